@@ -92,8 +92,9 @@ class MovingMesh:
         """Return the unit normals (V, 3) that follow from the faces, weighted by area.
 
         At a UV seam there are several vertices at one position with one normal. They
-        share the mean of all their faces. Vertices at one position with different
-        normals do not, so that creases stay sharp.
+        form a group (`_shared_groups`), and share the mean over all faces of the group.
+        Vertices at one position with different normals do not, so that creases stay
+        sharp.
 
         Args:
             vertices: (V, 3) positions of the mesh's vertices.
@@ -105,11 +106,13 @@ class MovingMesh:
         )
         # as long as twice the face's area: the sum weights faces by area
         face_normals = torch.linalg.cross(second - first, third - first)
-        # each face counts for the groups of its three corners: first all the first
-        # corners, then all the second and all the third ones
+        # Each face counts for the groups of its three corners. Both tensors have first
+        # the first corners of all faces, then the second and the third ones.
         group_of_corner = groups[faces].T.reshape(-1)
-        group_sums = vertices.new_zeros(int(groups.max()) + 1, 3).index_add(
-            0, group_of_corner, face_normals.repeat(3, 1)
+        normal_of_corner = face_normals.repeat(3, 1)
+        n_groups = int(groups.max()) + 1
+        group_sums = vertices.new_zeros(n_groups, 3).index_add(
+            0, group_of_corner, normal_of_corner
         )
         sums = group_sums[groups]
         # 1e-24 keeps the derivative finite where a sum is 0
@@ -218,20 +221,23 @@ class Assembly:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
-        # A scene may be rendered into one of several photographs: the scene of each,
-        # and by its index what it adds to the image. The light of the plane is always
-        # that of the scene itself.
-        self._views = [description]
+        # A scene may be rendered into one of several photographs. Each has a scene of
+        # its own, with its camera.
+        self._photograph_scenes = [description]
         if description.photographs is not None:
-            self._views = list(description.photographs.scenes.values())
+            self._photograph_scenes = list(description.photographs.scenes.values())
         self._resolution = resolution
+        # inputs of the finished image by the index of the photograph, see
+        # `_get_image_inputs`
         self._image_inputs_of: dict[int, dict[str, Tensor]] = {}
-        self._plane: dict[str, Tensor] = {}
+        # The radiance of the plane that receives the shadow. There is one plane, and
+        # one light on it, for all photographs.
+        self._plane_input: dict[str, Tensor] = {}
         if resolution is not None:
             image_inputs = make_image_inputs(description, resolution)
             self._image_inputs_of[0] = image_inputs
-            plane = image_inputs.get(PLANE_INPUT)
-            self._plane = {} if plane is None else {PLANE_INPUT: plane}
+            if PLANE_INPUT in image_inputs:
+                self._plane_input = {PLANE_INPUT: image_inputs[PLANE_INPUT]}
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
@@ -244,11 +250,15 @@ class Assembly:
         """
         if self.is_object_hidden:
             inputs = self._hide_object(inputs)
+        # Inputs of the space, which are replaced one after the other by those of
+        # Mitsuba's scene.
         parameters = dict(inputs)
-        # index of the chosen photograph; 0 without a choice
-        photograph = int(parameters.pop(PHOTOGRAPH_INPUT, torch.zeros(())))
-        parameters |= self._get_image_inputs(photograph)
-        for part in self._carried:  # what carries it may be moved or deformed
+        photograph_index = 0
+        if PHOTOGRAPH_INPUT in parameters:
+            photograph_index = int(parameters.pop(PHOTOGRAPH_INPUT))
+        parameters |= self._get_image_inputs(photograph_index)
+        # Lamps move with the car that carries them, whose pose is among the inputs.
+        for part in self._carried:
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():
             to_world = parameters.pop(f"{name}.to_world", None)
@@ -293,11 +303,11 @@ class Assembly:
         if self._resolution is None:
             return {}
         if photograph not in self._image_inputs_of:
-            view = self._views[photograph]
-            image_inputs = make_image_inputs(view, self._resolution)
-            # the plane has the light of the scene itself, whatever the photograph
+            photograph_scene = self._photograph_scenes[photograph]
+            image_inputs = make_image_inputs(photograph_scene, self._resolution)
+            # The plane has the light of the scene itself.
             image_inputs.pop(PLANE_INPUT, None)
-            self._image_inputs_of[photograph] = image_inputs | self._plane
+            self._image_inputs_of[photograph] = image_inputs | self._plane_input
         return self._image_inputs_of[photograph]
 
     def get_vertices(self, name: str, assembled: Mapping[str, Tensor]) -> Tensor:
@@ -306,11 +316,11 @@ class Assembly:
         `assembled` are inputs as a call returns them.
         """
         vertices = assembled.get(f"{name}.vertices")
-        return (
-            self.meshes[name].transform_mesh(None, None)[0]
-            if vertices is None
-            else vertices
-        )
+        if vertices is None:  # nothing moves the mesh
+            vertices, _normals = self.meshes[name].transform_mesh(
+                to_world=None, offsets=None
+            )
+        return vertices
 
 
 def _move_carried(
@@ -318,9 +328,10 @@ def _move_carried(
 ) -> dict[str, Tensor]:
     """Return the inputs that move a lamp with the car that carries it.
 
-    The glass of a lamp has the carrier's pose, and is deformed with the vertices that
-    it lies on. A beam keeps its place on the carrier. The result is empty if nothing
-    moves the carrier.
+    The glass of a lamp is in the carrier's coordinates: it has the carrier's pose, and
+    the offsets of the vertices that it lies on, even without a pose. A beam is a point
+    at a fixed pose on the carrier, which does not follow a deformation. The result is
+    empty if nothing moves the carrier.
 
     Args:
         part: the beam or the glass.
@@ -328,18 +339,23 @@ def _move_carried(
             moves.
     """
     moved_inputs: dict[str, Tensor] = {}
-    pose = inputs.get(f"{part.carrier}.to_world")
+    carrier_pose = inputs.get(f"{part.carrier}.to_world")
     offsets = inputs.get(f"{part.carrier}.offsets")
-    if isinstance(part, LampGlass) and offsets is not None:
-        follows = torch.from_numpy(part.vertex_of_carrier).to(offsets.device)
-        moved_inputs[f"{part.name}.offsets"] = offsets[follows]
-    if pose is not None and isinstance(part, BeamLamp):
-        car_pose = compute_car_pose(pose) if part.carrier == CAMERA else pose
-        pose = compute_carried_pose(
-            car_pose, torch.from_numpy(part.pose_on_carrier).to(pose)
+    if isinstance(part, LampGlass):
+        if offsets is not None:
+            carrier_vertex = torch.from_numpy(part.vertex_of_carrier).to(offsets.device)
+            moved_inputs[f"{part.name}.offsets"] = offsets[carrier_vertex]
+        if carrier_pose is not None:
+            moved_inputs[f"{part.name}.to_world"] = carrier_pose
+    elif carrier_pose is not None:
+        car_pose = carrier_pose
+        if part.carrier == CAMERA:  # the camera looks out of a car of its own
+            car_pose = compute_car_pose(carrier_pose)
+        # The same dtype and device as the carrier's pose.
+        pose_on_carrier = torch.from_numpy(part.pose_on_carrier).to(carrier_pose)
+        moved_inputs[f"{part.name}.to_world"] = compute_carried_pose(
+            car_pose, pose_on_carrier
         )
-    if pose is not None:
-        moved_inputs[f"{part.name}.to_world"] = pose
     return moved_inputs
 
 
@@ -353,14 +369,16 @@ def write_central_differences(
     """Write the central differences of a function into a derivative, in place.
 
     A difference is the rise of the function between two points, divided by their
-    distance. The distance is twice the step, or less at the border of the unit cube.
+    distance. The distance is twice the step. At the border of the unit cube one of the
+    points is clipped, so that it is less, but not 0.
 
     Args:
-        value: maps a configuration (d,) to a scalar.
+        value: function from a configuration (d,) to a scalar.
         group: the coordinates, and the step, which is half the distance.
         u: (d,) configuration.
-        derivative: (d,) into which the slopes of the group are written.
+        derivative: (d,) tensor into which the slopes of the group are written.
     """
+    # the coordinates of the group, which are consecutive
     for coordinate in range(group.begin, group.begin + group.size):
         step = torch.zeros_like(u)
         step[coordinate] = group.step
@@ -374,7 +392,7 @@ def write_central_differences(
 def step_in_box(
     u: Tensor, step: Tensor, periodic: bool | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return u + step brought back into the box, and the step that was really taken.
+    """Return u + step brought back into the unit box, and the step actually taken.
 
     Periodic coordinates wrap around, so that they can go the full step.
     """
@@ -385,11 +403,11 @@ def step_in_box(
     return position, torch.where(is_periodic, step, clipped - u)
 
 
-N_VERTICES = 400  # vertices of a mesh that are followed
+N_VERTICES = 400  # largest number of vertices of a mesh that are followed
 NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
-"""Changes of u over which the speed is measured.
+"""Changes of u over which the speed is measured, largest first.
 
-The largest is taken that leaves something in the frame.
+The first one is used after which a moved point is still in the frame.
 """
 # directions in which the environment is followed: some hundred of them lie in a frame
 N_DIRECTIONS = 4000
@@ -429,20 +447,23 @@ class Motion:
         aspect = resolution[1] / resolution[0]
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
-        # `_ground` is half the side of the square ground, and `_edge` has points (n, 3)
-        # on its edge. Of a photographed ground all vertices are followed.
+        # Half the width of the square ground, and points (n, 3) of it that are
+        # followed: its edge, or all vertices of a photographed ground.
         if description.photograph is None:
-            self._ground = description.get_number("ground.size") / 2.0
-            self._edge = _sample_square_edge(self._ground)
+            self._ground_half_width = description.get_number("ground.size") / 2.0
+            self._ground_points = _sample_square_edge(self._ground_half_width)
         else:
-            floor = description.photograph.mesh.vertices
-            self._ground = float(floor.max())
-            self._edge = torch.from_numpy(floor).double()
-        # Points of the environment; none if nothing shows them.
-        hidden = description.backdrop or description.environment is None
-        self._far = _sample_sphere(0 if hidden else N_DIRECTIONS) * ENVIRONMENT_DISTANCE
-        # which vertices of each mesh are followed
-        self._picks = {
+            vertices = description.photograph.mesh.vertices
+            # The ground is level and around the origin, so that the largest coordinate
+            # is half its width.
+            self._ground_half_width = float(vertices.max())
+            self._ground_points = torch.from_numpy(vertices).double()
+        # Points of the environment; none if the camera does not see it.
+        is_hidden = description.backdrop or description.environment is None
+        directions = _sample_sphere(0 if is_hidden else N_DIRECTIONS)
+        self._environment_points = directions * ENVIRONMENT_DISTANCE
+        # indices of the vertices of each mesh that are followed
+        self._followed_vertices = {
             name: torch.from_numpy(_spread_indices(len(mesh.vertices), N_VERTICES))
             for name, mesh in assembly.meshes.items()
         }
@@ -450,8 +471,8 @@ class Motion:
     def project_points(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed points lie in the image.
 
-        First come the vertices of meshes, then the edge of the ground, then the
-        environment. `inputs` are assembled ones, as Mitsuba's scene has them.
+        The first points are vertices of meshes, then come those of the ground, and then
+        those of the environment. `inputs` are assembled inputs of Mitsuba's scene.
 
         Returns:
             (N, 2) pixels from the center, and (N,) whether each is in or near the
@@ -460,36 +481,42 @@ class Motion:
         camera = self._camera
         if "camera.to_world" in inputs:
             camera = inputs["camera.to_world"].double()
-        points = [
-            self._assembly.get_vertices(name, inputs)[picks].double()
-            for name, picks in self._picks.items()
+        mesh_points = [
+            self._assembly.get_vertices(name, inputs)[followed].double()
+            for name, followed in self._followed_vertices.items()
         ]
+        points = torch.cat(
+            [*mesh_points, self._ground_points, self._environment_points]
+        )
         eye = camera[:3, 3]
-        relative = (torch.cat([*points, self._edge, self._far]) - eye) @ camera[:3, :3]
+        # The columns of the rotation are the camera's axes: this product is the points
+        # in its coordinates.
+        relative = (points - eye) @ camera[:3, :3]
         positions, is_visible = project_points(
             self._description, inputs, relative, self._resolution
         )
-        # The ground hides points of the environment; nothing else hides any.
-        n_near = len(is_visible) - len(self._far)
-        is_visible[n_near:] &= ~self._hidden_by_ground(eye)
+        # The ground hides points of the environment, which are the last ones. That
+        # other surfaces hide points is not taken into account.
+        first_of_environment = len(is_visible) - len(self._environment_points)
+        is_visible[first_of_environment:] &= ~self._is_hidden_by_ground(eye)
         half_size = torch.tensor(self._resolution[::-1], dtype=torch.float64) / 2.0
         # A point is near the frame if it is outside by at most a fifth of half a side.
         near_frame = (positions.abs() <= 1.2 * half_size).all(dim=1)
         return positions, is_visible & near_frame
 
-    def _hidden_by_ground(self, eye: Tensor) -> Tensor:
+    def _is_hidden_by_ground(self, eye: Tensor) -> Tensor:
         """Return which points of the environment, (n,), the ground hides from the eye.
 
         The ground is a square at z = 0, and hides nothing from an eye below it.
         """
-        directions = self._far - eye
-        # where the line of sight meets z = 0; it means nothing for lines that go up,
-        # which do not count below
+        directions = self._environment_points - eye
+        goes_down = directions[:, 2] < 0.0
+        # where the line of sight meets z = 0; means nothing for lines that go up
         distance = -eye[2] / directions[:, 2].clamp_max(-1e-9)
         hit = eye + distance[:, None] * directions
-        on_ground = (hit[:, :2].abs() <= self._ground).all(dim=1)
+        on_ground = (hit[:, :2].abs() <= self._ground_half_width).all(dim=1)
         is_eye_above = bool(eye[2] > 0.0)
-        return (directions[:, 2] < 0.0) & is_eye_above & on_ground
+        return goes_down & is_eye_above & on_ground
 
     def measure_speeds(
         self,
@@ -510,7 +537,7 @@ class Motion:
         with torch.no_grad():
             positions, is_visible = self.project_points(inputs(u))
             for coordinate in coordinates:
-                for nudge in NUDGES:
+                for nudge in NUDGES:  # largest first
                     nudged = u.clone()
                     # At the upper border of the unit cube the change goes backwards.
                     sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
@@ -518,8 +545,8 @@ class Motion:
                     new_positions, still_visible = self.project_points(inputs(nudged))
                     shifts = (new_positions - positions)[is_visible & still_visible]
                     distances = shifts.norm(dim=1)
-                    # If no point moves, those that moved may have left the frame: then
-                    # a smaller change is tried.
+                    # If no visible point has moved, all that moved may have left the
+                    # frame. Then the next, smaller change is tried.
                     if bool((distances > 0.0).any()):
                         speeds[coordinate] = float(distances.max()) / nudge
                         break
@@ -539,10 +566,13 @@ def _sample_square_edge(half_width: float) -> Tensor:
 def _sample_sphere(count: int) -> Tensor:
     """Return (count, 3) directions evenly spread over the sphere (Fibonacci spiral).
 
-    From one to the next the azimuth turns by the golden angle, pi (3 - sqrt 5). `count`
-    is `N_DIRECTIONS`, or 0 for none.
+    From one to the next the azimuth turns by the golden angle, pi (3 - sqrt 5).
+
+    Args:
+        count: `N_DIRECTIONS`, or 0 for none.
     """
     index = torch.arange(count, dtype=torch.float64)
+    # The fixed divisor avoids a division by 0 if `count` is 0.
     z = 1.0 - (2.0 * index + 1.0) / N_DIRECTIONS
     azimuth = index * torch.pi * (3.0 - 5.0**0.5)
     radius = (1.0 - z**2).sqrt()

@@ -316,9 +316,9 @@ def find_footing(points: Float64Array) -> tuple[Float64Array, float]:
     """
     lower = points.min(axis=0)
     upper = points.max(axis=0)
-    return np.array([*(lower[:2] + upper[:2]) / 2.0, lower[2]]), float(
-        (upper - lower).max()
-    )
+    middle_x, middle_y = (lower[:2] + upper[:2]) / 2.0
+    extent = float((upper - lower).max())
+    return np.array([middle_x, middle_y, lower[2]]), extent
 
 
 def group_indices(group_of: IntArray) -> list[IntArray]:
@@ -403,8 +403,10 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     """
     if len(mesh.faces) <= max_faces:
         return None
-    for grid in SIMPLIFICATION_GRIDS:
+    for grid in SIMPLIFICATION_GRIDS:  # from the finest to the coarsest
         cluster_of = _cluster_vertices(mesh, grid)
+        # For each new vertex, the index of an old one that it represents. The two sides
+        # of a texture seam have a new vertex each, in one cluster.
         representative, faces = _merge_clusters(mesh, cluster_of)
         if len(faces) <= max_faces:
             break
@@ -438,7 +440,8 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
     """
     lower = mesh.vertices.min(axis=0)
     extent = max(float((mesh.vertices.max(axis=0) - lower).max()), 1e-12)
-    # along each axis the lowest point is in the middle of the first cell
+    # `scaled` is 0 at the lowest point and grid - 1 at the far end of the largest
+    # extent. Rounded, both are in the middle of a cell.
     scaled = (mesh.vertices - lower) / extent * (grid - 1)
     cells = np.floor(scaled + 0.5).astype(np.int64)
     return np.unique(_encode_rows(cells), return_inverse=True)[1].reshape(-1)
@@ -611,7 +614,7 @@ def describe_size_doubts(
     usual_sizes = PLAUSIBLE_SIZES if kind is None else USUAL_SIZES[kind]
     min_size, max_size = usual_sizes
     size = asset.size_in_metres
-    # Whether an extent fits can be told only for a kind of object with a usual size.
+    # The file's extent suggests a unit only for a kind of object with a usual size.
     extent = None if kind is None else asset.extent
     is_unusual = size is not None and not min_size <= size <= max_size
     is_missing = size is None and (needs_metres or extent is not None)

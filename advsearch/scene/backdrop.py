@@ -4,21 +4,22 @@
     shade = 1 - coverage + change of the plane's radiance / its radiance
 
 `rendered` is the object's light times its coverage. The plane is a matt ground below
-the object that is itself not seen: what the object takes from its light, and adds,
-scales the photograph (Debevec 1998, Rendering synthetic objects into real scenes,
-section 5, adds the difference instead). Light that a matt surface reflects is its
-albedo times what arrives, so that the ratio is right whatever the albedo of the ground
-at that pixel is, and it never goes below zero; a difference is right only where the
-albedo of the plane is that of the ground, and makes dark ground negative.
+the object that is itself invisible. Where the object blocks or adds light on the plane,
+the photograph is scaled by the same ratio (Debevec 1998, Rendering synthetic objects
+into real scenes, section 5, adds the difference instead). Light that a matt surface
+reflects is its albedo times the light that arrives. So the ratio is right for any
+albedo of the ground at that pixel, and it is never below zero. A difference is right
+only where the albedo of the plane is that of the ground, and makes dark ground
+negative.
 
-What a clear coat on the ground (``ground.gloss``) reflects has not the ground's color.
-Its change, light of the object minus that of the environment behind it, is added; and
-as much of the photograph as the coat reflects of the environment takes no shadow.
+Light that a clear coat on the ground (``ground.gloss``) reflects does not have the
+ground's color. Its change, light of the object minus that of the environment behind it,
+is added. The part of the photograph that the coat reflects of the environment is not
+darkened by a shadow.
 
-The photograph is read as a viewer shows it, decoded from sRGB, and averaged over the
-area of each pixel of the film. A part of it may be cut out,
-`photo.jpg#X,Y,WIDTH,HEIGHT` in pixels from its top left corner; the intrinsics of the
-camera follow.
+The photograph is decoded from sRGB, and averaged over the area of each pixel of the
+film. A part of it may be cut out, `photo.jpg#X,Y,WIDTH,HEIGHT` in pixels from its top
+left corner. The intrinsics of the camera are adapted to the part.
 """
 
 from __future__ import annotations
@@ -65,33 +66,34 @@ from advsearch.trust.stored_files import (
     track_opened_files,
 )
 
-MAX_ELEVATION = 89.0  # degrees, of a camera that orbits the object
-MIN_SIDE = 8  # pixels of a photograph, or of what is cut out of it
-# of an angle's cosine: how far from a rotation a matrix may be
+MAX_ELEVATION = 89.0  # largest elevation of a camera that orbits the object, degrees
+MIN_SIDE = 8  # smallest width and height of a photograph or its used part, pixels
+# largest error of a product of two rows of a rotation matrix, which should be 0 or 1
 ROTATION_TOLERANCE = 1e-3
 # largest relative difference between the shapes of a photograph and of its camera
 SHAPE_TOLERANCE = 0.01
 PHOTOGRAPH_CAMERA = "photograph"  # name of the pinhole of a part of a photograph
-# settings of the plane that takes the shadow
+# settings of the plane that receives the shadow
 PLANE_SETTINGS = frozenset(
     (
         *("ground.size", "ground.level", "ground.gloss", "ground.roughness"),
         *(f"ground.{channel}" for channel in CHANNELS),
     )
 )
-# fraction of a depth: what is nearer by less does not hide, as where things touch
+# A surface of the photograph hides a point only if it is nearer by more than this
+# fraction of the depth: so surfaces that touch do not hide each other.
 DEPTH_TOLERANCE = 0.01
-MIN_BLUR = 0.15  # pixels; less is not seen
+MIN_BLUR = 0.15  # smallest standard deviation of a visible blur, pixels
 PLANE_SIZE = 12.0  # side of the plane, object sizes
-# mean reflectance of what photographs show, that of the grey card to which cameras
-# meter: it gives the exposure
+# assumed mean reflectance of what a photograph shows, from which its exposure follows:
+# that of the grey card to which cameras meter
 GREY_CARD = 0.18
-ALBEDO_RANGE = (0.05, 0.8)  # of the plane
+ALBEDO_RANGE = (0.05, 0.8)  # smallest and largest albedo of the plane
 # radii around the object, in object sizes, between which the plane's color is measured
 CONTACT_RING = (0.5, 1.5)
 N_CONTACT_POINTS = 400
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue (BT.709)
-GROUND = "ground"  # name of the plane that takes the shadow, among surfaces
+GROUND = "ground"  # name of the plane that receives the shadow, among surfaces
 LIGHT_SUFFIXES = (".hdr", ".exr")
 CROP = re.compile(r"(?P<path>.+)#(?P<numbers>\d+,\d+,\d+,\d+)")
 
@@ -140,12 +142,13 @@ def find_photograph_file(photograph: object) -> Path | None:
 
 
 def find_photographed_light(photograph: object) -> Path | None:
-    """Return the environment map beside a photograph, or None if there is none.
+    """Return the environment map next to a photograph, or None if there is none.
 
     The map of "kitchen.jpg" is "kitchen.hdr" or "kitchen.exr" in the same folder.
 
     Args:
-        photograph: path of the photograph, or what else a user may give as one.
+        photograph: path of the photograph, or another object that a user may pass as
+            one; only a path has a map.
     """
     path = find_photograph_file(photograph)
     if path is None:
@@ -153,7 +156,7 @@ def find_photographed_light(photograph: object) -> Path | None:
     for suffix in LIGHT_SUFFIXES:
         light = path.with_suffix(suffix)
         if light != path and light.is_file():
-            # the map counts as opened for the photograph, with which it belongs
+            # The map is recorded as a file that belongs to the photograph.
             with track_opened_files(path):
                 record_opened(light)
             return light
@@ -161,13 +164,14 @@ def find_photographed_light(photograph: object) -> Path | None:
 
 
 def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhotograph:
-    """Return a photograph with what is before the object, by a mask or by depth.
+    """Return a photograph with the mask or the depth of what is in front of the object.
 
     Args:
         photograph: the photograph.
-        spec: a mask: a picture file of the full photograph's size, white where
-            something is in front of the object, black elsewhere. Or a picture of the
-            photograph's depth: an .exr or .npy file, or "depth.png#0.001".
+        spec: path of a mask: a picture of the full photograph's size, white where
+            something is in front of the object, black elsewhere. Or path of the
+            photograph's depth: an .exr or .npy file in meters, or a 16-bit picture with
+            the meters that one level stands for, such as "depth.png#0.001".
 
     Raises:
         FileFormatError: the file cannot be used.
@@ -182,6 +186,7 @@ def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhot
         check_no_depth(image.mode, path)
         levels = _decode_photograph(image, path)
     _check_front_size(photograph, levels.shape, "a mask", spec)
+    # A mask is grey, so that any channel would do.
     front = np.ascontiguousarray(levels[..., 1])
     return replace(photograph, front=front, front_spec=str(spec))
 
@@ -204,40 +209,44 @@ def _check_front_size(
 def make_image_inputs(
     description: SceneData, resolution: tuple[int, int]
 ) -> dict[str, Tensor]:
-    """Return the inputs by which a rendered image becomes a part of its photograph.
+    """Return the inputs with which a rendered image is laid over its photograph.
 
     The result is empty if the scene is not rendered into a photograph.
 
     Returns:
         Tensors by name. ``backdrop.color`` (H, W, 3) is the photograph, display-linear.
-        The others are there only where they apply:
+        The others are missing if they do not apply:
 
         - ``backdrop.plane`` (3,): radiance of the plane without the object;
-        - ``backdrop.front`` (H, W, 1): fraction of each pixel that something before the
-          object covers;
+        - ``backdrop.front`` (H, W, 1): fraction of each pixel that something in front
+          of the object covers;
         - ``backdrop.depth`` (H S, W S): depth of the photograph in object sizes, at S x
           S points of each pixel;
-        - ``backdrop.noise`` (H, W, 3): noise that is added to what is rendered,
-          display-referred;
-        - ``backdrop.blur`` (1,): standard deviation in pixels by which what is rendered
-          is blurred.
+        - ``backdrop.noise`` (H, W, 3): noise that is added to the rendered object,
+          display-referred; missing if it is 0 everywhere;
+        - ``backdrop.blur`` (1,): standard deviation in pixels by which the rendered
+          object is blurred; missing if it would not be visible.
 
     Raises:
-        InputError: there is depth, and the object's size in metres is not known.
+        InputError: the photograph has depth, and the object's size in meters is not
+            known.
     """
     photograph = description.backdrop_photograph
     if photograph is None:
         return {}
     color = photograph.resample(resolution)
+    # Blur and noise are measured in the photograph, unless the user has set them.
     blur = description.values.get("backdrop.blur")
     if blur is None:
-        blur = measure_blur((color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32))
-    noise = photograph.make_noise(resolution, description.values.get("backdrop.noise"))
+        luminance = (color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32)
+        blur = measure_blur(luminance)
+    noise_setting = description.values.get("backdrop.noise")
+    noise = photograph.make_noise(resolution, noise_setting)
     depth = photograph.resample_depth(resolution)
     if depth is not None and description.object.size_in_metres is None:
         raise InputError(
-            f"occluder: {photograph.front_spec} is in metres, and how large "
-            f"{description.object.name} is is not known; give its longest side in "
+            f"occluder: {photograph.front_spec} is in metres, and the size of "
+            f"{description.object.name} is not known; give its longest side in "
             "metres, such as `size=0.1`"
         )
     inputs: dict[str, Tensor | None] = {
@@ -272,29 +281,38 @@ def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> T
         Radiance (H, W, 3).
     """
     radiance = rendered[..., :3]
-    coverage = rendered[..., 3:4]
+    rendered_coverage = rendered[..., 3:4]
+    coverage = rendered_coverage
     front = inputs.get("backdrop.front")
     if front is not None:
-        visible = 1.0 - front[..., :1]
-        radiance = visible * radiance
-        coverage = visible * coverage
-    shade = (1.0 - coverage).clamp(0.0, 1.0)
-    if "backdrop.plane" in inputs:
-        change = rendered[..., 4:7] / inputs["backdrop.plane"]
-        reflection = rendered[..., 7:10]
-        if front is not None:
-            change = (1.0 - front[..., -1:]) * change
-            reflection = (1.0 - front[..., -1:]) * reflection
-        uncovered = shade
-        shade = (shade + change).clamp_min(0.0)
-        if reflection.shape[-1]:
-            # A shadow takes light from the plane's color, but not from the reflection
-            # of the environment in its coat: that part of the photograph is added
-            # again.
-            coat = rendered[..., 10:] / (1.0 - rendered[..., 3:4]).clamp_min(1e-3)
-            unshaded = (uncovered - shade) * torch.minimum(coat, behind)
-            return radiance + (shade * behind + unshaded + reflection).clamp_min(0.0)
-    return radiance + shade * behind
+        visible_object = 1.0 - front[..., :1]
+        radiance = visible_object * radiance
+        coverage = visible_object * coverage
+    # fraction of each pixel in which the photograph is visible
+    uncovered = (1.0 - coverage).clamp(0.0, 1.0)
+    if "backdrop.plane" not in inputs:
+        return radiance + uncovered * behind
+
+    # change of the plane relative to its radiance; 0 where the plane is covered
+    relative_change = rendered[..., 4:7] / inputs["backdrop.plane"]
+    coat_change = rendered[..., 7:10]
+    if front is not None:
+        # The last channel of two is the plane's. With one, it holds for both.
+        visible_plane = 1.0 - front[..., -1:]
+        relative_change = visible_plane * relative_change
+        coat_change = visible_plane * coat_change
+    shade = (uncovered + relative_change).clamp_min(0.0)
+    has_coat = coat_change.shape[-1] > 0
+    if not has_coat:
+        return radiance + shade * behind
+
+    # A shadow darkens the light of the matt ground, but not the environment in the
+    # coat. So the fraction of light that the shadow takes is added again for the part
+    # of the photograph that is this reflection. The coat was rendered for the fraction
+    # of the pixel that the object does not cover.
+    environment_in_coat = rendered[..., 10:] / (1.0 - rendered_coverage).clamp_min(1e-3)
+    unshaded = (uncovered - shade) * torch.minimum(environment_in_coat, behind)
+    return radiance + (shade * behind + unshaded + coat_change).clamp_min(0.0)
 
 
 def compute_front(
@@ -308,7 +326,7 @@ def compute_front(
     same holds for the ground.
 
     Args:
-        surfaces: surface that is seen first at n x n points of each pixel.
+        surfaces: first surface that the camera sees at n x n points of each pixel.
         photograph_depth: (H n, W n) at the same points, in the unit of `surfaces`.
         n_points: n.
         radius: radius of the surroundings, pixels.
@@ -321,13 +339,20 @@ def compute_front(
     if GROUND in surfaces.names:
         is_ground = surfaces.visible_mask(GROUND)
     is_object = surfaces.z_depth.isfinite() & ~is_ground
-    masks = torch.stack([is_object, is_ground])
+    is_covered = torch.stack([is_object, is_ground])  # (2, H n, W n)
+
+    # Fractions (2, H, W) of each pixel, for object and ground. Pooled once more they
+    # are means of the pixels around; their padding cancels in the quotient below.
     pool = torch.nn.functional.avg_pool2d
-    # (2, 2, H, W): of all points and of the hidden ones; of the object and the ground
-    fractions = pool(torch.stack([masks, masks & is_hidden]).float(), n_points)
-    around = pool(fractions, 2 * radius + 1, stride=1, padding=radius)
-    covered, hidden = torch.where(fractions[0] > 0.0, fractions, around)
-    front: Tensor = (hidden / covered.clamp_min(1e-12)).movedim(0, -1)
+    covered = pool(is_covered.float(), n_points)
+    hidden = pool((is_covered & is_hidden).float(), n_points)
+    covered_around = pool(covered, 2 * radius + 1, stride=1, padding=radius)
+    hidden_around = pool(hidden, 2 * radius + 1, stride=1, padding=radius)
+
+    is_in_pixel = covered > 0.0
+    covered_nearby = torch.where(is_in_pixel, covered, covered_around)
+    hidden_nearby = torch.where(is_in_pixel, hidden, hidden_around)
+    front: Tensor = (hidden_nearby / covered_nearby.clamp_min(1e-12)).movedim(0, -1)
     return front
 
 
@@ -411,8 +436,8 @@ def compute_photograph_gain(
 def compute_level_irradiance(description: SceneData) -> Float64Array:
     """Return the irradiance (3,) of a level surface under the environment alone.
 
-    It is that of the map itself: the setting `environment.exposure` does not count. It
-    is 0 without an environment.
+    It is the irradiance under the map itself, without the setting
+    `environment.exposure`. It is 0 without an environment.
     """
     environment = description.environment
     if environment is None:
@@ -431,9 +456,10 @@ def compute_level_irradiance(description: SceneData) -> Float64Array:
 
 
 def has_plane(description: SceneData) -> bool:
-    """Return whether a scene has a plane that takes the shadow in a photograph.
+    """Return whether a scene has a plane that receives the shadow in a photograph.
 
-    It needs an environment, whose light the shadow is in, and a camera above it.
+    The plane needs an environment, whose light the object blocks, and a camera above
+    it.
     """
     return (
         description.backdrop_photograph is not None
@@ -462,6 +488,7 @@ def compute_plane_radiance(description: SceneData) -> Tensor | None:
         return None
     srgb = np.array(description.ground_color, np.float32)
     albedo = srgb_to_linear(srgb).astype(np.float64)
+    # `compute_level_irradiance` leaves out the exposure.
     brightness = 2.0 ** description.get_number("environment.exposure")
     radiance = albedo * brightness * compute_level_irradiance(description) / math.pi
     return torch.from_numpy(radiance).float()
@@ -526,14 +553,15 @@ def _look_up_levels(
     camera = camera_to_world(description, width / height)
     # in the camera's coordinates: left, up and ahead
     relative = (points - camera[:3, 3]) @ camera[:3, :3]
+    # The description may have the aspect of a film for a part of the photograph.
+    full_description = replace(description, aspect=width / height)
+    no_inputs: dict[str, Tensor] = {}
     positions, is_visible = project_points(
-        replace(description, aspect=width / height),
-        {},
-        torch.from_numpy(relative),
-        (height, width),
+        full_description, no_inputs, torch.from_numpy(relative), (height, width)
     )
     size = np.array([width, height])
-    # positions are counted from the middle of the image, pixels from its top left
+    # Positions (x to the right, y down) are counted from the middle of the image,
+    # pixels from its top left.
     pixels = np.floor(positions.numpy() + size / 2.0).astype(int)
     is_inside = is_visible.numpy() & ((pixels >= 0) & (pixels < size)).all(axis=1)
     inside: npt.NDArray[np.intp] = pixels[is_inside]
@@ -612,21 +640,23 @@ def fit_to_photograph(
     full_aspect = full_width / full_height
     model = description.camera_model
     if model is not None:
-        # bundled models, such as the fisheye, depend on the shape of the image
+        # A bundled model, such as the fisheye, depends on the shape of the image, and
+        # is made again for the full photograph. Other models stay.
         model = make_bundled_models(full_aspect).get(model.name, model)
         _check_camera_shape(photograph, model)
     uncropped = replace(description, camera_model=model)
-    plane_color = measure_plane_color(uncropped, photograph, gain)
+    color_settings = measure_plane_color(uncropped, photograph, gain)
     if photograph.is_cropped:
         if model is None:
             fov = description.get_number("camera.fov")
             model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
         model = crop_camera(model, photograph)
+    film_height, film_width = resolution
     return replace(
         description,
-        aspect=resolution[1] / resolution[0],
+        aspect=film_width / film_height,
         camera_model=model,
-        values={**description.values, **plane_color},
+        values={**description.values, **color_settings},
     )
 
 
@@ -650,13 +680,14 @@ def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraMod
         )
     left, top, width, height = photograph.crop
     full_height, full_width = photograph.full_size
-    values = model.values
+    values = model.values  # a new dictionary
     values["fx"] *= full_width / width
     values["skew"] *= full_width / width
     values["cx"] = (values["cx"] * full_width - left) / width
     values["fy"] *= full_height / height
     values["cy"] = (values["cy"] * full_height - top) / height
     numbers = tuple(values[name] for name in NUMBER_NAMES)
+    # Without a size: the model's own is that of the full photograph.
     return replace(model, numbers=numbers, size=None)
 
 
@@ -672,8 +703,8 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     """
     height, width = photograph.size
     film_height, film_width = resolution
-    # A pixel of the film has that many pixels of the photograph: by so much the width
-    # may differ if the film's sides were rounded.
+    # A pixel of the film covers so many pixels of the photograph. Rounding the film's
+    # sides changes the width in the photograph by no more than that.
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
@@ -684,7 +715,8 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     left = photograph.crop[0] + (width - part_width) // 2
     top = photograph.crop[1] + (height - part_height) // 2
     path = photograph.spec.partition("#")[0]
-    # the photograph's shape, with the larger side of the film
+    # the photograph's shape, with the larger side of the film; the setting `resolution`
+    # is height x width, while this message has width x height elsewhere
     shrinking = max(film_width, film_height) / max(width, height)
     fitting = f"{max(round(height * shrinking), 1)}x{max(round(width * shrinking), 1)}"
     raise InputError(
@@ -698,7 +730,7 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
 def _check_gloss(description: SceneData) -> None:
     """Check that a gloss of the ground that the user requests has an effect.
 
-    Raises InputError: a roughness is given without a gloss, or a gloss without a plane
+    Raises InputError: a roughness is set without a gloss, or a gloss without a plane
     that could reflect the object.
     """
     is_glossy = description.get_number("ground.gloss") > 0.0
@@ -709,6 +741,7 @@ def _check_gloss(description: SceneData) -> None:
         )
     if not is_glossy or has_plane(description):
         return
+    # The conditions of `has_plane` in their order: if the others hold, it is the last.
     reason = "the camera is not above ground.level"
     if description.get_number("ground.size") == 0.0:
         reason = "ground.size is 0"
@@ -751,8 +784,8 @@ def compute_view_settings(
 ) -> dict[str, float]:
     """Return the settings of the scene in which a camera sees the object in a pose.
 
-    The camera orbits a point on its axis at the depth of the object's center, and the
-    object is shifted and turned from where it would stand.
+    The camera orbits a point on its axis at the depth of the object's center. Without
+    settings the object would stand upright at that point; `pose.*` moves and turns it.
 
     Args:
         asset: the object, from a file whose unit is known.
@@ -778,29 +811,42 @@ def compute_view_settings(
     distance = float(center[2])
     if distance <= 0.0:
         raise InputError("object_to_camera: puts the object behind the camera")
+    object_up = mesh_to_camera[:3, 2]
     world_axes = _make_world_axes(
-        mesh_to_camera[:3, 2] if up is None else np.asarray(up, np.float64)
+        object_up if up is None else np.asarray(up, np.float64)
     )
     rotation = world_axes @ mesh_to_camera[:3, :3]
-    offset = world_axes @ (center - np.array([0.0, 0.0, distance]))
-    # height of the lowest vertex, from the middle of the object
-    lowest = float(((vertices - middle) @ rotation.T)[:, 2].min())
+    # shift of the object's center from the point that the camera orbits, in the world
+    orbit_center = np.array([0.0, 0.0, distance])
+    offset = world_axes @ (center - orbit_center)
+    # The camera orbits the height `middle[2]`, that of the center of an object that
+    # stands on the height 0. So this is the height of the lowest vertex in the world.
+    lowest_from_center = float(((vertices - middle) @ rotation.T)[:, 2].min())
+    lowest = float(offset[2] + middle[2]) + lowest_from_center
     return {
         **_compute_orbit(world_axes),
+        # in meters; `_check_and_map` has checked that the size is known
         "camera.distance": distance * (asset.size_in_metres or 1.0),
         **_decompose_rotation(rotation),
         "pose.x": float(offset[0]),
         "pose.y": float(offset[1]),
-        # Without a shift the object stands with its lowest vertex at the height 0.
-        "pose.z": float(offset[2] + middle[2]) + lowest,
-        "ground.level": float(offset[2] + middle[2]) + lowest,
+        # Without a shift the lowest vertex of the object is at the height 0.
+        "pose.z": lowest,
+        "ground.level": lowest,
     }
 
 
 def _check_and_map(asset: ObjectAsset, object_to_camera: npt.ArrayLike) -> Float64Array:
     """Return the map (4, 4) from an object's mesh to camera coordinates.
 
-    Both are in object sizes. Raises InputError as `compute_view_settings`.
+    The coordinates on both sides are in object sizes.
+
+    Args:
+        asset: the object.
+        object_to_camera: pose (4, 4) in the unit of the object's file.
+
+    Raises InputError: the pose is not rigid, the object comes from no file, or its size
+    in meters is not known.
     """
     pose = _check_rigid(object_to_camera)
     if asset.file_to_mesh is None or asset.size_in_metres is None:
@@ -814,19 +860,22 @@ def _check_and_map(asset: ObjectAsset, object_to_camera: npt.ArrayLike) -> Float
 def compute_mesh_to_camera(
     file_to_mesh: Float64Array, pose: Float64Array
 ) -> Float64Array:
-    """Return the rigid map (4, 4) from a mesh to camera coordinates, in object sizes.
+    """Return the rigid map (4, 4) from a mesh to camera coordinates.
+
+    A mesh is in object sizes: its longest side is 1. So are the camera coordinates of
+    the result, which makes the map rigid.
 
     Args:
-        file_to_mesh: (4, 4) from coordinates of the object's file to those of its mesh,
-            whose longest side is 1.
-        pose: rigid (4, 4) from the file's coordinates to the camera's, in the file's
-            unit. The result is divided by the object's size in that unit.
+        file_to_mesh: (4, 4) from coordinates of the object's file to those of its mesh.
+        pose: rigid (4, 4) from the file's coordinates to the camera's, both in the
+            file's unit.
     """
     mesh_to_file = np.linalg.inv(file_to_mesh)
-    # the scale of a map of uniform scale is the cube root of its determinant
+    # The object's size in the file's unit: the scale of a map of uniform scale is the
+    # cube root of its determinant.
     object_size = float(np.cbrt(np.linalg.det(mesh_to_file[:3, :3])))
     mesh_to_camera: Float64Array = pose @ mesh_to_file
-    mesh_to_camera[:3] /= object_size
+    mesh_to_camera[:3] /= object_size  # the last row, (0, 0, 0, 1), stays
     return mesh_to_camera
 
 
@@ -838,8 +887,8 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
 
     Raises InputError: the camera looks straight up or down.
     """
-    # from the object to the camera, in the axes of the world: the camera looks along
-    # its own z
+    # Each column is an axis of the camera in the coordinates of the world. The camera
+    # looks along its z, so that this direction goes from the object to the camera.
     outwards = -world_axes[:, 2]
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
     if abs(elevation) > MAX_ELEVATION:
@@ -852,7 +901,7 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
     upright = np.cross(-outwards, level_left)
-    # roll is the angle of the camera's own left against that
+    # The roll is the angle from there to the camera's own left; its x points right.
     left = -world_axes[:, 0]
     return {
         "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
@@ -916,8 +965,9 @@ def _decompose_rotation(rotation: Float64Array) -> dict[str, float]:
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
     roll = math.atan2(rotation[2, 1], rotation[2, 2])
     # At a pitch of 90 degrees yaw and roll are about the same axis, and only their sum
-    # or difference is known: the roll is set to 0.
-    if abs(rotation[2, 0]) > 1.0 - 1e-9:
+    # or difference is known. With a roll of 0, (0, 1) is -sin yaw and (1, 1) cos yaw.
+    is_vertical = abs(rotation[2, 0]) > 1.0 - 1e-9
+    if is_vertical:
         yaw = math.atan2(-rotation[0, 1], rotation[1, 1])
         roll = 0.0
     return {

@@ -53,13 +53,15 @@ class BackdropPhotograph:
     def resample(self, resolution: tuple[int, int]) -> Tensor:
         """Return the part in display-linear values at (height, width) pixels.
 
-        Each pixel is the mean over the area that it covers, in linear light. Where the
+        Each pixel is the mean over the area that it covers, in linear light. If the
         photograph has fewer pixels than that, it is interpolated.
 
         Returns:
             (H, W, 3) float32 in [0, 1].
         """
-        return self._resample_part(decode_all_levels()[self.levels], resolution)
+        value_of_level = decode_all_levels()  # for each of 256 levels
+        linear_photograph = value_of_level[self.levels]
+        return self._resample_part(linear_photograph, resolution)
 
     def resample_front(self, resolution: tuple[int, int]) -> Tensor | None:
         """Return what is before the object, (H, W, 1) float32 in [0, 1], or None."""
@@ -93,15 +95,16 @@ class BackdropPhotograph:
         return torch.from_numpy(part[np.ix_(rows, columns)])
 
     def make_noise(self, resolution: tuple[int, int], sigma: float | None) -> Tensor:
-        """Return noise (H, W, 3) float32, display-referred, as the photograph has.
+        """Return noise (H, W, 3) float32, display-referred, like the photograph's.
 
-        It is made in the pixels of the photograph and resampled as that is, so that it
-        is as coarse. The same photograph gives the same noise.
+        Without `sigma`, the noise of the photograph is measured. Noise of that strength
+        is made in the pixels of the photograph and resampled as that is, so that it is
+        as coarse. With `sigma`, it is independent in each pixel of the result. The same
+        photograph gives the same noise.
 
         Args:
             resolution: height and width in pixels.
-            sigma: standard deviation in levels at that resolution; None: that of the
-                photograph.
+            sigma: standard deviation in levels at that resolution; None measures it.
         """
         left, top, width, height = self.crop
         part = self.levels[top : top + height, left : left + width]

@@ -36,7 +36,10 @@ def is_depth(spec: str | Path) -> bool:
 
 
 def check_no_depth(mode: str, path: Path) -> None:
-    """Raise FileFormatError if a mask has the mode of a picture of depth."""
+    """Raise FileFormatError if a mask has the mode of a depth picture, 16 bits.
+
+    `mode` is Pillow's; those of 16 bits are the keys of `LEVEL_BITS`.
+    """
     if mode in LEVEL_BITS:
         raise FileFormatError(
             f"{path}: expected a mask of 8 bits, got a picture of 16 bits; if it is "

@@ -275,23 +275,27 @@ class SceneDescription(SceneData):
             FileFormatError: they do not name the photograph, or its camera cannot be
                 used.
             InputError: the size of the object is not known; or a setting of the camera
-                around the object was given.
+                around the object was requested.
         """
         spec = photograph_cameras.path
         if self.object.size_in_metres is None:
             raise InputError(
-                f"`camera={spec}` is in metres, and how large {self.object.name} is is "
+                f"`camera={spec}` is in metres, and the size of {self.object.name} is "
                 "not known; give its longest side in metres, such as `size=0.1`"
             )
         with track_opened_files(photograph):
             pose, model = photograph_cameras.find(photograph)
+        # `AXES` turns our camera axes (left, up, ahead) to those of the file's pose.
         to_world = pose @ AXES
+        # from meters to object sizes
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)
         # Focal lengths are in widths and heights of the image, so that half a side's
         # angle has the tangent 0.5 / focal. The field of view is along the larger side.
         tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
+        # The pose becomes a camera of the scene, and is selected; `with_camera` also
+        # checks the settings. Then it gets its lens, which `with_camera` has removed.
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}
         scene = replace(self, cameras=cameras).with_camera(spec)
         return replace(scene, camera_model=replace(model, name=spec))
@@ -305,7 +309,7 @@ class SceneDescription(SceneData):
         return _load_object(spec, None, None)
 
     def with_camera(self, camera: str) -> SceneDescription:
-        """Return the scene as one of its cameras sees it, or through another lens.
+        """Return the scene with another camera, or with another lens of its camera.
 
         Args:
             camera: name of a camera of the scene, or of a preset of a mounted camera.
@@ -313,15 +317,19 @@ class SceneDescription(SceneData):
                 or the name of a bundled camera model.
 
         Raises:
-            InputError: a setting of the camera around the object was given, and another
-                is to see it; or a file cannot be used.
+            InputError: a setting of the camera around the object was requested, and
+                another camera is chosen; or a file cannot be used.
             UnknownNameError: it has no such camera.
         """
+        # A camera of the scene goes before a preset with the same name.
         if camera in PRESETS and camera not in self.cameras:
             return self._with_mounted_camera(camera)
         scene = replace(self, camera=ORBIT_CAMERA, camera_model=None)
-        if camera not in (ORBIT_CAMERA, *self.cameras):
+        is_lens = camera not in (ORBIT_CAMERA, *self.cameras)
+        if is_lens:
             return scene._with_lens(camera)
+        # The exposure is allowed with any camera. The others are those of the camera
+        # around the object.
         camera_settings = sorted(
             name
             for name in self.requested
@@ -409,10 +417,11 @@ class SceneDescription(SceneData):
         return scene.with_values(camera__distance=distance)
 
     def _make_preset_values(self, preset: CameraPreset) -> dict[str, float]:
-        """Return the settings of a mounted camera by name, without its distance.
+        """Return the settings of a mounted camera by name, except for its distance.
 
         A small object on a plain ground stands on a table. The preset's height counts
-        from the floor, `TABLE_HEIGHT` below, and the ground gets the size of a table.
+        from the floor, `TABLE_HEIGHT` below the table, and the ground gets the size of
+        a table.
         """
         is_on_plain_ground = (
             self.get_number("ground.size") > 0.0
@@ -421,13 +430,14 @@ class SceneDescription(SceneData):
         )
         is_on_table = is_on_plain_ground and self.size_in_metres <= MAX_TABLETOP_SIZE
         preset_values = {"camera.fov": preset.fov}
+        # A requested elevation takes the place of the height: only one can be set.
         if "camera.elevation" not in self.requested:
             place = find_place(self)
             floor = 0.0 if place is None else place.file.floor
             if is_on_table:
                 floor = -TABLE_HEIGHT
             preset_values["camera.height"] = preset.height + floor
-        if preset.in_lane:
+        if preset.in_lane:  # azimuth 0 is in the lane of the object
             preset_values["camera.azimuth"] = 0.0
         if is_on_table:
             preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres
@@ -435,7 +445,7 @@ class SceneDescription(SceneData):
 
     @property
     def things(self) -> Mapping[str, ThingPart]:
-        """The things beside the object by name, as they came."""
+        """The things next to the object by name, in the order of the setting."""
         return {part.name: part for part in self.parts if isinstance(part, ThingPart)}
 
     @property
@@ -540,6 +550,7 @@ class SceneDescription(SceneData):
         Raises InputError: the scene has no environment map.
         """
         if self.environment is None:
+            # Raises another message if a Mitsuba scene has environments of its own.
             check_single_environment(self.parts, requester)
             raise InputError(
                 f"{requester}: the scene has no environment map; give it one, "
@@ -554,7 +565,11 @@ class SceneDescription(SceneData):
 
     @property
     def metered_irradiance(self) -> float:
-        """Irradiance that the exposure of images is metered for, in scene units."""
+        """Irradiance that the exposure of images is metered for, in scene units.
+
+        Under it, a grey card has the radiance reflectance * irradiance / pi, which
+        times the gain is `CARD_DISPLAY_VALUE`.
+        """
         return (
             CARD_DISPLAY_VALUE
             * math.pi
@@ -730,7 +745,11 @@ class _Source(NamedTuple):
 def _find_source(
     object_spec: str | Path | ObjectAsset, plugins: Mapping[str, object] | None
 ) -> _Source:
-    """Return what an object spec names; with `plugins` it is the id of a shape."""
+    """Return the file and the node that an object spec names.
+
+    With `plugins`, a Mitsuba scene as a dictionary, the spec is the id of a shape, and
+    its file is not used. `split_node` cuts "scene.glb#car" into file and node.
+    """
     file: str | Path | ObjectAsset = object_spec
     node = None
     if isinstance(object_spec, str):
@@ -746,7 +765,7 @@ def _import_source(
     up: str | None,
     facing: str | None,
 ) -> ImportedScene:
-    """Read an object, and what stands around it.
+    """Read an object, and the scene around it if its source has one.
 
     Args:
         source: which file and which node of it the object is.
@@ -756,10 +775,12 @@ def _import_source(
         facing: the axis of a mesh file that is its front.
     """
     if plugins is not None:
-        # Mitsuba is imported only for what it reads
+        # Imported here, since other scenes do not need Mitsuba to be read.
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
-        return import_mitsuba_scene(plugins, source.node or str(object_spec))
+        # "scene#mug" and "mug" both name the shape "mug".
+        shape_id = source.node or str(object_spec)
+        return import_mitsuba_scene(plugins, shape_id)
     if source.node is None:
         return ImportedScene(_load_object(object_spec, up, facing))
     return _import_scene_file(
@@ -768,9 +789,9 @@ def _import_source(
 
 
 def _choose_environment(imported: ImportedScene, *, is_mitsuba: bool) -> str:
-    """Return the environment where none is requested: none where lights shine already.
+    """Return the environment if none is requested; "none" if the scene has lights.
 
-    What shines may be a light around the object; of a Mitsuba scene also the object.
+    A light may be one around the object, or in a Mitsuba scene also the object itself.
     """
     object_shines = is_mitsuba and imported.object.emission is not None
     if object_shines or _has_lights(imported.surroundings):
@@ -852,17 +873,18 @@ def _check_material_settings(
 ) -> None:
     """Check that an object has the single material that settings change.
 
-    Raises InputError: "material." settings are given, but the object has several
+    Raises InputError: "material." settings are requested, but the object has several
     materials or a surface that is described as a Mitsuba plugin.
     """
     material_settings = [name for name in requested if name.startswith("material.")]
     if asset.surface is not None and material_settings:
+        # Several materials (finishes) are one surface, too.
         surface = "a surface of Mitsuba's own"
         if asset.finishes:
             surface = "several materials"
         raise InputError(
-            f"`set` {material_settings[0]}: the object has {surface}, without it; "
-            "leave it out"
+            f"`set` {material_settings[0]}: the object has {surface}, which this "
+            "setting cannot change; leave it out"
         )
 
 
@@ -955,7 +977,8 @@ def _load_object(
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
-        # Any other `up` was rejected before. The branches tell the type checker so.
+        # `up` is "y", "z" or None: others were rejected before. These branches do not
+        # change it, but give it a type that `import_object` accepts.
         known_up: Literal["y", "z"] | None = None
         if up == "y":
             known_up = "y"

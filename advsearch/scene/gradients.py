@@ -79,11 +79,11 @@ class Group:
 
     @property
     def step_reason(self) -> str:
-        """Why the step has its width, as a text; empty where none is taken."""
+        """Why the step has its width, as a text; empty without differences."""
         if self.estimator not in DIFFERENCE_ESTIMATORS:
             return ""
         if self.step == self.pixel_step:
-            return "an outline moves by a pixel, or nothing moves"
+            return "it moves an outline by a pixel, or moves none"
         return (
             f"{self.step / self.pixel_step:.2g} times as wide as moves an outline by a "
             "pixel, so that a search can follow"
@@ -318,8 +318,8 @@ def _plan_group(
         forced: estimators by the name of a group, of a control, or "*".
         image_size: pixels of the longer side of the image.
     """
-    # With the smallest step, no coordinate of the group moves an outline by more than a
-    # pixel.
+    # The step over which the fastest coordinate of the group moves an outline by a
+    # pixel. A group without coordinates has no step.
     pixel_step = float(steps[group.coordinates].min()) if group.size else 0.0
     group = replace(group, pixel_step=pixel_step)
     if not group.valid:
@@ -334,8 +334,9 @@ def _plan_group(
             group, estimator=forced_by_name, reason="forced by name", is_forced=True
         )
     forced_for_all = forced.get(ALL_GROUPS)
-    # Some estimators are valid for every group, and not listed as such. But what is
-    # differentiated on the picture, without a render, stays as it is.
+    # Some estimators are valid for every group, and are not listed in `valid`. They are
+    # not forced on a group that only changes the finished image ("image"), whose
+    # derivative needs no render.
     is_always_valid = (
         forced_for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
     )
@@ -354,13 +355,14 @@ def _plan_group(
 def _choose_step(group: Group, image_size: float) -> float:
     """Return the half-width of a group's differences in u.
 
-    It is the step of a pixel, `Group.pixel`. A single coordinate that moves outlines
-    has a wider one, `SEARCH_STEP`, as long as that moves them by no more than
-    `SEARCH_FRACTION` of the image, whose longer side has `image_size` pixels.
+    It is `Group.pixel_step`, over which an outline moves by a pixel. A single
+    coordinate that moves outlines has a wider one, `SEARCH_STEP`, as long as that moves
+    them by no more than `SEARCH_FRACTION` of the image, whose longer side has
+    `image_size` pixels.
     """
-    # both estimators are right only for what moves no outline
-    moves_outlines = not {"adjoint", "image"} & {*group.valid}
-    if group.size != 1 or not moves_outlines:
+    # "adjoint" and "image" are valid only for groups that move no outline.
+    moves_no_outline = bool({"adjoint", "image"} & {*group.valid})
+    if group.size != 1 or moves_no_outline:
         return group.pixel_step
     widest_step = SEARCH_FRACTION * image_size * group.pixel_step
     return max(group.pixel_step, min(SEARCH_STEP, widest_step))
@@ -385,11 +387,12 @@ Backward = Callable[[Any, Tensor], tuple[Tensor | None, ...]]
 
 
 def forbid_second_derivatives(backward: Backward) -> Backward:
-    """Make what a backward pass returns raise an error when it is differentiated again.
+    """Return a backward pass whose results raise an error if they are differentiated.
 
-    Torch's own `once_differentiable` does so only if the backward pass reaches its
-    node. `torch.autograd.grad` and `functional.hessian` may leave that node out: they
-    would return a second derivative that lacks a part.
+    Torch's own `once_differentiable` raises an error only if the second backward pass
+    reaches its node in the graph. `torch.autograd.grad` and `functional.hessian` visit
+    only nodes on the way to the requested inputs. They may leave that node out, and
+    would return a second derivative in which a part is missing.
     """
 
     @wraps(backward)
@@ -405,7 +408,7 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         arguments = (cotangent, *ctx.saved_tensors)
         guarded = []
         for value in derivatives:
-            # the cotangent itself, of an identity, may be differentiated
+            # An identity returns the cotangent itself, whose derivative is right.
             if value is not None and value is not cotangent:
                 value = _OnceDifferentiable.apply(value, *arguments)  # type: ignore[no-untyped-call]
             guarded.append(value)

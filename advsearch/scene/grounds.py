@@ -80,9 +80,12 @@ def make_traffic_remark(scene: SceneData) -> str:
 
 
 def is_enclosed(scene: SceneData) -> bool:
-    """Return whether much stands around the object: light paths seldom leave the
-    scene.
+    """Return whether houses or trees stand around the object.
+
+    Then light paths seldom leave the scene. Only places with such meshes have them.
     """
+    # `is_laid_ground` marks all meshes of a road or a place, `is_ground` those that are
+    # the ground itself.
     return any(
         part.is_laid_ground and not part.is_ground
         for part in scene.surrounding_meshes.values()
@@ -167,6 +170,7 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
         for part in scene.parts
         if not (isinstance(part, MeshPart) and part.is_laid_ground)
     )
+    # A photograph behind the object shows a ground already.
     place = None
     if scene.backdrop_photograph is None:
         place = load_requested_place(scene)
@@ -186,13 +190,15 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
 def _is_dark(environment: EnvironmentAsset | None) -> bool:
     """Return whether level ground has less illuminance than `DUSK_ILLUMINANCE`.
 
-    False where that is not known: without an environment, or if it has no unit.
+    The result is False if that is not known: without an environment, or if its light
+    has no unit.
     """
     if environment is None or environment.candelas is None:
         return False
     irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
-    luminance = float(irradiance @ torch.tensor(LUMINANCE))
-    return environment.candelas * luminance < DUSK_ILLUMINANCE
+    # Weighted like a luminance, times cd/m2 for a radiance of 1, it is in lux.
+    weighted_irradiance = float(irradiance @ torch.tensor(LUMINANCE))
+    return environment.candelas * weighted_irradiance < DUSK_ILLUMINANCE
 
 
 DUSK_ILLUMINANCE = (
@@ -287,6 +293,8 @@ def find_valid_range(
     rotation = (surroundings.rotation + 180.0) % 360.0 - 180.0
     if abs(rotation) > MAX_MAP_ROTATION:
         return NO_RANGE
+    # A camera that moves back by d sees things at a distance r too large by the factor
+    # (r + d) / r. The nearest things count in its direction of view (`towards`).
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
         surroundings.nearest_distance, camera.towards
     )
@@ -295,9 +303,11 @@ def find_valid_range(
     if camera.lower_angle > 0.0:
         lower_angle = math.radians(min(camera.lower_angle, 179.0))
         hidden_ground_distance = camera.height / math.tan(lower_angle)
+    # The ground ends where the camera stands, at its azimuth from the object.
     ground_distance = _reach_of_area(surroundings.ground_extent, camera.azimuth)
     max_distance = min(max_scale_distance, ground_distance + hidden_ground_distance)
-    return max(0.0, max_distance), MAX_SCALE_ERROR * surroundings.height
+    max_height = MAX_SCALE_ERROR * surroundings.height
+    return max(0.0, max_distance), max_height
 
 
 def _reach_of_area(area: Box | float, azimuth: float) -> float:
@@ -317,11 +327,12 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
 
 
 def find_surroundings(scene: SceneData) -> Surroundings | None:
-    """Return what is known of the place that a scene's environment is a picture of.
+    """Return the dimensions of the place that a scene's environment is a picture of.
 
     A picture looks right only from near the point where it was taken. The result has
-    the height from which that was, the distance of the nearest things in it, and where
-    the ground ends, in metres. It is None if no ground has to fit the picture.
+    the height of that point, the distance of the nearest things in the picture, and the
+    extent of the ground, in meters. It is None if the scene has no ground to which the
+    picture has to fit.
     """
     environment = scene.environment
     # An enclosing place is geometry, which looks right from everywhere.
@@ -351,11 +362,15 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
         radius = scene.values.get("ground.radius")
         if radius is None:
             radius = DEFAULT_EMPTY_RADIUS * height
-        return Surroundings(height, radius, extent)
+        return Surroundings(
+            height=height, nearest_distance=radius, ground_extent=extent
+        )
     if not is_paved(scene):
         return None
     # Any other map is taken for infinitely far: only the end of the ground counts.
-    return Surroundings(math.inf, math.inf, extent)
+    return Surroundings(
+        height=math.inf, nearest_distance=math.inf, ground_extent=extent
+    )
 
 
 def bound_ground(place: Place) -> Box:
@@ -383,17 +398,20 @@ def make_camera_view(
         fov: field of view along the larger side, degrees; None: the scene's.
     """
     pose = camera_to_world(scene) if to_world is None else to_world
+    # An object of unknown size counts as 1 m large.
     x, y, z = pose[:3, 3] * scene.size_in_metres
     forward = pose[:3, 2]
     if fov is None:
         fov = scene.get_number("camera.fov")
     half_fov = math.radians(fov) / 2.0
-    # The field of view is along the larger side: that is the height, or else the height
-    # is smaller by the aspect.
+    # The field of view is along the larger side. In a wide image the height is smaller
+    # than that by the aspect.
+    height_to_larger_side = min(1.0, 1.0 / scene.aspect)
     half_height_angle = math.degrees(
-        math.atan(math.tan(half_fov) * min(1.0, 1.0 / scene.aspect))
+        math.atan(math.tan(half_fov) * height_to_larger_side)
     )
-    # A lens of the user's, which has a name, may show anything down to straight below.
+    # A lens of the user's, which has a name, may have any field of view: it may show
+    # the ground straight below the camera.
     if scene.camera_model is not None and scene.camera_model.name:
         half_height_angle = 90.0
     azimuth = math.degrees(math.atan2(y, x))
@@ -450,6 +468,7 @@ def list_view_remarks(
     outside = () if place is None else list_outside_remarks(scene, place, views)
     if outside or surroundings is None:
         return outside
+    # `NO_RANGE` depends on the map's rotation only, so that any view would do.
     is_against_road = find_valid_range(surroundings, views[0]) == NO_RANGE
     # Houses along a road are at different distances in x and y, which are a tuple.
     # Other surroundings are equally far in all directions.
@@ -533,6 +552,8 @@ def list_outside_remarks(
         place: its place, whose file states the box.
         views: positions and directions of its camera, at least one.
     """
+    # `valid` is a model with the fields x, y and z; iterating it yields names and
+    # values. An axis without limits is None.
     axis_limits = [
         (axis, limits) for axis, limits in place.file.valid if limits is not None
     ]

@@ -1,22 +1,22 @@
-"""Headlamps and tail lamps of cars: the object's own, those of cars beside it, and
-those of the car behind the camera.
+"""Headlamps and tail lamps of cars: of the object, of cars next to it, and of the car
+that carries the camera.
 
 A headlamp is a point that shines by a table of luminous intensity over angles, and
-glass that glows. Of one lamp, at h degrees aside and v above the horizon, with d =
--0.57 - v, the angle below the cut-off:
+glass that glows. The intensity of one lamp, h degrees to the side and v degrees above
+the horizon, follows from the angle below the cut-off, d = -0.57 - v:
 
     low:  (14,500 exp(-(h/5)^2/2) exp(-d/1.5) + 4,000 exp(-(h/16)^2/2) exp(-d/5))
           / (1 + exp(-d/0.08)) candela
     high: low + 45,000 exp(-(h/3.5)^2/2 - (v/1.5)^2/2)
 
-The cut-off is level, 1 % below the horizon; a real one rises on the side of the kerb.
-These numbers fulfil what a lamp of class B has to (UN Regulation 112, section 6.2 and
-6.3): at 0.86 degrees down at least 5,100 cd ahead and 10,100 at
-1.72 aside, at 1.72 down at least 1,700 at 9 aside, above the horizon at most 350 to
-625, of the high beam 40,500. The
-glass of a headlamp shines 250 cd ahead, which is what is left above the cut-off, and
-that of a tail lamp 10 cd in red (UN Regulation 7: from 4).
-`tests/scene/test_headlamps.py` holds them to these.
+The cut-off is level, 1 % below the horizon; a real one rises on the side of the curb.
+These numbers fulfil the requirements for a lamp of class B (UN Regulation 112, sections
+6.2 and 6.3). At 0.86 degrees down they are at least 5,100 cd ahead and 10,100 cd at
+1.72 degrees to the side; at 1.72 degrees down at least 1,700 cd at 9 degrees to the
+side; above the horizon at most 350 to 625 cd. For the high beam 40,500 cd are required.
+The glass of a headlamp shines with 250 cd ahead, which is the light left above the
+cut-off, and that of a tail lamp with 10 cd in red (UN Regulation 7: at least 4). This
+is tested in `tests/scene/test_headlamps.py`.
 """
 
 from __future__ import annotations
@@ -46,42 +46,45 @@ from advsearch.scene.scene_data import AnyScene, SceneData
 from advsearch.scene.settings import LAMPS, LAMPS_OFF
 from advsearch.scene.things import ThingPart, find_triangle_heights
 
-# degrees above the horizon at which the low beam has half of what it has below
+# degrees above the horizon at which the low beam has half of its intensity below
 CUT_OFF = -0.57
-# tangent of the table's angle to either side, and its size; texels are square
+# tangent of the table's largest angle to the side, and its size; texels are square
 TABLE_HALF_WIDTH = 1.0
 ROWS = 512
 COLUMNS = 896
-# candela ahead of the glass of one headlamp, and behind that of one tail lamp
+# intensity of the glass of one headlamp ahead, and of one tail lamp behind, candela
 HEADLAMP_CANDELA = 250.0
 TAILLAMP_CANDELA = 10.0
 WHITE, RED = (
     color / (color @ np.array(LUMINANCE))
     for color in np.array([[1.0, 0.95, 0.86], [1.0, 0.0, 0.0]])
 )
-"""Linear colours with a luminance of 1."""
+"""Linear colors with a luminance of 1."""
 MATERIAL_NAMES = {
     "headlamps": re.compile(r"head[ _-]?(light|lamp)", re.IGNORECASE),
     "taillamps": re.compile(r"(tail|rear)[ _-]?(light|lamp)", re.IGNORECASE),
 }
-"""What the materials of lamps are called in a file."""
+"""Patterns of the names of materials of lamps in a file."""
 LAMP_HEIGHTS = {"headlamps": (0.65, 0.45), "taillamps": (0.85, 0.6)}
 LAMP_OFFSET = 0.36
 LAMP_RADIUS = 0.07
-"""Where a car has lamps whose file names none: metres above its foot, or that share of
-its height where it is lower; to either side, as a share of its width; and how large
-they are, metres.
+"""Positions of lamps on a car without materials of lamps.
+
+A height is in meters above the car's lowest point, or if it is lower, the second
+number, a fraction of the car's height. The offset to either side is a fraction of the
+car's width, and the radius is in meters.
 """
-N_SPOKES = 12
+N_SPOKES = 12  # points on the rim of such a lamp
 EGO_LAMP_POSITION = (1.7, 0.62, 0.65)
-"""Where the headlamps of the camera's own car are: metres before the camera, to either
-side, above the ground.
+"""Position of the left headlamp of the car that carries the camera: meters in front of
+the camera, to the left, and above the ground.
 """
 # A beam shines along its own +z; a car drives along its +x, with +z up.
 BEAM_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 GLASS_MATERIAL = Material(roughness=0.06, specular=0.6)
-GLASS_OFFSET = 0.004  # how far glass stands out from what it lies on, metres
-# how far before the glass of a lamp its beam starts, so that the glass hides none of it
+GLASS_OFFSET = 0.004  # distance of the glass of a lamp from the car's body, meters
+# distance in front of the glass at which the beam starts, so that the glass hides none
+# of it, meters
 BEAM_OFFSET = 5.0 * GLASS_OFFSET
 
 
@@ -147,10 +150,10 @@ def make_candela_table(kind: str) -> Float32Array:
 
 
 def add_lamps(scene: AnyScene) -> AnyScene:
-    """Return the scene with the lamps that are on, and no others.
+    """Return the scene with those lamps that are on.
 
-    The object, the things beside it and the camera's own car may carry lamps. Lamps
-    that the scene has already are replaced. If no lamp is on and none was there, the
+    The object, the things next to it and the camera's own car may carry lamps. Lamps
+    that the scene has already are removed. If no lamp is on and the scene has none, the
     same scene is returned.
 
     Raises:
@@ -160,7 +163,7 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     other_parts = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
-    # what each car has on: "off", "low" or "high" beam
+    # "off", "low" or "high" beam of each car
     kind_by_carrier = {
         "object": get_lamp_kind(scene, "object.lamps"),
         CAMERA: get_lamp_kind(scene, "camera.lamps"),
@@ -174,10 +177,12 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     if not kind_by_lit_carrier:
         had_lamps = len(other_parts) < len(scene.parts)
         return replace(scene, parts=other_parts) if had_lamps else scene
-    radiance_unit = _check_units(scene, next(iter(kind_by_lit_carrier)))
+    # The units are those of the scene. One of the carriers is named in the message.
+    first_carrier = next(iter(kind_by_lit_carrier))
+    radiance_unit = _get_radiance_unit(scene, first_carrier)
     scene = replace(scene, parts=other_parts)
     # Each car has two beams. With this weight all beams together are sampled as often
-    # as the environment.
+    # as the environment, which has a weight of 1.
     weight = 1.0 / (2 * len(kind_by_lit_carrier))
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
@@ -191,35 +196,37 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     return replace(scene, parts=(*other_parts, *lamps))
 
 
-def _check_units(scene: SceneData, carrier: str) -> float:
+def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
     """Return the luminance of a radiance of 1, cd/m2, in the scene's environment.
 
     Args:
         scene: the scene.
-        carrier: name of what has lamps, for the message.
+        carrier: name of a car whose lamps are on, for the message.
 
     Raises InputError: the environment's light has no unit, or the object's size in
     metres is not known.
     """
+    # names for the message; all other cars are things
     settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
     setting = settings.get(carrier, "things: lamps")
     radiance_unit = None if scene.environment is None else scene.environment.candelas
     if radiance_unit is None:
         raise InputError(
             f"{setting}: lamps are in candela, and the brightness of this environment "
-            "has no unit; take one of the avenue, or leave the lamps off"
+            "has no unit; use an environment of the bundled avenue, or leave the lamps "
+            "off"
         )
     if scene.object.size_in_metres is None:
         raise InputError(
-            f"{setting}: lamps are so many metres apart, and how large "
-            f"{scene.object_name} is is not known; give its longest side in metres, "
+            f"{setting}: the positions of lamps are in metres, and the size of "
+            f"{scene.object_name} is not known; give its longest side in metres, "
             "such as `size=4.5`"
         )
     return radiance_unit
 
 
 def get_lamp_kind(scene: SceneData, setting: str) -> str:
-    """Return the word that a setting of lamps has, one of `LAMPS`.
+    """Return the value of a setting of lamps, one of `LAMPS`.
 
     The scene's value is the word's index; without one, lamps are off.
     """
@@ -247,25 +254,38 @@ def _make_lamps(
     if carrier == CAMERA:
         # in the coordinates of the camera's car, see `compute_car_pose`
         left_position = np.array(EGO_LAMP_POSITION)
-        right_position = left_position * [1.0, -1.0, 1.0]
+        right_position = left_position * [1.0, -1.0, 1.0]  # mirrored to the other side
         positions = [
             position / scene.size_in_metres
             for position in (left_position, right_position)
         ]
     else:
         part = scene.meshes[carrier]
-        units_per_metre = _count_units_per_metre(scene, part)
+        units_per_metre = _compute_units_per_metre(scene, part)
+        # radiance of the scene times square meters
         front_power = HEADLAMP_CANDELA / radiance_unit * WHITE
         rear_power = TAILLAMP_CANDELA / radiance_unit * RED
         headlamp_glass = _make_glass(
-            part, "headlamps", 1.0, units_per_metre, front_power
+            part,
+            "headlamps",
+            facing=1.0,
+            units_per_metre=units_per_metre,
+            power=front_power,
         )
         yield headlamp_glass
-        yield _make_glass(part, "taillamps", -1.0, units_per_metre, rear_power)
+        yield _make_glass(
+            part,
+            "taillamps",
+            facing=-1.0,
+            units_per_metre=units_per_metre,
+            power=rear_power,
+        )
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
-    # From candela to the scene's unit. Intensity is radiance times squared length, and
-    # lengths are in object sizes.
-    red, green, blue = map(float, WHITE / (radiance_unit * scene.size_in_metres**2))
+    # The color of a beam, and the factor from candela to the scene's unit. Intensity is
+    # radiance times squared length, and a beam is a point in the scene, whose lengths
+    # are in object sizes. (The area of glass is measured in square meters.)
+    beam_color = WHITE / (radiance_unit * scene.size_in_metres**2)
+    red, green, blue = map(float, beam_color)
     for name, position in zip(("left", "right"), positions, strict=True):
         yield BeamLamp(
             name=f"{carrier}-{name}-beam",
@@ -277,17 +297,21 @@ def _make_lamps(
         )
 
 
-def _count_units_per_metre(scene: SceneData, part: MeshPart) -> float:
-    """Return how many units of a car's mesh are a metre.
+def _compute_units_per_metre(scene: SceneData, part: MeshPart) -> float:
+    """Return the length of a meter in the coordinates of a car's mesh.
 
-    A car's size in metres is that of its longest side; `part` is the scene's object or
-    a thing beside it.
+    The size of a car in meters is that of its longest side. `add_lamps` has checked
+    that it is known.
+
+    Args:
+        scene: the scene.
+        part: the scene's object, or a thing next to it.
     """
-    metres = scene.size_in_metres
+    size_in_metres = scene.size_in_metres
     if isinstance(part, ThingPart):
-        metres = part.size_in_metres
+        size_in_metres = part.size_in_metres
     longest_side = float(np.ptp(part.mesh.vertices, axis=0).max())
-    return longest_side / metres
+    return longest_side / size_in_metres
 
 
 def _find_beam_positions(
@@ -324,17 +348,17 @@ def _make_glass(
 ) -> LampGlass:
     """Return the glass of a car's two headlamps or tail lamps.
 
-    If the car has a material with such a name, the glass is a copy of its faces, moved
-    out along their normals. Otherwise it is two disks in front of the car's body. The
-    glass moves with the car's nearest vertices.
+    If the car has a material with the name of such lamps, the glass is a copy of its
+    faces, moved out along their vertices' normals. Otherwise it is two disks in front
+    of the car's body. The glass moves with the car's nearest vertices.
 
     Args:
         part: the car.
         lamp_type: "headlamps" or "taillamps", a key of `MATERIAL_NAMES`.
         facing: 1 for lamps that shine along +x, -1 along -x.
-        units_per_metre: length of a metre in the car's coordinates.
-        power: (3,) radiance times square metres, as seen from straight ahead, of each
-            of the two lamps.
+        units_per_metre: length of a meter in the car's coordinates.
+        power: (3,) radiance times square meters of one of the two lamps, for a viewer
+            straight ahead.
     """
     mesh = part.mesh
     named_faces = [
@@ -348,9 +372,10 @@ def _make_glass(
         )
     else:
         glass = _make_disks(mesh, lamp_type, facing, units_per_metre)
-    corners = glass.vertices[glass.faces] / units_per_metre
-    # Square metres as seen from straight ahead: the x of the faces' area vectors.
-    facing_area = facing * compute_area_vectors(corners)[:, 0] / 2.0
+    corners_in_metres = glass.vertices[glass.faces] / units_per_metre
+    # (F,) square meters of each face for a viewer straight ahead, below 0 if it faces
+    # the other way. An area vector is along the normal, with twice the area as length.
+    facing_area = facing * compute_area_vectors(corners_in_metres)[:, 0] / 2.0
     glass_mesh = Mesh(
         vertices=glass.vertices.astype(np.float32),
         faces=glass.faces.astype(np.uint32),
@@ -360,8 +385,9 @@ def _make_glass(
     # The base color has the light's color, with 0.8 as its largest channel: no surface
     # reflects all light.
     glass_color = (0.8 * power / power.max()).astype(np.float32)
-    # two lamps send the power over the area of both
-    radiance = 2.0 * power / max(float(facing_area.clip(0.0).sum()), 1e-9)
+    # The visible area is that of both lamps, and so is the power.
+    visible_area = float(facing_area.clip(0.0).sum())
+    radiance = 2.0 * power / max(visible_area, 1e-9)
     return LampGlass(
         name=f"{part.name}-{lamp_type}",
         mesh=glass_mesh,
@@ -380,8 +406,8 @@ class _Glass(NamedTuple):
     vertices: Float64Array  # (V, 3)
     faces: IntArray  # (F, 3)
     normals: Float64Array  # (V, 3)
-    vertex_of_carrier: IntArray  # (V,) the car's vertex that each vertex moves with
-    face_of_carrier: IntArray  # (F,) the car's face that each face is taken for
+    vertex_of_carrier: IntArray  # (V,) index of the car's vertex that each moves with
+    face_of_carrier: IntArray  # (F,) index of the car's face that each counts as
 
 
 def _lift_faces(mesh: Mesh, face: IntArray, offset: float) -> _Glass:
@@ -397,9 +423,8 @@ def _make_disks(
 ) -> _Glass:
     """Make two disks at the front or rear of a car, for lamps without a material.
 
-    `LAMP_HEIGHTS` and `LAMP_OFFSET` tell how high and how far to the sides they are.
-    They stand out from the body by `GLASS_OFFSET`. The first is on the left (+y). Each
-    belongs to the car's nearest vertices and faces.
+    Their heights are `LAMP_HEIGHTS`, and their offsets to the sides `LAMP_OFFSET`. They
+    are `GLASS_OFFSET` in front of the body. The first disk is on the left (+y).
 
     Args:
         mesh: mesh of the car.
@@ -407,27 +432,26 @@ def _make_disks(
         facing: 1 for lamps that shine along +x, -1 along -x.
         units_per_metre: length of a metre in the car's coordinates.
     """
-    # mirrored for tail lamps, so that they look along +x too
+    # For tail lamps the car is mirrored, so that these face along +x, too.
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [facing, 1.0, 1.0]
     lower = corners.min(axis=(0, 1))
     upper = corners.max(axis=(0, 1))
     height, height_fraction = LAMP_HEIGHTS[lamp_type]
     width = upper[1] - lower[1]
-    # a disk takes at most a fifth of a narrow car's width
+    # A disk is at most a fifth as wide as a narrow car.
     rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
+    center_z = lower[2] + min(
+        height * units_per_metre, height_fraction * (upper[2] - lower[2])
+    )
     disks = list[Float64Array]()
     for side in (1.0, -1.0):
         center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
-        center = np.array([0.0, center_y, lower[2]])
-        center[2] += min(
-            height * units_per_metre, height_fraction * (upper[2] - lower[2])
-        )
+        # x is set below
+        center = np.array([0.0, center_y, center_z])
         disk_vertices = np.concatenate([[center], center + rim_offsets])
-        # in mirrored coordinates until here: `facing` brings tail lamps back
-        disk_vertices[:, 0] = facing * (
-            _find_foremost(corners, disk_vertices, upper[0])
-            + GLASS_OFFSET * units_per_metre
-        )
+        body_x = _find_foremost_x(corners, disk_vertices, default=upper[0])
+        # `facing` mirrors the disks of tail lamps back to the rear.
+        disk_vertices[:, 0] = facing * (body_x + GLASS_OFFSET * units_per_metre)
         disks.append(disk_vertices)
     return _attach_disks(mesh, disks, facing)
 
@@ -448,10 +472,18 @@ def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _
     # The vertices of the second disk follow those of the first.
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
-    vertex_of_carrier = cKDTree(mesh.vertices).query(vertices)[1]
-    face_centers = mesh.vertices[mesh.faces].mean(axis=1)
-    face_of_carrier = cKDTree(face_centers).query(vertices[faces].mean(axis=1))[1]
-    return _Glass(vertices, faces, normals, vertex_of_carrier, face_of_carrier)
+    # A query returns the distances to the nearest points, and their indices.
+    _distances, nearest_vertex = cKDTree(mesh.vertices).query(vertices)
+    car_face_centers = mesh.vertices[mesh.faces].mean(axis=1)
+    disk_face_centers = vertices[faces].mean(axis=1)
+    _distances, nearest_face = cKDTree(car_face_centers).query(disk_face_centers)
+    return _Glass(
+        vertices,
+        faces,
+        normals,
+        vertex_of_carrier=nearest_vertex,
+        face_of_carrier=nearest_face,
+    )
 
 
 def _make_circle(facing: float) -> Float64Array:
@@ -469,7 +501,9 @@ def _make_disk_faces() -> IntArray:
     return np.stack([0 * spoke, 1 + spoke, 1 + (spoke + 1) % N_SPOKES], axis=1)
 
 
-def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) -> float:
+def _find_foremost_x(
+    corners: Float64Array, disk: Float64Array, default: float
+) -> float:
     """Return the largest x at which a line through a disk's vertex meets a face.
 
     The lines are along x, so that a disk at this x is in front of the car's body.
@@ -479,13 +513,16 @@ def _find_foremost(corners: Float64Array, disk: Float64Array, default: float) ->
         disk: (V, 3) vertices of the disk, whose x does not count.
         default: result if no such line meets a face.
     """
-    # (F, 3): per axis, whether the boxes of triangle and disk lie apart; x is not used
+    # (F, 3): for each axis, whether the boxes of triangle and disk lie apart
     is_disjoint = (corners.min(axis=1) > disk.max(axis=0)) | (
         corners.max(axis=1) < disk.min(axis=0)
     )
-    # The axis x becomes the height, since `find_triangle_heights` looks along z.
-    faces_around = corners[~is_disjoint[:, 1:].any(axis=1)][:, :, [1, 2, 0]]
-    foremost_x = [
-        x for point in disk[:, 1:] for x in find_triangle_heights(faces_around, point)
+    # The lines are along x, so that only y and z have to overlap.
+    may_meet = ~is_disjoint[:, 1:].any(axis=1)
+    # `find_triangle_heights` finds heights z over points (x, y). With the axes in the
+    # order y, z, x it finds x over points (y, z).
+    rotated_faces = corners[may_meet][:, :, [1, 2, 0]]
+    met_x = [
+        x for point in disk[:, 1:] for x in find_triangle_heights(rotated_faces, point)
     ]
-    return max(foremost_x, default=default)
+    return max(met_x, default=default)

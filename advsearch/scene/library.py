@@ -117,11 +117,11 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
 
     `split` selects those of "train", "heldout", "street" or "place".
     """
-    facts_by_name = _read_environment_facts().items()
+    facts_by_name = _read_environment_facts()
     return tuple(
         sorted(
             name
-            for name, fact in facts_by_name
+            for name, fact in facts_by_name.items()
             if split is None or fact["split"] == split
         )
     )
@@ -327,7 +327,10 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
 
 
 def _check_planes(path: Path, planes: Sequence[Plane]) -> None:
-    """Check the radiance of an ``.exr`` image; an ``.hdr`` can hold no wrong values.
+    """Check the radiance of an ``.exr`` image.
+
+    The format of ``.hdr`` files cannot represent such values. Negative infinity is
+    reported as infinite, since that is tested first.
 
     Raises InputError: a texel is NaN, infinite or negative in one of its three planes.
     """

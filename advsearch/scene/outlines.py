@@ -94,9 +94,9 @@ def _compare_outline(
         mask: (H, W) bool, the pixels in which the mesh is the nearest surface.
 
     Returns:
-        The fraction of the outline that is visible, and whether the outline goes on
-        beyond the image. Both are None if the outline is not known: the faces do not
-        tell it, or it does not cover the visible pixels.
+        The fraction of the outline that is visible, and whether the outline extends
+        beyond the image. Both are None if the outline is not known: the faces cannot be
+        projected, or the outline does not cover the visible pixels.
     """
     height, width = mask.shape
     corners = _project_faces(renderer, inputs, name, (height, width))
@@ -109,9 +109,11 @@ def _compare_outline(
     x = outline.left + (column + 0.5) * outline.step
     y = outline.top + (row + 0.5) * outline.step
     is_inside = (x > 0) & (x < width) & (y > 0) & (y < height)
-    # visible pixels over the pixels of the full outline, also those beyond the image
+    # Visible pixels over the pixels of the full outline, also those beyond the image. A
+    # cell of the outline is `step` pixels wide and high.
     fraction = float(mask.sum()) / (len(row) * outline.step**2)
-    return min(1.0, fraction), bool((~is_inside).any())
+    is_truncated = bool((~is_inside).any())
+    return min(1.0, fraction), is_truncated
 
 
 def _select_camera_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -176,7 +178,8 @@ class _Outline:
         """Return whether the visible pixels of a mask (H, W) lie in the outline.
 
         At least `MIN_MATCHING_FRACTION` of them have to lie in a cell of the outline,
-        or in a neighbour of one. If not, the projection is not what was rendered.
+        or in a neighbor of one. Otherwise the outline, which was made by projecting the
+        faces, is not that of the rendered mesh.
         """
         n_rows, n_columns = self.cells.shape
         pixel_row, pixel_column = np.nonzero(mask)

@@ -1,9 +1,9 @@
-"""What may be in a scene beside its environment map, as data: meshes, lamps, haze, each
-under a name. And cameras.
+"""Named parts of a scene other than its environment map, as data: meshes, lamps and
+haze; and cameras.
 
-A part says what it is and which scene inputs it takes, torch tensors under names of
-ours; `mitsuba_backend` translates it. A part of another kind is a subclass, with a
-translation registered in `mitsuba_backend.parts.translation`.
+A part states its properties and which scene inputs it takes: torch tensors with our own
+names. `mitsuba_backend` translates it. A new kind of part is a subclass, with a
+translation registered by `mitsuba_backend.parts.translate_part.register`.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class MeshPart(Shape, ScenePart):
     `advsearch.scene.assembly`.
     """
 
-    to_world: Float64Array = field(
-        default_factory=lambda: np.eye(4)
-    )  # (4, 4) its base pose
-    place: Place | None = None  # which it belongs to, and goes with
-    is_ground: bool = False  # of a place: things stand on it
-    # Solids of a place: what nothing else can be in, in object sizes.
+    # (4, 4) base pose
+    to_world: Float64Array = field(default_factory=lambda: np.eye(4))
+    # place that the mesh belongs to; it is removed with the place
+    place: Place | None = None
+    is_ground: bool = False  # whether it is the part of a place on which things stand
+    # Solids of a place, in object sizes: nothing else can be inside them.
     solids: tuple[Solid, ...] = ()
 
     @property
@@ -129,7 +129,8 @@ class _Point(ScenePart):
     ) -> tuple[Float64Array, Float64Array]:
         """Return the vector (3,) from a position to the lamp, and its irradiance (3,).
 
-        The irradiance is that of a surface that faces the lamp. By base values.
+        The irradiance is that of a surface that faces the lamp, for the base values of
+        the lamp's position and intensity.
         """
         to_lamp = np.array(self.position) - position
         return to_lamp, np.array(self.intensity) / max(float(to_lamp @ to_lamp), 1e-12)
@@ -206,6 +207,7 @@ class SpotLamp(_Point):
         # Degrees from the axis: full light up to `beam`, falling to none at `cutoff`.
         cutoff, beam = self.cone
         distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
+        # The lamp shines along its z, and `-to_lamp` points from it to the position.
         cosine = -to_lamp @ self.to_world[:3, 2] / distance
         angle = math.degrees(math.acos(min(max(float(cosine), -1.0), 1.0)))
         fraction = min(max((cutoff - angle) / (cutoff - beam), 0.0), 1.0)
@@ -374,9 +376,10 @@ class PluginNumber:
     key: str  # key that name: "red.reflectance.value"
     values: tuple[float, ...]  # its one or three numbers in the scene as it is
     input: str  # the scene input that sets it
-    # the valid ways to differentiate it, preferred first
+    # valid estimators of its derivative, the preferred one first
     valid: tuple[str, ...] = ("differences",)
-    # Mitsuba has it as a plain number, which light paths are traced anew for
+    # whether it is a plain number in Mitsuba, a constant of the compiled kernels: after
+    # a change they are recorded again
     plain: bool = False
 
 

@@ -88,13 +88,14 @@ def compute_pose(
     linear = parameters["scale"] * make_rotation(
         parameters["yaw"], parameters["pitch"], parameters["roll"]
     )
+    # height of the lowest vertex relative to the middle, below 0
     lowest = float(((positions - center) @ linear.T)[:, 2].min())
-    # `- linear @ center` moves the middle to the origin
+    # `- linear @ center` moves the middle to the origin. From there the height puts the
+    # lowest vertex on the floor, and the shift is added.
     translation = (
         np.array([parameters["x"], parameters["y"], floor + parameters["z"] - lowest])
         - linear @ center
     )
-    # In x and y the middle goes back to where it was; its height follows from the
-    # floor.
+    # In x and y the middle goes back to its old position, plus the shift.
     translation[:2] += center[:2]
     return make_pose(linear, translation)

@@ -1,4 +1,4 @@
-"""Base class of what predicts images of a scene without tracing paths for each."""
+"""Base class of predictors: images of a scene without tracing paths for each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from advsearch.scene.renderer import Renderer
 
 
 class RefusalCause(Enum):
-    """Cause of a refusal, as far as code has to know it."""
+    """Cause of a refusal, for code that reacts to some of them."""
 
     UNSUITABLE = "the scene, the space or the policy"
     TOO_FEW_STEPS = "it does not pay for so few images"
@@ -55,8 +55,7 @@ class Predictor(ABC):
 
     Attributes:
         path_renderer: the renderer `traced`.
-        non_finite: how many values were not finite while it was made, and were set to
-            zero.
+        non_finite: how many traced values were not finite, and were set to zero.
     """
 
     non_finite: int = 0
@@ -67,8 +66,8 @@ class Predictor(ABC):
     @property
     def renderer(self) -> Renderer:
         """A renderer of the same space whose images are the predicted ones."""
-        # A new one each time: two objects that hold each other are freed late, and
-        # matrices are large.
+        # It is not stored, since it refers to this object. Two objects that refer to
+        # each other are freed late, and matrices are large.
         return self.path_renderer.copy_with(predict=self.predict_radiance)
 
     def __call__(self, u: Tensor) -> Tensor:
@@ -94,7 +93,7 @@ class Predictor(ABC):
     @property
     @abstractmethod
     def n_bytes(self) -> int:
-        """Memory of all that is stored."""
+        """Memory of all that is stored, bytes."""
 
     @property
     def n_traced_images(self) -> int:
@@ -105,7 +104,8 @@ class Predictor(ABC):
 def inputs_differ(first: Tensor | None, second: Tensor | None) -> bool:
     """Return whether two inputs of a scene are not the same, bit for bit.
 
-    A missing one (None) differs from any other, and from a missing one.
+    None stands for an input without a known value, which may differ from anything. So
+    even two None count as different.
     """
     return (
         first is None
@@ -118,7 +118,8 @@ def inputs_differ(first: Tensor | None, second: Tensor | None) -> bool:
 class LinearMap(torch.autograd.Function):
     """A linear map as a torch operation, differentiable any number of times.
 
-    It is `times`; its transpose is the derivative.
+    The map is `times`. Its derivative is the transposed map, `transposed_times`, and
+    the derivative of that is `times` again.
     """
 
     @staticmethod
@@ -128,12 +129,15 @@ class LinearMap(torch.autograd.Function):
         transposed_times: Callable[[Tensor], Tensor],
         values: Tensor,
     ) -> Tensor:
-        """Return the map's `values`, and store its transpose for the derivative."""
-        ctx.transpose = transposed_times, times
+        """Apply the map to `values`, and store both functions for the derivative."""
+        ctx.times = times
+        ctx.transposed_times = transposed_times
         return times(values.detach())
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> tuple[None, None, Tensor]:
-        """Apply the transpose, again as such a map, so that it has a derivative."""
-        gradient = LinearMap.apply(*ctx.transpose, cotangent.contiguous())  # type: ignore[no-untyped-call]
+        """Apply the transpose as a `LinearMap` with both functions exchanged."""
+        gradient = LinearMap.apply(
+            ctx.transposed_times, ctx.times, cotangent.contiguous()
+        )  # type: ignore[no-untyped-call]
         return None, None, gradient

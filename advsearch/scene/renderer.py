@@ -5,10 +5,11 @@ See docs/design.md, "One function in the middle".
     u in [0, 1]^d --space--> scene inputs --assembly, Mitsuba--> radiance --image
     formation--> (H, W, 3) sRGB in [0, 1]
 
-The arrows outside Mitsuba are torch operations and differentiate themselves. Mitsuba's
-is a custom autograd function whose backward pass renders the adjoint with a seed of its
-own. Coordinates that the gradient plan gives to differences get their derivative from a
-second one, which is the identity in the forward pass.
+Autograd differentiates the arrows outside Mitsuba, which are torch operations.
+Mitsuba's arrow is a custom autograd function, whose backward pass renders the adjoint
+with a seed of its own. Coordinates that the gradient plan assigns to differences get
+their derivative from a second custom function, which is the identity in the forward
+pass.
 """
 
 from __future__ import annotations
@@ -59,15 +60,15 @@ Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """From scene inputs to linear radiance (H, W, 3); differentiable.
 
-It is (H, W, 4) with coverage where there is a backdrop, and (H, W, 7 or 13) with the
-changes of the plane that takes the shadow in a photograph.
+With a backdrop it is (H, W, 4), with coverage. With a plane that receives the shadow in
+a photograph it is (H, W, 7 or 13), with the changes of that plane.
 """
 
 
 class InputSpace(InputMapping, Protocol):
-    """What the renderer and a user's own loop need of a space.
+    """Interface of a space for the renderer and for a user's own loop.
 
-    It is its start, its groups, and what a configuration does.
+    It has the start, the groups of coordinates, and the effects of a configuration.
     """
 
     @property
@@ -98,16 +99,17 @@ class InputSpace(InputMapping, Protocol):
 
 
 class Crop(NamedTuple):
-    """A part of the image that is rendered, and what the rest of it shows."""
+    """A part of the image that is rendered, and a fixed image of the rest."""
 
     window: Window  # window of the pixels that are rendered
-    # radiance (H, W, 3), or (H, W, 4) with coverage where there is a backdrop
+    # radiance (H, W, 3) of the full image; with a backdrop (H, W, 4), with coverage
     surroundings: Tensor
 
 
-# largest group for which it is measured how far its coordinates move outlines
+# Largest size of a group whose motion of outlines is measured.
 MAX_MEASURED_SIZE = 64
-# fraction of the noise over which the tone curve is straight; see `Renderer.halves`
+# fraction of the noise over which the tone curve is nearly straight; see
+# `Renderer.render_halves`
 STRAIGHT_FRACTION = 0.0625
 
 
@@ -119,8 +121,9 @@ class Renderer:
         plan: how each coordinate is differentiated; may be replaced.
         routes: which scene inputs each group of coordinates reaches, by
             `control.parameter`.
-        crop: what is rendered of each image; None for all of it.
-        shared_paths: renders full images instead of the scene; None for none.
+        crop: part of each image that is rendered; None for all of it.
+        shared_paths: object that renders full images in place of the scene; None if the
+            scene renders them.
         renders: number of primal renders so far, those of differences included.
         gradients: number of adjoint renders so far.
         non_finite: number of pixels and gradient entries that were NaN or infinite and
@@ -128,13 +131,16 @@ class Renderer:
 
     Args:
         scene: the scene inside Mitsuba, at the formation's resolution.
-        space: maps u to scene inputs.
+        space: space of configurations, which maps u to scene inputs.
         formation: how radiance becomes the image.
-        root_seed: seeds of different roots never meet, whatever is passed as `seed`.
-        moments: an image is their mean, while something moves; empty if nothing does.
-        motion: measures how fast coordinates move points; None uses the default step
-            for all.
-        estimators: estimators forced by "control.parameter", "control" or "*".
+        root_seed: seed from which all others are derived. Renderers with different root
+            seeds have independent noise, even at the same `seed` of a call.
+        moments: moments of an exposure during which something moves; an image is their
+            mean. Empty if nothing moves.
+        motion: object that measures how fast coordinates move points. None uses the
+            default step for all.
+        estimators: estimators that the user forces, by "control.parameter", "control"
+            or "*".
     """
 
     def __init__(
@@ -170,8 +176,11 @@ class Renderer:
         self._predict: Predict | None = None
         self.crop: Crop | None = None
         self.shared_paths: SharedPaths | None = None
-        self.renders = self.gradients = self.non_finite = 0
-        self._left_out: frozenset[str] = frozenset()
+        self.renders = 0
+        self.gradients = 0
+        self.non_finite = 0
+        # estimators that the backward pass skips, set by `gradient` for its call
+        self._skipped_estimators: frozenset[str] = frozenset()
         groups = space.groups
         self.plan = make_first_plan(
             groups,
@@ -179,7 +188,7 @@ class Renderer:
             estimators,
             image_size=max(formation.resolution),
         )
-        self.routes = self._find_routes(groups)
+        self.routes = self._find_reached_inputs(groups)
 
     @property
     def start(self) -> Tensor:
@@ -194,20 +203,24 @@ class Renderer:
         )
 
     def _repr_png_(self) -> bytes:
-        """Return the start as a notebook shows it; it does not count as a render."""
+        """Return the image of the start for a notebook; it is not counted."""
         with torch.no_grad():
             return encode_levels(to_uint8(self.copy_with()(self.start)).numpy())
 
     @property
     def composition_reason(self) -> str:
-        """Why an image is not that of one scene as one camera sees it.
+        """Why an image is composed of several renders; empty if it is one render.
 
-        It is empty if it is, so that others may predict it from light that was
-        collected once.
+        Only an image of one scene through one camera can be predicted from light that
+        was collected once.
         """
-        if self.scene.definition[0].rig:
+        has_several_cameras = bool(self.scene.definition[0].rig)
+        if has_several_cameras:
             return "a picture is made of those of several cameras"
-        return "a picture is made of several moments" if self.moments else ""
+        has_several_moments = bool(self.moments)
+        if has_several_moments:
+            return "a picture is made of several moments"
+        return ""
 
     def copy_with(
         self,
@@ -220,15 +233,16 @@ class Renderer:
     ) -> Renderer:
         """Return a renderer of the same space with some changes.
 
-        Its counters of renders start from those of this one, and go on independently.
+        Its counters of renders start from those of this one, and count independently.
+        An argument that is None leaves the value of this renderer.
 
         Args:
             scene: another scene.
-            source: another program, which renders and denoises.
-            predict: predicts radiance (`scene.predictor`). Seed and samples of a call
-                mean nothing then, and every derivative runs back through scene inputs,
-                whatever the plan is.
-            crop: what is rendered of each image.
+            source: function of another program, which renders and denoises.
+            predict: function that predicts radiance (`scene.predictor`). Then the seed
+                and the samples of a call have no effect, and autograd differentiates
+                all coordinates through the scene inputs, for any plan.
+            crop: part of each image that is rendered.
             formation: other fields of the image formation.
         """
         other = copy.copy(self)
@@ -303,18 +317,20 @@ class Renderer:
                 range; or u requires a gradient and was made in `torch.inference_mode`.
         """
         u = _to_tensor(u)
-        if u.ndim == 2 and len(u):
+        is_batch = u.ndim == 2 and len(u) > 0
+        if is_batch:
             return torch.stack([self(row, seed, spp) for row in u])
-        # `through` has the values of `u` and is what is rendered. It is another tensor
-        # if some coordinates are differentiated by finite differences: autograd must
-        # not reach those.
-        u, through = self._check_arguments(u, spp)
+        # An empty batch goes on, and is rejected for its shape.
+        u, masked_u = self._check_arguments(u, spp)
         with _leave_inference_mode():
-            image = self._render_image(through, seed, spp)
+            image = self._render_image(masked_u, seed, spp)
+            # The derivatives that autograd does not compute through `masked_u` are
+            # added by differences.
+            is_masked = masked_u is not u
             if (
-                through is not u
+                is_masked
                 and torch.is_grad_enabled()
-                and self._groups_by_differences()
+                and self._select_difference_groups()
             ):
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
@@ -322,22 +338,22 @@ class Renderer:
     def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render linear radiance (H, W, 3) float32; arguments as for a call.
 
-        It is denoised if the formation requires it. Exposure and backdrop of the
-        configuration are in it; what controls do to the finished image is not.
+        It is denoised if the formation requires it. It is multiplied by the exposure of
+        the configuration, and laid over a backdrop. Controls that change the finished
+        image are not applied.
         """
-        _, through = self._check_arguments(u, spp)
+        _, masked_u = self._check_arguments(u, spp)
         with _leave_inference_mode():
-            return self._render_image(through, seed, spp, display=False)
+            return self._render_image(masked_u, seed, spp, display=False)
 
     def render_halves(
         self, u: Tensor, seed: int, spp: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two images of a configuration with independent noise.
 
-        The tone curve is bent, so that a noisy image behind it would be darker on
-        average. The two images therefore go through the curve's tangent at the third,
-        denoised image, and may leave [0, 1]. There is no graph, and the renders are not
-        counted.
+        The tone curve is concave, so that it makes noisy images darker on average. The
+        two images therefore go through the curve's tangent at the third, denoised
+        image, and may leave [0, 1]. There is no graph, and the renders are not counted.
 
         Args:
             u: (d,) configuration in [0, 1].
@@ -353,27 +369,26 @@ class Renderer:
             halves, mean = self.trace_halves(inputs, seed, spp)
 
             def finish(radiance: Tensor) -> Tensor:
+                """Return the radiance with exposure and backdrop, before the curve."""
                 return self.finish_image(radiance, inputs, u, display=False)
 
             clean = finish(mean)
-            curve_point = self.formation.display(clean)
+            clean_image = self.formation.display(clean)
 
-            def display_straight(radiance: Tensor) -> Tensor:
-                """Return the image on the tone curve's tangent at the denoised image.
+            def display_on_tangent(radiance: Tensor) -> Tensor:
+                """Return the image of radiance on the curve's tangent at `clean`.
 
-                The curve's slope is a difference over `STRAIGHT_FRACTION` of the way
-                from the denoised to the noisy image, where the curve is almost
-                straight.
+                The change along the tangent is extrapolated from a small fraction of
+                the change of radiance, within which the curve is nearly straight.
                 """
-                nudged = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
-                slope = (
-                    self.formation.display(nudged) - curve_point
-                ) / STRAIGHT_FRACTION
-                return self.space.apply_to_image(u, curve_point + slope)
+                nearby = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
+                small_change = self.formation.display(nearby) - clean_image
+                change = small_change / STRAIGHT_FRACTION
+                return self.space.apply_to_image(u, clean_image + change)
 
-            first = display_straight(halves[0])
-            second = display_straight(halves[1])
-            return first, second, self.space.apply_to_image(u, curve_point)
+            first = display_on_tangent(halves[0])
+            second = display_on_tangent(halves[1])
+            return first, second, self.space.apply_to_image(u, clean_image)
 
     def trace_halves(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
@@ -389,31 +404,32 @@ class Renderer:
 
         Returns:
             The two images, which are not denoised, and their mean, which is. Each is
-            (H, W, 3), or (H, W, 4) with coverage where there is a backdrop.
+            (H, W, 3), or with a backdrop (H, W, 4), with coverage. With a crop they are
+            full images, too.
         """
-        hide = "backdrop.color" in inputs
+        hides_environment = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
         undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
         halves = [
-            undenoised.render_radiance(scene_inputs, noise_seed, spp, hide)
+            undenoised.render_radiance(scene_inputs, noise_seed, spp, hides_environment)
             for noise_seed in noise_seeds
         ]
         mean = (halves[0] + halves[1]) / 2.0
+        # One render of the guides serves both halves; its seed follows from the first.
         guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
         with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
-        plane_radiance = self.scene.plane_radiance if hide else None
+        plane_radiance = self.scene.plane_radiance if hides_environment else None
         if self.crop is None:
             return halves, denoise_image(mean, albedo, normal, plane_radiance)
-        traced = self.crop.window.select(mean)
-        clean = denoise_image(traced, albedo, normal, plane_radiance)
+        # Only the window is noisy: the surroundings were denoised when they were made.
+        window_mean = self.crop.window.select(mean)
+        clean = denoise_image(window_mean, albedo, normal, plane_radiance)
         return halves, self.crop.window.paste(clean, self.crop.surroundings)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the inputs of Mitsuba's scene at a configuration (d,), without a
-        graph.
-        """
+        """Return the inputs of Mitsuba's scene at a configuration, without a graph."""
         inputs = self.scene.assembly(self.space.inputs(u))
         return {
             name: value.detach() for name, value in _select_scene_inputs(inputs).items()
@@ -440,23 +456,27 @@ class Renderer:
         Returns:
             Ids and depths at (subdivision H, subdivision W) points; depths in metres.
         """
-        u, _ = self._check_arguments(u, 1)
+        u, _ = self._check_arguments(u, spp=1)
         with torch.no_grad():
             rig = self.scene.definition[0].rig
-            inputs = self.find_front(
-                self._camera_inputs(rig[camera] if rig else None, u)
-            )
+            mount = rig[camera] if rig else None
+            inputs = self.find_front(self._make_camera_inputs(mount, u))
             surfaces = self.scene.find_surfaces(
                 _select_scene_inputs(inputs), subdivision
             )
             if "backdrop.front" in inputs:
+                # The first channel is the hidden fraction of the object. Its pixels
+                # that are mostly hidden have no surface, whatever is behind.
                 is_hidden = inputs["backdrop.front"][..., 0] > 0.5
                 for dim in (0, 1):  # a pixel's value for all of its points
                     is_hidden = is_hidden.repeat_interleave(subdivision, dim)
                 surfaces.id[is_hidden] = 0  # no surface
-        metres = self.scene.definition[0].size_in_metres
+        # The scene is in object sizes.
+        object_size = self.scene.definition[0].size_in_metres
         return replace(
-            surfaces, depth=surfaces.depth * metres, z_depth=surfaces.z_depth * metres
+            surfaces,
+            depth=surfaces.depth * object_size,
+            z_depth=surfaces.z_depth * object_size,
         )
 
     def gradient(
@@ -470,11 +490,12 @@ class Renderer:
     ) -> tuple[Tensor, Tensor]:
         """Return a loss of the image of u, and its derivative by the plan.
 
-        Unlike autograd through a call, this gives coordinates with the estimator
-        "secant" differences of the loss.
+        Coordinates with the estimator "secant" get differences of the loss. (With
+        autograd through a call, they get differences of the image times the loss's
+        derivative.)
 
         Args:
-            loss: maps an image (H, W, 3) sRGB to a scalar.
+            loss: function from an image (H, W, 3) sRGB to a scalar.
             u: (d,) configuration in [0, 1].
             seed: seed of the noise.
             spp: samples per pixel.
@@ -484,30 +505,34 @@ class Renderer:
         Returns:
             The loss without graph, and (d,) float32.
         """
-        # "secant" is left out of the backward pass: the loop below adds it.
-        self._left_out = DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
+        # Read by `_select_difference_groups` in the forward and backward pass of the
+        # call. "secant" is skipped there, since the loop below adds it.
+        self._skipped_estimators = (
+            DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
+        )
         try:
             with torch.inference_mode(False), torch.enable_grad():
                 leaf = u.detach().clone().requires_grad_()
                 value = loss(self(leaf, seed, spp))
-            slope = None
+            gradient = None
             if value.requires_grad:
-                (slope,) = torch.autograd.grad(value, leaf, allow_unused=True)
+                (gradient,) = torch.autograd.grad(value, leaf, allow_unused=True)
         finally:
-            self._left_out = frozenset()
-        derivative = torch.zeros_like(leaf) if slope is None else slope
+            self._skipped_estimators = frozenset()
+        derivative = torch.zeros_like(leaf) if gradient is None else gradient
         if free:
             return value.detach(), derivative
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
+
+        def compute_loss(configuration: Tensor) -> Tensor:
+            image = self._render_image(configuration, noise_seed, difference_spp)
+            return loss(image)
+
         with torch.no_grad():
             for group in self.plan.select_groups("secant"):
-                write_central_differences(
-                    lambda at: loss(self._render_image(at, noise_seed, difference_spp)),
-                    group,
-                    u.detach(),
-                    derivative,
-                )
+                # writes the entries of the group into `derivative`
+                write_central_differences(compute_loss, group, u.detach(), derivative)
         return value.detach(), derivative
 
     # ---- from u to the image
@@ -519,8 +544,10 @@ class Renderer:
         range, or u was made in inference mode and requires a gradient.
 
         Returns:
-            The configuration as float32; and the same numbers in a tensor through which
-            only those coordinates have a derivative that the plan gives to autograd.
+            The configuration as float32, and a tensor with the same numbers that is
+            rendered. Through it, autograd differentiates only the coordinates that the
+            plan does not assign to differences. If it does so for all coordinates, or
+            needs no derivatives, both are the same object.
         """
         u = _to_tensor(u)
         if u.shape != self._shape:
@@ -530,11 +557,12 @@ class Renderer:
             )
         if not 1 <= spp <= MAX_SPP:
             raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
+        # An empty configuration has no smallest number. NaN fails both comparisons.
+        is_in_range = True
         if u.numel():
             smallest, largest = torch.aminmax(u.detach())
-        else:
-            smallest = largest = u.sum()
-        if not bool((smallest >= 0.0) & (largest <= 1.0)):
+            is_in_range = bool((smallest >= 0.0) & (largest <= 1.0))
+        if not is_in_range:
             raise InputError(
                 "render: expected every entry of u in [0, 1]; project u "
                 "before you render it"
@@ -549,11 +577,12 @@ class Renderer:
             u = u.clone() if u.is_inference() else u
             if self._predict is not None or not u.requires_grad:
                 return u, u
-            mask = self.plan.autograd_mask
-            if bool(mask.all()):
+            is_by_autograd = self.plan.autograd_mask
+            if bool(is_by_autograd.all()):
                 return u, u
             # The difference is 0, so that the value is u; the derivative is the mask.
-            return u, u.detach() + mask * (u - u.detach())
+            masked_u = u.detach() + is_by_autograd * (u - u.detach())
+            return u, masked_u
 
     def _render_image(
         self, u: Tensor, seed: int, spp: int, *, display: bool = True
@@ -577,13 +606,15 @@ class Renderer:
             camera_seed = seed
             if index > 0:
                 camera_seed = seeds.stream(seed, "camera", index)
-            inputs = self._camera_inputs(mount, u)
-            hide = "backdrop.color" in inputs
+            inputs = self._make_camera_inputs(mount, u)
+            hides_environment = "backdrop.color" in inputs
             if self.moments:  # an exposure of some time
-                rendered = self._render_exposure(mount, u, camera_seed, spp, hide)
+                rendered = self._render_exposure(
+                    mount, u, camera_seed, spp, hides_environment
+                )
             else:
                 rendered = self.render_radiance(
-                    _select_scene_inputs(inputs), camera_seed, spp, hide
+                    _select_scene_inputs(inputs), camera_seed, spp, hides_environment
                 )
             images.append(self.finish_image(rendered, inputs, u, display=display))
         if len(images) == 1:
@@ -592,7 +623,7 @@ class Renderer:
         self.renders = renders_before + 1
         return torch.cat(images, dim=1)
 
-    def _camera_inputs(
+    def _make_camera_inputs(
         self, mount: Mount | None, u: Tensor, space: InputMapping | None = None
     ) -> dict[str, Tensor]:
         """Return the scene inputs of a configuration for one camera.
@@ -600,47 +631,59 @@ class Renderer:
         Args:
             mount: a camera of a rig; None if the scene has one camera.
             u: (d,) configuration.
-            space: maps u to scene inputs. None: the renderer's space; a camera that
-                takes its image later than the first has things that move at that time.
+            space: mapping of u to scene inputs at the time of the image. None is the
+                renderer's space, at the time of this camera.
         """
         if space is None:
             space = self.space
             if mount is not None and mount.delay:
+                # The camera takes its image later than the first one: until then, what
+                # moves has moved on.
                 space = self.space.advance_time(mount.delay)
         inputs = self.scene.assembly(space.inputs(u))
         if mount is None:
             return inputs
         description = self.scene.definition[0]
-        pose, center = _base_pose_and_center(description)
+        # The rig is mounted where the camera of the description stands.
+        pose, center = _get_camera_pose_and_center(description)
         return mount.make_inputs(inputs, pose, center, description.size_in_metres)
 
     def _render_exposure(
-        self, mount: Mount | None, u: Tensor, seed: int, spp: int, hide: bool
+        self,
+        mount: Mount | None,
+        u: Tensor,
+        seed: int,
+        spp: int,
+        hide_environment: bool,
     ) -> Tensor:
         """Render the mean radiance of the moments of u, denoised once.
 
-        The image is the sum of the moments' radiance, each weighted by row: a sensor
-        reads its rows one after the other, and so a row may see a moment in part or not
-        at all. All moments together count as one render.
+        Rows of a sensor may be read one after the other, so that each row is exposed
+        during some of the moments only. A moment is weighted in each row by the
+        fraction of that row's exposure (`row_fractions`), which add up to 1 over the
+        moments. The guides of the denoiser are averaged in the same manner. All moments
+        together count as one render.
 
         Args:
             mount: the camera of a rig; None if the scene has one camera.
             u: (d,) configuration.
             seed: seed of the noise; each moment gets its own.
             spp: samples per pixel of all moments together.
-            hide: hide the environment behind a backdrop.
+            hide_environment: hide the environment behind a backdrop.
         """
         is_denoised = self.formation.denoiser == "oidn"
         renders_before = self.renders
         exposed = torch.zeros(())
         guides = torch.zeros(())
         for index, moment in enumerate(self.moments):
-            inputs = _select_scene_inputs(self._camera_inputs(mount, u, moment.space))
+            inputs = _select_scene_inputs(
+                self._make_camera_inputs(mount, u, moment.space)
+            )
             moment_seed = seeds.stream(seed, "moment", index)
-            rows = moment.row_fractions[:, None, None]
+            row_weights = moment.row_fractions[:, None, None]
             samples = max(1, math.ceil(spp * moment.sample_fraction))
-            exposed = exposed + rows * self.render_radiance(
-                inputs, moment_seed, samples, hide, denoised=False
+            exposed = exposed + row_weights * self.render_radiance(
+                inputs, moment_seed, samples, hide_environment, denoised=False
             )
             if is_denoised:
                 with torch.no_grad():
@@ -648,7 +691,9 @@ class Renderer:
                     albedo, normal = self.scene.render_guides(
                         inputs, guide_seed, samples
                     )
-                    guides = guides + rows * torch.cat([albedo, normal], dim=-1)
+                    moment_guides = torch.cat([albedo, normal], dim=-1)
+                    guides = guides + row_weights * moment_guides
+        # `render_radiance` has counted each moment.
         self.renders = renders_before + 1
         if not is_denoised:
             return exposed
@@ -660,9 +705,10 @@ class Renderer:
     def _compute_denoising_change(self, exposed: Tensor, guides: Tensor) -> Tensor:
         """Return the denoised image minus the image, (H, W, C).
 
-        C is 3, 4 with coverage, or 7 or 13 with the changes of the plane that takes the
-        shadow. `guides` are albedo and normals (H, W, 6), which show the denoiser the
-        edges.
+        Args:
+            exposed: (H, W, C). C is 3, or 4 with coverage, or 7 or 13 with the changes
+                of the plane that receives the shadow.
+            guides: (H, W, 6) albedo and normals.
         """
         has_plane = exposed.shape[-1] > 4
         clean = denoise_image(
@@ -686,10 +732,10 @@ class Renderer:
 
         Args:
             rendered: radiance (H, W, 3), or (H, W, 4) with coverage, or (H, W, 7 or 13)
-                with the changes of the plane that takes the shadow.
+                with the changes of the plane that receives the shadow.
             inputs: scene inputs, of which exposure and backdrop are applied.
-            u: configuration, for what controls do to the finished image.
-            display: if False, return the radiance that is to be displayed.
+            u: configuration, for the controls that change the finished image.
+            display: if False, return the radiance before the tone curve.
         """
         inputs = self.find_front(inputs)
         exposure = inputs.get("camera.exposure")
@@ -701,14 +747,18 @@ class Renderer:
             radiance = radiance * torch.exp2(exposure)
             coat = coat * torch.exp2(exposure)
         if "backdrop.color" in inputs:
-            # The photograph is display-linear, which is radiance times the gain.
+            # The photograph is display-linear, which is radiance times the gain. The
+            # exposure does not change it. Channels 4 to 6, the change of the plane, are
+            # used relative to the plane's radiance, so that they need no exposure.
             behind = inputs["backdrop.color"] / self.formation.gain
-            layers = torch.cat([radiance, rendered[..., 3:7], coat], dim=-1)
+            coverage_and_plane = rendered[..., 3:7]
+            layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
             radiance = compose(layers, behind, inputs)
         if not display:
             return radiance
         image = self.formation.display(radiance)
         if "backdrop.noise" in inputs:
+            # Only where the object is visible: the photograph has its own noise.
             coverage = rendered[..., 3:4].detach()
             if "backdrop.front" in inputs:
                 coverage = coverage * (1.0 - inputs["backdrop.front"][..., :1])
@@ -717,15 +767,17 @@ class Renderer:
 
     @torch.no_grad()
     def find_front(self, inputs: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """Return inputs in which a photograph's depth became what is before the object.
+        """Return inputs in which a photograph's depth is replaced by what it hides.
 
-        ``backdrop.front`` (H, W, 2) takes the place of ``backdrop.depth``; inputs
-        without depth are returned as they are. It has no derivative, as coverage.
+        ``backdrop.front`` (H, W, 2), the hidden fractions of object and ground, takes
+        the place of ``backdrop.depth``. Inputs without depth are returned as they are.
+        Like coverage, the fractions have no derivative.
         """
         if "backdrop.depth" not in inputs:
             return inputs
         front_inputs = dict(inputs)
         depth = front_inputs.pop("backdrop.depth")
+        # The depth is an image with n x n points in each pixel.
         n_points = depth.shape[0] // self.formation.resolution[0]
         surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
         blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
@@ -758,7 +810,7 @@ class Renderer:
 
         Returns:
             (H, W, C). C is 3, or 4 with coverage if the environment is hidden. It is 7
-            with the change of the radiance of a plane that takes the shadow in a
+            with the change of the radiance of a plane that receives the shadow in a
             photograph. It is 13 if that plane has a coat, with the change of what the
             coat reflects, and the environment in it.
         """
@@ -781,9 +833,10 @@ class Renderer:
 
     # ---- differences
 
-    def _groups_by_differences(self) -> tuple[Group, ...]:
-        """Return the groups that use differences."""
-        return self.plan.select_groups(*(DIFFERENCE_ESTIMATORS - self._left_out))
+    def _select_difference_groups(self) -> tuple[Group, ...]:
+        """Return the groups that are differentiated by differences."""
+        estimators = DIFFERENCE_ESTIMATORS - self._skipped_estimators
+        return self.plan.select_groups(*estimators)
 
     def compute_differences(
         self, u: Tensor, cotangent: Tensor, seed: int, spp: int
@@ -803,13 +856,15 @@ class Renderer:
         noise_seed = seeds.stream(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp
         derivative = torch.zeros_like(u)
-        for group in self._groups_by_differences():
-            write_central_differences(
-                lambda at: (cotangent * self._render_image(at, noise_seed, spp)).sum(),
-                group,
-                u,
-                derivative,
-            )
+
+        def compute_product(configuration: Tensor) -> Tensor:
+            return (
+                cotangent * self._render_image(configuration, noise_seed, spp)
+            ).sum()
+
+        for group in self._select_difference_groups():
+            # writes the entries of the group into `derivative`
+            write_central_differences(compute_product, group, u, derivative)
         return self.replace_non_finite(derivative)
 
     # ---- set-up
@@ -820,10 +875,11 @@ class Renderer:
         """Return half-widths (d,) of differences over which outlines move by a pixel.
 
         A group counts as not moving if it moves no outline, if it has more than
-        `MAX_MEASURED_SIZE` coordinates, or if there is no `motion` to measure it. Its
-        step is the default: that of a range, or of a full turn if it is periodic.
+        `MAX_MEASURED_SIZE` coordinates, or if there is no `motion` to measure it. Then
+        it has a default step: `TURN_STEP` if it is periodic, as an angle over a full
+        turn, and else the step of `compute_steps` for a speed of 0.
         """
-        speeds = torch.zeros(len(self.start))
+        speeds = torch.zeros(len(self.start))  # pixels per unit of each coordinate
         coordinates: list[int] = []
         for group in groups:
             # "adjoint" and "image" are valid only for what moves no outline: a group
@@ -843,12 +899,14 @@ class Renderer:
                 steps[group.coordinates] = TURN_STEP
         return steps
 
-    def _find_routes(self, groups: tuple[Group, ...]) -> dict[str, frozenset[str]]:
+    def _find_reached_inputs(
+        self, groups: tuple[Group, ...]
+    ) -> dict[str, frozenset[str]]:
         """Find the scene inputs that each group of coordinates reaches.
 
-        Reaches means that the derivative of the input with respect to one of the
-        group's coordinates is not zero, by autograd at one point. It is needed for
-        adjoints alone, and empty where they are valid for no group.
+        A group reaches an input if the input's derivative by one of the group's
+        coordinates is not zero, by autograd at one point. The result is needed only for
+        adjoints; it is empty if they are valid for no group.
 
         Returns:
             Names of scene inputs, by the group's name.
@@ -880,11 +938,11 @@ class Renderer:
 
 
 @cache_per_scene
-def _base_pose_and_center(description: SceneDescription) -> tuple[Tensor, Tensor]:
+def _get_camera_pose_and_center(description: SceneDescription) -> tuple[Tensor, Tensor]:
     """Return the camera's pose (4, 4) and the object's center (3,) in a scene.
 
-    They are those without inputs of a configuration, and cached, since the center takes
-    all vertices.
+    They are those of the scene itself, before a configuration moves anything. They are
+    cached, since the center is computed from all vertices.
     """
     pose = camera_to_world(description)
     center = compute_center(description)
@@ -897,9 +955,9 @@ def _select_scene_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _leave_inference_mode() -> AbstractContextManager[object]:
-    """Return a context of ordinary mode inside of torch's inference mode.
+    """Return a context that leaves torch's inference mode.
 
-    To set it where it is set already would cost time.
+    Outside of inference mode it does nothing, since entering a context takes time.
     """
     if torch.is_inference_mode_enabled():
         return torch.inference_mode(False)
@@ -918,7 +976,7 @@ def _to_tensor(u: Configuration) -> Tensor:
 
 
 class _Radiance(torch.autograd.Function):
-    """Mitsuba as one torch operation; the adjoint is rendered only for a gradient."""
+    """Mitsuba as one torch operation, whose backward pass renders the adjoint."""
 
     @staticmethod
     def forward(
@@ -957,27 +1015,31 @@ class _Radiance(torch.autograd.Function):
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "primal", seed)
-        guides: list[Tensor] = []
-        if renderer._source is not None:
+        guides: Tensor | None = None
+        if renderer._source is not None:  # another program, which also denoises
             rendered = renderer._source(inputs, noise_seed, spp)
         else:
             image_seeds = {"hidden" if hide else "path": noise_seed}
             if denoised and renderer.formation.denoiser == "oidn":
                 guide_seed = seeds.stream(renderer.root_seed, "guides", seed)
                 image_seeds["guides"] = guide_seed
-            source: MitsubaScene | SharedPaths = renderer.scene
+            scene: MitsubaScene | SharedPaths = renderer.scene
+            # Shared paths are stored for full images only.
             if renderer.shared_paths is not None and ctx.window is None:
-                source = renderer.shared_paths
+                scene = renderer.shared_paths
             with renderer.scene.limit_window(ctx.window):
-                rendered, *guides = source.render_images(inputs, image_seeds, spp)
+                images = scene.render_images(inputs, image_seeds, spp)
+            # in the order of `image_seeds`
+            rendered = images[0]
+            if "guides" in image_seeds:
+                guides = images[1]
         rendered = renderer.replace_non_finite(rendered)
-        # one image of guides if the result is to be denoised, otherwise none
-        for guide in guides:
+        if guides is not None:
             rendered = denoise_image(
                 rendered,
-                guide[..., :3],
-                guide[..., 3:],
-                renderer.scene.plane_radiance if hide else None,
+                albedo=guides[..., :3],
+                normal=guides[..., 3:],
+                plane_radiance=renderer.scene.plane_radiance if hide else None,
                 quick=renderer.formation.quick,
             )
         renderer.renders += 1
@@ -995,38 +1057,45 @@ class _Radiance(torch.autograd.Function):
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise_seed = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.replace_non_finite(cotangent)
-        by_input = dict[str, Tensor]()
-        remaining = list(inputs)
-        # An input that groups of both estimators reach is differentiated by "material",
-        # which is right for more inputs: so that one comes first.
-        for estimator in ("material", "adjoint"):
-            reached = _reached_inputs(renderer, estimator)
-            wrt = [name for name in remaining if name in reached]
-            if not wrt:
-                continue
-            remaining = [name for name in remaining if name not in reached]
-            if estimator == "material":
-                meshes = sorted({name.rpartition(".")[0] for name in wrt})
-                gradients = renderer.scene.render_material_adjoint(
-                    inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
-                )
-            else:
-                method = "hidden" if ctx.hide else "path"
-                with renderer.scene.limit_window(ctx.window):
-                    gradients = renderer.scene.render_adjoint(
-                        inputs, cotangent, noise_seed, ctx.spp, wrt=wrt, method=method
-                    )
+        gradient_of_input = dict[str, Tensor]()
+        # If groups of both estimators reach an input, it is differentiated by the
+        # material form, which is right for more inputs.
+        by_material = _select_reached_inputs(renderer, "material")
+        by_interior = _select_reached_inputs(renderer, "adjoint") - by_material
+        material_names = [name for name in inputs if name in by_material]
+        interior_names = [name for name in inputs if name in by_interior]
+        if material_names:
+            # The result has the vertices and the normals of each mesh, and both are
+            # used. Only the radiance is differentiated, not further channels.
+            meshes = sorted({name.rpartition(".")[0] for name in material_names})
+            gradient_of_input |= renderer.scene.render_material_adjoint(
+                inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
+            )
             renderer.gradients += 1
-            for name, gradient in gradients.items():
-                by_input[name] = renderer.replace_non_finite(gradient)
-        # six arguments before the tensors have no gradients
-        return (*(None,) * 6, *map(by_input.get, ctx.names))
+        if interior_names:
+            method = "hidden" if ctx.hide else "path"
+            with renderer.scene.limit_window(ctx.window):
+                gradient_of_input |= renderer.scene.render_adjoint(
+                    inputs,
+                    cotangent,
+                    noise_seed,
+                    ctx.spp,
+                    wrt=interior_names,
+                    method=method,
+                )
+            renderer.gradients += 1
+        for name, gradient in gradient_of_input.items():
+            gradient_of_input[name] = renderer.replace_non_finite(gradient)
+        # The six arguments of `forward` before the tensors have no gradients.
+        no_gradients = (None,) * 6
+        return (*no_gradients, *map(gradient_of_input.get, ctx.names))
 
 
-def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
+def _select_reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
     """Return the scene inputs that coordinates with an estimator reach.
 
-    Of the interior adjoint, only those that it differentiates correctly count.
+    For the estimator "adjoint", the interior adjoint, only the inputs that it
+    differentiates correctly are returned.
     """
     reached: frozenset[str] = frozenset()
     for group in renderer.plan.select_groups(estimator):
@@ -1037,17 +1106,23 @@ def _reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]:
 
 
 class _Differences(torch.autograd.Function):
-    """The identity on the image, with the derivative by differences in addition."""
+    """The identity on an image, with a derivative by differences.
+
+    In the forward pass the image passes through. In the backward pass, the
+    configuration u gets the derivative of the coordinates that the plan assigns to
+    differences. It is added to the derivative that autograd computes through the image.
+    """
 
     @staticmethod
     def forward(
         ctx: Any, renderer: Renderer, seed: int, spp: int, u: Tensor, image: Tensor
     ) -> Tensor:
-        """Return the image as it is; keep what its backward pass needs."""
+        """Return the image as it is, and store what the backward pass needs."""
         ctx.renderer = renderer
         ctx.seed = seed
         ctx.spp = spp
         ctx.save_for_backward(u)
+        # A view, since an output that is the input itself needs care in autograd.
         return image.view_as(image)
 
     @staticmethod

@@ -95,10 +95,10 @@ class SceneData:
     # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba
     # shows it
     metered: bool = True
-    # Remarks for users: of further files that controls have read, of things in each
-    # other.
+    # remarks for users: on further files that controls have read, on things that
+    # overlap
     remarks: tuple[str, ...] = ()
-    things_spec: str = ""  # how the things beside the object were asked for
+    things_spec: str = ""  # the setting that names the things next to the object
 
     @property
     def azimuth_zero(self) -> float:
@@ -164,9 +164,12 @@ class SceneData:
         return compute_base_vertices(self.meshes[OBJECT])
 
     def get_number(self, name: str) -> float:
-        """Return a setting that always has a value.
+        """Return the value of a setting that is a number in every scene.
 
-        Of the field of view, that of the camera in use.
+        The field of view is that of the camera in use.
+
+        Raises:
+            KeyError: the setting has no value, or there is no such setting.
         """
         if name == "camera.fov" and self.camera != ORBIT_CAMERA:
             return self.cameras[self.camera].compute_larger_fov(self.aspect)

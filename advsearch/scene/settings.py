@@ -180,9 +180,11 @@ class Parameter:
         Args:
             name: name without the control's, such as "kind".
             options: names to choose from.
-            default: what the scene has without a choice, in words.
+            default: what the scene has without a choice, in words. It may be one of the
+                options, such as "off", or a description, such as "the file's own".
             text: description for the user.
-            estimators: valid estimators of a derivative; none by default.
+            estimators: valid estimators of the derivative, the preferred one first. By
+                default there is none: a choice has no derivative.
             moves_silhouettes: whether it can move an outline in the image.
         """
         return cls(
@@ -214,8 +216,8 @@ class Parameter:
         Args:
             text: description for the user, to which "Red", "Green" or "Blue" is the
                 beginning: "of the ground" becomes "Red of the ground".
-            search: range that is searched by default; None: the value stays at its
-                default.
+            search: range that a search covers if the user names none. None: the color
+                is not searched unless the user gives a range.
             low: smallest value of each channel; the largest is 1.
             defaults: default values of red, green and blue.
             estimators: valid estimators of the derivative, the preferred one first.
@@ -462,7 +464,7 @@ def _make_lamp_parameter(whose: str) -> Parameter:
     """
     text = (
         f"Headlamps of {whose}, with its tail lamps: the low beam, or the high "
-        "beam; in the avenue."
+        "beam. They need an environment whose light has a unit, such as the avenue."
     )
     return Parameter(
         name="lamps",
@@ -564,7 +566,7 @@ GROUND = (
         low=-1e4,
         high=1e4,
         default=0.0,
-        description="Height of the ground that takes the shadow in a photograph "
+        description="Height of the ground that receives the shadow in a photograph "
         "(`backdrop`).",
     ),
     Parameter(
@@ -677,14 +679,16 @@ SettingValues = Mapping[str, float | str | Sequence[float]]
 
 
 def find_parameter(name: str) -> Parameter | None:
-    """Return the parameter that a setting's name means; None if there is none.
+    """Return the parameter of a setting by its name; None if there is none.
 
-    A setting of a mesh around the object, ``pose:chair.yaw``, has that of the object,
-    ``pose.yaw``.
+    A mesh around the object has the same parameters as the object. So the parameter of
+    ``pose:chair.yaw`` is that of ``pose.yaw``.
     """
-    family, _, full_name = name.partition(":")
-    if full_name and family in MESH_FAMILIES:
-        name = f"{family}.{full_name.rpartition('.')[2]}"
+    family, _, mesh_and_parameter = name.partition(":")
+    if mesh_and_parameter and family in MESH_FAMILIES:
+        # The name of the mesh may have dots itself.
+        parameter_name = mesh_and_parameter.rpartition(".")[2]
+        name = f"{family}.{parameter_name}"
     return SETTINGS.get(name)
 
 
@@ -714,9 +718,10 @@ def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
     """
     if "camera.elevation" in settings and "camera.height" in settings:
         raise InputError(
-            "`set` camera.elevation and camera.height say the same thing; "
+            "`set` camera.elevation and camera.height determine each other; "
             "leave one of them out"
         )
+    # A default in words, such as "as far as needed", is computed from the scene.
     values = {
         name: None if isinstance(parameter.default, str) else parameter.default
         for name, parameter in SETTINGS.items()
@@ -740,7 +745,7 @@ def resolve_settings(settings: SettingValues) -> dict[str, float | None]:
                 f"`set` {name}: expected a number from {allowed_range}, got {value!r}"
             )
         values[name] = float(value)
-        if not setting.low <= value <= setting.high:  # NaN is not, either
+        if not setting.low <= value <= setting.high:  # NaN fails, too
             raise InputError(
                 f"`set` {name}: expected a number from {allowed_range}, got {value:g}"
             )

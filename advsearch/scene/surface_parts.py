@@ -1,8 +1,8 @@
 """Divide a mesh's surface into parts that can be counted: cells of a map, and faces.
 
-The map is that of the mesh's own texture coordinates, cut into cells. Where these
-cannot tell points of the surface apart (charts lie on each other, faces without area),
-the mesh is unwrapped anew for it, with xatlas.
+The map is the square of the mesh's own texture coordinates, cut into cells. If several
+points of the surface have the same texture coordinates (charts overlap, or faces have
+no area there), the mesh gets new ones from xatlas.
 """
 
 from __future__ import annotations
@@ -38,12 +38,14 @@ from advsearch.scene.raster import (
 ATLAS_SIZE = 512
 # texels between charts in an atlas of `ATLAS_SIZE`: two in a texture of half that size
 ATLAS_PADDING = 4
-_XATLAS_SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
-# xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
+# factor on lengths, since xatlas ignores faces below about 1e-7 square units
+_XATLAS_SCALE = 100.0
+# xatlas treats neighbors as one plane if the product of their normals is over 1 - 1e-4
 _MIN_FLUSH_COSINE = 1.0 - 1.5e-4
-# how far the normals of what it takes for a plane may stray before it matters
+# smallest cosine between a normal and the mean of its plane, up to which treating it as
+# a plane does no harm
 _MIN_PLANE_COSINE = np.cos(np.radians(10.0))
-# faces of a mesh above which it is always cut where the surface turns
+# a mesh with more faces is always cut where the surface turns
 _FACES_PER_ATLAS = 20_000
 _CELL_FACES = ((200_000, 1_500), (10_000, 500))
 """Faces of a mesh above which it is cut for the sake of speed, and how many faces
@@ -70,7 +72,8 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
         chart_group: (F,) a number for each face; no chart has faces with different
             numbers. None: there is no such limit.
     """
-    patch = _find_patches(soup)  # (F,) the patch of each face, which is cut out
+    # (F,) index of the patch of each face: xatlas gets the patches one by one
+    patch = _find_patches(soup)
     if chart_group is not None:
         # patches are cut further where the group changes
         patch_and_group = patch * (int(chart_group.max()) + 1) + chart_group
@@ -168,10 +171,11 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     """
     normals: Float64Array = normalize_vectors(soup.compute_face_vectors())
     count = len(normals)
-    # the two faces of each shared edge; their corners are numbered 3 face + k
-    left, right, _ = find_shared_edges(soup.faces)
-    face = left // 3
-    neighbour = right // 3
+    # The two faces of each shared edge. `find_shared_edges` returns corners, of which
+    # each face has three.
+    left_corner, right_corner, _ = find_shared_edges(soup.faces)
+    face = left_corner // 3
+    neighbour = right_corner // 3
     is_flush = (normals[face] * normals[neighbour]).sum(axis=1) > _MIN_FLUSH_COSINE
     plane = find_components(count, face[is_flush], neighbour[is_flush])
     patch = np.zeros(count, dtype=np.int64)
@@ -191,19 +195,22 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
 def _find_directions(
     normals: Float64Array, face: IntArray, neighbour: IntArray
 ) -> IntArray:
-    """Return the index (F,) of the nearest of the 14 directions to each face's normal.
+    """Return the index (F,) of the cutting direction nearest to each face's normal.
 
-    The normals are smoothed before; arguments are those of `_smooth_normals`.
+    The directions are the 14 of `_make_cut_directions`. The normals are smoothed
+    before; the arguments are those of `_smooth_normals`.
     """
     smoothed = _smooth_normals(normals, face, neighbour)
     return np.asarray((smoothed @ _make_cut_directions().T).argmax(axis=1))
 
 
 def _find_cells(soup: TriangleSoup, patch: IntArray) -> IntArray | None:
-    """Return the piece (F,) of each face where patches (F,) are cut for speed.
+    """Return the piece (F,) of each face, if patches (F,) are cut for speed.
 
-    None where the mesh is too small for that.
+    xatlas takes long for large patches. The result is None if the mesh is too small to
+    need that.
     """
+    # from the largest meshes to smaller ones
     for min_faces, max_faces in _CELL_FACES:
         if len(patch) > min_faces:
             centers = soup.points[soup.faces].mean(axis=1)
@@ -356,9 +363,10 @@ class SurfaceParts:
             uv: (n, 2) the mesh's own texture coordinates.
         """
         if self.is_unwrapped:
-            # its arguments are in the order of rows and columns: v, then u
+            # The arguments are in the order of rows and columns: v, then u.
             weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
-            # The weights in a face without area are not finite: its middle is taken.
+            # In a face without area the weights are NaN or infinite. Then the middle of
+            # the face is used.
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
@@ -407,11 +415,11 @@ def _rasterise_map(mesh: Mesh, uvs: Float64Array) -> Charts:
 
 
 def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
-    """Return whether texture coordinates (F, 3, 2) tell points of a surface apart.
+    """Return whether different points of a surface have different texture coordinates.
 
-    They do under four conditions. They are in the unit square. Almost all of the
-    surface has an area in the texture. They cover enough of the square, and hardly any
-    of it twice. The last two are tested on a raster of `_TEST_RASTER_SIZE` pixels a
+    There are four conditions. The coordinates are in the unit square. Almost all of the
+    surface has an area in the texture. The faces cover enough of the square, and hardly
+    any of it twice. The last two are tested on a raster of `_TEST_RASTER_SIZE` pixels a
     side.
 
     Args:
@@ -427,16 +435,16 @@ def _has_unique_uvs(mesh: Mesh, uvs: Float64Array) -> bool:
         return False
     # The raster has the center of its first pixel at 0. By the negative tolerance a
     # pixel on the border of two faces is in neither.
-    _, row, column, _ = rasterize_triangles(
+    _face, row, column, _weights = rasterize_triangles(
         uvs * _TEST_RASTER_SIZE - 0.5,
         (_TEST_RASTER_SIZE, _TEST_RASTER_SIZE),
         tolerance=-1e-6,
     )
-    # The rows of the result are pairs of face and pixel. Those beyond one for each
-    # covered pixel are in a further face.
-    covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
-    doubled = len(row) - covered
+    # There is one entry for each pixel of each face. A pixel in several faces has
+    # several entries.
+    n_covered = len(np.unique(row * _TEST_RASTER_SIZE + column))
+    n_repeated = len(row) - n_covered
     return (
-        covered >= MIN_COVERED_FRACTION * _TEST_RASTER_SIZE**2
-        and doubled <= MAX_DOUBLED_FRACTION * covered
+        n_covered >= MIN_COVERED_FRACTION * _TEST_RASTER_SIZE**2
+        and n_repeated <= MAX_DOUBLED_FRACTION * n_covered
     )

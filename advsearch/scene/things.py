@@ -1,11 +1,11 @@
-"""Things beside the object, which stand on the ground with it where they were asked
-for.
+"""Things next to the object, at requested positions on the ground.
 
     car@12,3.5,heading=180; person@6,-2; bike.glb@3,1,size=1.8,label=bicycle
 
-Places are in metres from where the object stands by itself: x forwards, the way that
-the object faces, and y to its left. A heading is in degrees counter-clockwise, seen
-from above; at 0 a thing faces where the object does.
+Positions are in meters from the position of the object without a shift: x forwards, in
+the direction that the object faces, and y to its left. A heading is in degrees
+counterclockwise, seen from above; at 0 a thing faces in the same direction as the
+object.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from advsearch.scene.settings import LAMPS, LAMPS_OFF
 MAX_DISTANCE = 1000.0  # how far from the object a thing may stand, metres
 MAX_HEADING = 3600.0  # limit of a heading, degrees
 MAX_THINGS = 64  # things beside an object
-EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
+EYE_SIZE = 1e-3  # half the width of the box that represents a camera, object sizes
 OPTIONS = ("heading", "size", "name", "label", "lamps", "facing")
-GROUND_NAMES = ("road", "floor")  # what the ground of a bundled place is called
-ALL_THINGS = "all"  # what stands for the object and every thing beside it
+GROUND_NAMES = ("road", "floor")  # names of the ground of bundled places
+ALL_THINGS = "all"  # name that means the object and all things next to it
 # what a thing can't be called
 RESERVED_NAMES = (
     "object",
@@ -79,14 +79,14 @@ class RequestedThing:
 
 @dataclass(frozen=True, eq=False)
 class ThingPart(MeshPart):
-    """A thing beside the object."""
+    """A thing next to the object."""
 
     size_in_metres: float = 1.0  # its longest side
     lamps: str = LAMPS_OFF  # which it has on
 
 
 def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
-    """Parse the setting that names things beside the object.
+    """Parse the setting that names things next to the object.
 
     Things are separated by semicolons, as in "car@12,3.5,heading=180; person@4,-2". If
     the name of a thing is taken, a number is added to it ("car-2"), unless the user has
@@ -103,12 +103,14 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
     for part in filter(None, map(str.strip, (things_spec or "").split(";"))):
         thing = _parse_thing(part)
         used_names = [*RESERVED_NAMES, *(other.name for other in things)]
-        if thing.name in used_names and "name=" in part:
+        has_chosen_name = "name=" in part
+        if thing.name in used_names and has_chosen_name:
             raise InputError(
                 f"things: {part}: another thing of the scene is called "
                 f"{thing.name}; choose another name"
             )
-        # car, car-2, car-3: each number takes the place of the one before
+        # car, car-2, car-3: each number takes the place of the one before. (A name that
+        # ends in "-1" itself, as from a file "car-1.glb", becomes "car-2" at once.)
         number = 2
         while thing.name in used_names:
             plain_name = thing.name.removesuffix(f"-{number - 1}")
@@ -171,6 +173,9 @@ def _parse_thing(part: str) -> RequestedThing:
 def _parse_options(part: str, words: Iterable[str]) -> dict[str, str]:
     """Return the options of a thing, words such as heading=180, by name.
 
+    The value of `lamps` is checked here; the caller converts and checks the numbers. If
+    an option is repeated, the last one counts.
+
     Args:
         part: text of the thing, for messages.
         words: its options, such as "heading=180".
@@ -209,7 +214,7 @@ def add_things(
     things_spec: str | None,
     load: Callable[[str, str | None], ObjectAsset],
 ) -> AnyScene:
-    """Return the scene with the things beside its object that a setting names.
+    """Return the scene with the things next to its object that a setting names.
 
     Args:
         scene: scene with the object.
@@ -227,8 +232,8 @@ def add_things(
         return scene
     if scene.object.size_in_metres is None:
         raise InputError(
-            f"things: they stand in metres beside {scene.object_name}, whose size in "
-            "metres is not known; say it: its longest side, such as `size=0.1`"
+            f"things: their positions are in metres from {scene.object_name}, whose "
+            "size is not known; give its longest side in metres, such as `size=0.1`"
         )
     parts = list[ThingPart]()
     remarks = list[str]()
@@ -236,7 +241,9 @@ def add_things(
         part, thing_remarks = _make_thing(scene, thing, load)
         parts.append(part)
         remarks += thing_remarks
+    # `things_spec` is a string here: None has no requested things.
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=things_spec or "")
+    # Overlaps are found in the scene with the things.
     remarks += _list_overlap_remarks(scene)
     return replace(scene, remarks=(*scene.remarks, *remarks))
 

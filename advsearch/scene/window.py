@@ -53,6 +53,7 @@ class Window(NamedTuple):
         It is differentiable with respect to these (h, w, ...).
         """
         pasted = image.clone()
+        # `select` returns a view, through which `pasted` is written.
         self.select(pasted)[...] = pixels
         return pasted
 
@@ -68,5 +69,5 @@ class Window(NamedTuple):
     def is_outside(self, resolution: tuple[int, int]) -> Tensor:
         """Return which pixels of an image are outside of the window, (H, W) bool."""
         outside = torch.ones(resolution, dtype=torch.bool)
-        self.select(outside)[...] = False
+        self.select(outside)[...] = False  # a view, as in `paste`
         return outside

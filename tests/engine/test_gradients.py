@@ -163,7 +163,7 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
         u = torch.rand(2, generator=generator)
         if number == 3:
             assert bool(recorded.gradient(lambda image: image.square().sum(), u, 1, 2)[1].any())
-            recorded.scene._integrator("hidden")
+            recorded.scene._get_integrator("hidden")
         if number == 4:  # a second owner of the vertices, which makes Dr.Jit copy them
             held = recorded.scene.parameters["object.vertex_positions"]
             second = type(held)(held)

@@ -480,7 +480,7 @@ def test_hostile_depths_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "good.npy", np.ones((12, 16)))
     mesh = Path(__file__).parents[2] / "scenes" / "photographs" / "models" / "obj_000001.ply"
     scene = load_description(mesh).with_backdrop(tmp_path / "a.png", tmp_path / "good.npy")
-    with pytest.raises(InputError, match=r"how large .* is is not known; give its longest side"):
+    with pytest.raises(InputError, match=r"the size of .* is not known; give its longest side"):
         make_image_inputs(scene, (12, 16))
 
 

@@ -41,7 +41,7 @@ def transport() -> Callable[[Tensor], Tensor]:
     made, shape = TextureTransport((2, 2), (CELL_SIZE, CELL_SIZE)), (CELL_SIZE, CELL_SIZE, 3)
     places = torch.tensor([[0.1, 0.3], [0.2, 0.3], [0.3, 0.3], [0.3, 0.4]])
     weight = torch.arange(1.0, 13.0).reshape(4, 3) / 6.0
-    made.add_pass([Vertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], fraction=1.0)
+    made.add_pass([Vertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], pass_weight=1.0)
     made.finish()
     spread = torch.randn(10, *shape, generator=torch.Generator().manual_seed(1)) / CELL_SIZE
     return lambda x: made(torch.einsum("n,nhwc->hwc", x.float(), spread)).double()

@@ -85,7 +85,7 @@ def vertices(rows: Sequence[tuple[int, float, float, float]], sharp: bool = True
 def test_a_lookup_is_bilinear_and_repeats_at_the_border() -> None:
     """One vertex in the middle of a texel, one between two, one over the corner; their weights add up."""
     made = TextureTransport((1, 3), (4, 4))
-    made.add_pass([vertices([(0, 0.375, 0.625, 2.0), (1, 0.5, 0.625, 2.0), (2, 0.0, 0.0, 4.0)])], fraction=0.5)
+    made.add_pass([vertices([(0, 0.375, 0.625, 2.0), (1, 0.5, 0.625, 2.0), (2, 0.0, 0.0, 4.0)])], pass_weight=0.5)
     made.finish()
     texture = torch.arange(16.0).reshape(4, 4, 1).expand(-1, -1, 3).contiguous()
     seen = made.multiply(texture)[0, :, 0]
@@ -98,7 +98,7 @@ def test_the_transpose_is_one() -> None:
     places = torch.rand(60, 2, generator=generator)
     rows = [(int(60 * x) % 12, float(x), float(y), float(x - y)) for x, y in places]
     made = TextureTransport((3, 4), (CELL_SIZE + 3, 2 * CELL_SIZE))
-    made.add_pass([vertices(rows[:30]), vertices(rows[30:], sharp=False)], fraction=1.0)
+    made.add_pass([vertices(rows[:30]), vertices(rows[30:], sharp=False)], pass_weight=1.0)
     made.finish()
     change = torch.randn(CELL_SIZE + 3, 2 * CELL_SIZE, 3, generator=generator)
     cotangent = torch.randn(3, 4, 3, generator=generator)
@@ -112,7 +112,7 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
     seen = [vertices([(0, 0.3, 0.3, 1.0), (0, 0.999, 0.999, 3.0), (1, 0.7, 0.2, 1.0)])]
     made, small = (TextureTransport((1, 2), texture, small=one) for one in (False, True))
     for one in (made, small):
-        one.add_pass(seen, fraction=1.0)
+        one.add_pass(seen, pass_weight=1.0)
         one.finish()
     change = torch.rand(*texture, 3, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(small.multiply(change), made.multiply(change), rtol=HALF, atol=0.0)
@@ -192,7 +192,7 @@ def test_what_it_starts_from_is_the_traced_picture(renderer: Renderer, predicted
 
 def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for() -> None:
     made = TextureTransport((1, 2), (CELL_SIZE, CELL_SIZE))
-    made.add_pass([vertices([(0, 0.3, 0.3, 1.0), (0, 0.8, 0.3, 3.0), (1, 0.3, 0.3, 1.0)])], fraction=1.0)
+    made.add_pass([vertices([(0, 0.3, 0.3, 1.0), (0, 0.8, 0.3, 3.0), (1, 0.3, 0.3, 1.0)])], pass_weight=1.0)
     made.finish(lambda picture: torch.full_like(picture, 2.0))
     ones = torch.ones(CELL_SIZE, CELL_SIZE, 3)
     assert made.multiply(ones)[0, :, 0].tolist() == pytest.approx([2.0, 2.0], rel=HALF)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -72,12 +72,13 @@ def denoise(
         return (output / gain).to(radiance.device)
 
 
-# The denoised change is faded out where the mean relative change within so many pixels
-# is less than this, half of one of 255 levels.
+# The denoised change is faded out where the mean relative change within `FADE_RADIUS`
+# pixels is less than `MIN_CHANGE`. In sRGB that is half of one of 255 levels.
 FADE_RADIUS = 8
 MIN_CHANGE = 0.004
 FILL_RADIUS = 3  # pixels over which the plane is continued below the object
-FILL_WEIGHT = 0.05  # of what is filled in, where the plane covers a pixel fully
+# weight of the mean nearby, relative to a pixel that the plane covers fully
+FILL_WEIGHT = 0.05
 
 
 def denoise_image(
@@ -88,45 +89,47 @@ def denoise_image(
     *,
     quick: bool = False,
 ) -> Tensor:
-    """Denoise a rendered image (H, W, C), where C is 3, 4, 7 or 13.
+    """Denoise a rendered image (H, W, C).
+
+    C is 3 or 4 without a photograph, 7 with one, and 13 if its plane has a coat. The
+    plane is the ground of the photograph, on which the object's shadow falls.
 
     Args:
-        rendered: channels 0 to 2 are radiance; 3 is coverage, which stays as it is; 4
-            to 6 are the change of the radiance of the plane that takes the shadow in a
-            photograph, 7 to 9 that of what its coat reflects, and 10 to
-            12 the environment in the coat.
+        rendered: channels 0 to 2 are radiance. Channel 3, coverage, is returned as it
+            is. Channels 4 to 6 are the change of the plane's radiance by the object, 7
+            to 9 the change of what its coat reflects, and 10 to 12 what the coat
+            reflects of the environment.
         albedo, normal: (H, W, 3) float32 reflectance in [0, 1] and shading normal of
             the first hit.
         plane_radiance: (3,) radiance of the plane without the object; None if there is
             no plane.
         quick: whether to take less time, and leave a little more error.
     """
+    remove_noise = partial(denoise, albedo=albedo, normal=normal, quick=quick)
     color = rendered[..., :3].contiguous()
     coverage = rendered[..., 3:4]
-    channels = [denoise(color, albedo, normal, quick=quick), coverage]
+    channels = [remove_noise(color), coverage]
     if plane_radiance is not None:
         relative_change = _denoise_shade(
             rendered[..., 4:7] / plane_radiance,
-            (1.0 - coverage).clamp(0.0, 1.0),  # where no surface covers the plane
-            lambda shade: denoise(shade, albedo, normal, quick=quick),
+            visible=(1.0 - coverage).clamp(0.0, 1.0),
+            remove_noise=remove_noise,
         )
-        # the plane is a surface too: where nothing is hit there is no normal
+        # The plane is a surface: where the camera sees none, there is no normal.
         is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
         channels.append(plane_radiance * is_surface * relative_change)
-    if rendered.shape[-1] > 7:
-        # What the coat reflects with and without the object are denoised as two images,
-        # and then subtracted.
-        change = rendered[..., 7:10]
-        before = rendered[..., 10:].contiguous()
-        after = (before + change).clamp_min(0.0)
-        before, after = (
-            denoise(image, albedo, normal, quick=quick) for image in (before, after)
-        )
+    has_coat = rendered.shape[-1] > 7
+    if has_coat:
+        # What the coat reflects without and with the object is denoised as two images,
+        # which are then subtracted.
+        noisy_change = rendered[..., 7:10]
+        noisy_before = rendered[..., 10:].contiguous()
+        noisy_after = (noisy_before + noisy_change).clamp_min(0.0)
+        before = remove_noise(noisy_before)
+        after = remove_noise(noisy_after)
         assert plane_radiance is not None
-        channels += [
-            (after - before) * _compute_fade(change / plane_radiance),
-            before,
-        ]
+        fade = _compute_fade(noisy_change / plane_radiance)
+        channels += [(after - before) * fade, before]
     return torch.cat(channels, dim=-1)
 
 
@@ -144,23 +147,29 @@ def _denoise_shade(
         visible: (H, W, 1) fraction of a pixel in which the plane is visible.
         remove_noise: denoises an image (H, W, 3) of numbers of at least 0.
     """
-    both = torch.cat([change, visible], dim=-1)
-    # Two box filters are about a Gaussian one. The quotient is the mean change of what
-    # is visible nearby.
+    # Two box filters are about a Gaussian one. The quotient is the mean change of the
+    # visible plane nearby.
+    change_and_visible = torch.cat([change, visible], dim=-1)
     for _ in range(2):
-        both = _average(both, FILL_RADIUS)
-    mean_nearby = both[..., :3] / both[..., 3:].clamp_min(1e-4)
-    # the change itself where the plane is visible, and the mean nearby where it is not
+        change_and_visible = _average(change_and_visible, FILL_RADIUS)
+    mean_nearby = change_and_visible[..., :3] / change_and_visible[..., 3:].clamp_min(
+        1e-4
+    )
+    # The change of a full pixel of the plane. `change` is multiplied by the visible
+    # fraction, so that this is a mean: of the pixel's own change by the weight
+    # `visible`, and of the mean nearby by a small weight. Where the plane is hidden,
+    # the latter remains.
     full_change = (change + FILL_WEIGHT * mean_nearby) / (visible + FILL_WEIGHT)
-    # 1 is added for the filter, since a change may be negative
+    # The denoiser needs numbers of at least 0, and a change may be as low as -1.
     clean = remove_noise((1.0 + full_change).clamp_min(0.0).contiguous()) - 1.0
     return clean * visible * _compute_fade(change)
 
 
 def _compute_fade(change: Tensor) -> Tensor:
-    """Return a factor (H, W, 1) that is 0 where nothing near a change (H, W, 3) is.
+    """Return a factor (H, W, 1) that falls to 0 where nothing nearby changes.
 
-    The change is relative to the radiance of the plane.
+    Args:
+        change: (H, W, 3) change relative to the radiance of the plane.
     """
     magnitude = _average(change.abs().mean(dim=-1, keepdim=True), FADE_RADIUS)
     return (magnitude / MIN_CHANGE).clamp_max(1.0)

@@ -109,7 +109,7 @@ def find_libraries(
     libraries = [
         examine_library(path, name_hint=link) for path, link in link_of_file.items()
     ]
-    # in falling order: without a refusal first, then by version
+    # usable libraries first, and among them the newest first
     return sorted(
         libraries,
         key=lambda library: (not library.refusal, library.version),
@@ -147,12 +147,15 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         with path.open("rb") as file:
             header = file.read(ELF_HEADER_SIZE)
     except OSError as error:
-        return LibraryFile(path, (), f"it cannot be read: {error.strerror}")
+        reason = f"it cannot be read: {error.strerror}"
+        return LibraryFile(path, version=(), refusal=reason)
     if interpreter_header:
         if header[:4] != b"\x7fELF" or len(header) < ELF_HEADER_SIZE:
-            return LibraryFile(path, (), "it is not a shared library")
+            reason = "it is not a shared library"
+            return LibraryFile(path, version=(), refusal=reason)
         if _get_architecture(header) != _get_architecture(interpreter_header):
-            return LibraryFile(path, (), "it is for another processor")
+            reason = "it is for another processor"
+            return LibraryFile(path, version=(), refusal=reason)
     version = (
         parse_version(path) or parse_version(name_hint) or query_version(str(path))
     )
@@ -162,7 +165,7 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
 def explain_refusal(version: Version) -> str:
     """Return why Dr.Jit cannot use this version of LLVM; empty if it can."""
     if not version:
-        return "it does not tell its version, so it is older than 16 or not LLVM"
+        return "it does not report its version, so it is older than 16 or not LLVM"
     if version[0] < 15:
         return "Dr.Jit refuses versions below 15"
     if version[0] < MIN_VERSION:
@@ -255,8 +258,10 @@ def get_install_command(
     release = release or {}
     ids = {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
     version = release.get("VERSION_ID", "")
+    # The packages of Ubuntu before 24 end with LLVM 15. conda's can be installed there,
+    # too, after conda itself.
     if "ubuntu" in ids and re.match(r"(1\d|2[0-3])\.", version):
-        return commands["conda"]  # its own packages end with LLVM 15
+        return commands["conda"]
     if ids & {"debian", "ubuntu"}:
         return commands["Debian, Ubuntu"]
     if ids & {"fedora", "rhel"}:
@@ -265,7 +270,10 @@ def get_install_command(
 
 
 def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
-    """Return the first usable candidate that can be loaded.
+    """Return the newest usable library that can be loaded.
+
+    Args:
+        candidates: libraries in the order of `find_libraries`, the newest first.
 
     Raises:
         EnvironmentSetupError: there is none.

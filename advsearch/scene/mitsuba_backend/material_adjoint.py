@@ -1,10 +1,10 @@
-"""The material form of the geometric adjoint: follow the moving surface, and let its
-position on the film move instead.
+"""The material form of the geometric adjoint: samples stick to the moving surface, and
+their positions on the film move.
 
 The loss `sum(cotangent * radiance)` is an integral over the film, `integral of W(s)
-L(s) ds`, with W the cotangent as a function of the film position s in pixels. Over the
-visible part M of the moving meshes it is written in coordinates m that stick to the
-surface, where textures, facets and glossy lobes do not slide under the sample:
+L(s) ds`, where W is the cotangent as a function of the film position s in pixels. Over
+the visible part M of the moving meshes it is written in coordinates m that stick to the
+surface. There textures, facets and glossy lobes do not slide under the sample:
 
     integral over M of  W(s(m)) L(m) J(m) dm,        J = |N . (p - o)| / z^3
 
@@ -30,8 +30,8 @@ number of geometric dimensions.
 
 Source: the material form is that of Zhang, Miller, Yan, Gkioulekas and Zhao,
 "Path-Space Differentiable Rendering" (2020), section 4; sampling edges follows Li,
-Aittala, Durand and Lehtinen (2018). We depart from both in that geometry counts at the
-first hit and its shadow ray only; see `LIMITS`.
+Aittala, Durand and Lehtinen (2018). Unlike both, geometry counts only at the first hit
+and its shadow ray; see `LIMITS`.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.material_view import (
+    INTERIOR,
     FilmView,
     compute_outline_term,
     compute_shadow_term,
@@ -105,7 +106,7 @@ LIMITS: Mapping[str, str] = {
         "mesh itself are left out"
     ): "not measured",
 }
-"""What the estimator does not cover, and what that costs where it was measured.
+"""Limits of the estimator, and the error that each causes, as far as measured.
 
 Errors are relative, of the mean of several seeds over six pose axes; noise is the
 standard deviation of one estimate.
@@ -135,19 +136,19 @@ def material_adjoint(
     depth makes a path tracer.
 
     Args:
-        scene, sensor, parameters: Mitsuba's scene, loaded with `optimize=False`, a
-            perspective camera of it (a thin lens is taken for a pinhole), and what
-            `mi.traverse` returns for it.
+        scene: Mitsuba's scene, loaded with `optimize=False`.
+        sensor: perspective camera of the scene; a thin lens is taken for a pinhole.
+        parameters: what `mi.traverse` returns for the scene.
         moving: `NAME.vertices` and `NAME.normals` of each moving mesh, (V, 3) float32,
-            world units, as the scene has them.
+            in world units, with the values that the scene has.
         cotangent: (H, W, 3) float32, derivative of the loss by the radiance of
             box-filtered pixels.
         seed: seed of all random numbers.
         spp: samples per pixel of the interior term.
         boundary_spp, shadow_spp: samples of the outlines of each mesh and of the edges
             that cast shadows, in multiples of the number of pixels; 0 leaves them out.
-        max_depth: longest light path in segments, of which only the first two move with
-            the vertices.
+        max_depth: longest light path in segments. Only the first two segments, from the
+            camera to a surface and from there on, are differentiated.
 
     Returns:
         The gradients by the vertices and by the normals of each mesh, under the same
@@ -161,9 +162,12 @@ def material_adjoint(
         # cancels. For a smooth cotangent, independent noise averages out better.
         tile = ROUGH_TILE if _is_rough(cotangent) else 1
         total += _compute_interior_term(view, seed, spp, tile)
+    # A still mesh may hide a moving one, or cast a shadow on it. The index gives each
+    # mesh random numbers of its own.
     for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
         total += compute_outline_term(view, mesh, seed, index, boundary_spp)
         total += compute_shadow_term(view, mesh, seed, index, shadow_spp)
+    # `total` is no loss: each term is made so that its gradient is the derivative.
     if dr.grad_enabled(total):
         dr.backward(total)
     gradients = dict[str, Tensor]()
@@ -192,9 +196,9 @@ def _is_rough(cotangent: Tensor) -> bool:
 def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """Return a value whose gradient by the vertices is the interior term.
 
-    The derivative is taken in two steps, since that of some samples is not finite. The
-    first step goes back to the point and the normals of each sample. The second one
-    goes on to the vertices, without samples whose derivative is not finite.
+    The derivative is taken in two steps, since it is not finite for some samples. The
+    first step computes the derivatives by the point and the normals of each sample. The
+    second one takes those that are finite on to the vertices.
 
     Args:
         view: the scene.
@@ -210,28 +214,31 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
         si = hit.compute_surface_interaction(
             view.camera.make_ray(film), mi.RayFlags.All
         )
-    # point, normal and shading normal, and copies at which the first step ends
-    attached = view.attach_hit(hit)[:3]
-    local_values = [type(value)(dr.detach(value)) for value in attached]
+    # Point, normal and shading normal depend on the vertices. The first step is taken
+    # on copies that depend on nothing.
+    attached_values = view.attach_hit(hit)[:3]
+    local_values = [type(value)(dr.detach(value)) for value in attached_values]
     dr.enable_grad(local_values)
     point, scaled_normal, shading_normal = local_values
 
-    # Over all samples the sum of cotangent W, radiance L and the relative change of the
-    # film area J that a piece of the surface covers.
-    jacobian = (
+    # Step 1: differentiate the sum of W L J / J over all samples. The film area J that
+    # a piece of the surface covers counts relatively, so that constant factors of it
+    # may be left out.
+    film_area = (
         dr.dot(scaled_normal, point - view.camera.eye)
         / view.camera.compute_depth(point) ** 3
     )
-    weight = view.interpolate_cotangent(
-        dr.replace_grad(film, view.camera.project(point)), mi.Bool(True)
-    )
+    moving_film = dr.replace_grad(film, view.camera.project(point))
+    weight = view.interpolate_cotangent(moving_film, mi.Bool(True))
     moving_si = _attach_interaction(view, si, point, scaled_normal, shading_normal)
     radiance = _sample_reflected(view, moving_si, si, sampler)
-    dr.backward(dr.sum(dr.sum(weight * radiance) * _with_relative_gradient(jacobian)))
+    sample_loss = dr.sum(weight * radiance)  # over the color channels
+    dr.backward(dr.sum(sample_loss * _with_relative_gradient(film_area)))
 
-    # From there on to the vertices, without samples whose gradient is not finite.
+    # Step 2: the gradient of value * constant by the vertices is the constant, here the
+    # gradient of step 1, times the derivative of the value.
     total = mi.Float(0)
-    for value, local_value in zip(attached, local_values, strict=True):
+    for value, local_value in zip(attached_values, local_values, strict=True):
         gradient = dr.grad(local_value)
         is_finite = dr.all(dr.isfinite(gradient))
         product = dr.dot(value, dr.select(is_finite, gradient, 0))
@@ -244,15 +251,16 @@ def _sample_first_hits(
 ) -> tuple[Any, Any, Any]:
     """Sample film positions that see a moving mesh.
 
-    The film is cut into cells between the centers of pixels, one more than pixels along
-    each side, with stratified samples in each.
+    The film is cut into cells whose corners are the centers of pixels, since the
+    cotangent is bilinear between those. With half a cell past each border there is one
+    more cell than pixels along each side. Each has stratified samples.
 
     Args:
         view: the scene.
         seed: seed of the samples.
         spp: samples in each cell.
-        tile: width of a tile in cells; all cells of a tile have the same random
-            numbers.
+        tile: width of a tile in cells. All cells of a tile have the same random
+            numbers, so that their noise is the same.
 
     Returns:
         Film positions in pixels; their hits; and a sampler that goes on with their
@@ -269,8 +277,12 @@ def _sample_first_hits(
     tiles_across = math.ceil(n_columns / tile)
     n_tiles = tiles_across * math.ceil(n_rows / tile)
     tile_index = row // tile * tiles_across + column // tile
-    stream = make_stream(seed, 0)  # 0: the interior term, whatever the mesh
-    sampler = make_sampler(stream, n_tiles * spp, tile_index * spp + sample)
+    # One stream of random numbers for each sample of a tile.
+    sampler = make_sampler(
+        make_stream(seed, INTERIOR),
+        count=n_tiles * spp,
+        index=tile_index * spp + sample,
+    )
 
     # A cell has as many strata as samples, in an almost square grid.
     strata_across = _find_largest_divisor(spp)
@@ -285,6 +297,7 @@ def _sample_first_hits(
     for mesh in view.moving_meshes:
         on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
     dr.eval(on_moving, film, hit, sampler)
+    # Keep the lanes that see a moving mesh. Each sampler goes on where it is.
     selected_lanes = dr.compress(on_moving)
     film = dr.gather(type(film), film, selected_lanes)
     hit = dr.gather(type(hit), hit, selected_lanes)
@@ -305,11 +318,9 @@ def _with_relative_gradient(value: Any) -> Any:
     derivative is 0.
     """
     constant = dr.detach(value)
-    is_usable = dr.abs(constant) > 1e-20
-    return dr.replace_grad(
-        dr.full(type(constant), 1.0),
-        dr.select(is_usable, value / dr.select(is_usable, constant, 1.0), 1.0),
-    )
+    is_usable = dr.abs(constant) > 1e-20  # the rest is not divided by
+    ratio = dr.select(is_usable, value / dr.select(is_usable, constant, 1.0), 1.0)
+    return dr.replace_grad(dr.full(type(constant), 1.0), ratio)
 
 
 def _attach_interaction(
@@ -330,17 +341,19 @@ def _attach_interaction(
 
     def attach_normal(fixed: Any, normal: Any) -> Any:
         """Give a fixed normal the gradient of another, which may be its opposite."""
-        sign = dr.dot(dr.detach(normal), fixed)
-        return dr.replace_grad(fixed, dr.mulsign(dr.normalize(normal), sign))
+        # Below 0 if the normals are opposite; then `mulsign` turns the second over.
+        cosine = dr.dot(dr.detach(normal), fixed)
+        return dr.replace_grad(fixed, dr.mulsign(dr.normalize(normal), cosine))
 
     moving_si = mi.SurfaceInteraction3f(si)
     moving_si.p = dr.replace_grad(si.p, point)
     moving_si.n = attach_normal(si.n, scaled_normal)
     normal = attach_normal(si.sh_frame.n, shading_normal)
-    tangent = si.sh_frame.s
-    # the part of the tangent that is perpendicular to the normal
-    perpendicular = dr.fma(-normal, dr.dot(normal, tangent), tangent)
-    tangent = dr.replace_grad(tangent, dr.normalize(perpendicular))
+    fixed_tangent = si.sh_frame.s
+    # the part of the tangent that is perpendicular to the moving normal
+    perpendicular = dr.fma(-normal, dr.dot(normal, fixed_tangent), fixed_tangent)
+    tangent = dr.replace_grad(fixed_tangent, dr.normalize(perpendicular))
+    # The third axis has the value of `si.sh_frame.t`: a frame's axes are perpendicular.
     moving_si.sh_frame = mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
     to_eye = dr.normalize(view.camera.eye - point)
     moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))
@@ -360,24 +373,25 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
     """
     with dr.suspend_grad():
         active = mi.Bool(view.max_depth > 1)
-        ds, em_weight, active_em = _sample_light(view, si, sampler, active)
+        ds, em_weight, has_light = _sample_light(view, si, sampler, active)
         bsdf_sample, incoming, active = _sample_incoming(view, si, sampler, active)
         wo = si.to_world(bsdf_sample.wo)
         is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
-    direct = _reflect_light(view, moving_si, si, ds, em_weight, active_em)
+    direct = _reflect_light(view, moving_si, si, ds, em_weight, has_light)
 
-    # Light along the sampled direction is a constant, of which the BSDF passes more or
-    # less as the surface moves; what a mirror reflects stays the same.
+    # `incoming` is the light along the sampled direction, already multiplied by the
+    # BSDF. It is a constant but for the BSDF, which changes as the surface turns. A
+    # mirror has no BSDF value to differentiate: its factor is a constant 1.
     bsdf_value = si.bsdf().eval(
         mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & is_smooth
     )
-    relative = mi.Color3f(
+    relative_bsdf = mi.Color3f(
         *(
             _with_relative_gradient(dr.select(is_smooth, channel, 1.0))
             for channel in bsdf_value
         )
     )
-    return direct + dr.select(active, incoming * relative, 0.0)
+    return direct + dr.select(active, incoming * relative_bsdf, 0.0)
 
 
 def _sample_light(
@@ -385,19 +399,19 @@ def _sample_light(
 ) -> tuple[Any, Any, Any]:
     """Sample a direction to an emitter from surface points.
 
-    Nothing is sampled at a surface that only mirrors: it would reflect none of it.
+    Nothing is sampled at a perfect mirror: it reflects no light of a sampled direction.
 
     Returns:
         Mitsuba's direction sample; the emitter's radiance over the density; and in
         which lanes there is a sample.
     """
     is_smooth = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Smooth)
-    active_em = active & is_smooth
+    has_light = active & is_smooth
     ds, em_weight = view.scene.sample_emitter_direction(
-        si, sampler.next_2d(), True, active_em
+        si, sampler.next_2d(), test_visibility=True, active=has_light
     )
-    active_em &= ds.pdf != 0.0
-    return ds, em_weight, active_em
+    has_light &= ds.pdf != 0.0
+    return ds, em_weight, has_light
 
 
 def _sample_incoming(
@@ -417,51 +431,52 @@ def _sample_incoming(
     active = active & dr.any(bsdf_weight != 0.0)
     is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
-    # all of what the next surface emits is in it
-    L = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
+    radiance = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
+    # `sample_radiance` includes all emission of the next surface, which is found again
+    # here. Subtract the fraction that the samples at emitters cover; in the direction
+    # of a mirror they cover nothing.
+    is_shared = active & is_smooth
     si_next = view.scene.ray_intersect(ray, active)
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
-    em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active & is_smooth)
+    em_pdf = view.scene.pdf_emitter_direction(si, ds_next, is_shared)
     mis = mi.ad.integrators.common.mis_weight(bsdf_sample.pdf, em_pdf)
-    # `sample_radiance` includes all emission of the next surface. Subtract the fraction
-    # that the samples at emitters cover.
-    L -= (1.0 - mis) * ds_next.emitter.eval(si_next, active & is_smooth)
-    return bsdf_sample, bsdf_weight * L, active
+    radiance -= (1.0 - mis) * ds_next.emitter.eval(si_next, is_shared)
+    return bsdf_sample, bsdf_weight * radiance, active
 
 
 def _reflect_light(
     view: FilmView, moving_si: Any, si: Any, ds: Any, em_weight: Any, active: Any
 ) -> Any:
-    """Return the reflected light of emitters that were sampled, attached to the moving
-    point.
+    """Return the reflected light of sampled emitters, attached to the moving point.
 
     The point on the emitter stays. As the reflecting point moves, three factors change:
-    the direction to the emitter, the falloff with distance, and the BSDF; of an
-    infinitely far emitter only the BSDF does.
+    the direction to the emitter, the falloff with distance, and the BSDF. For an
+    infinitely far emitter only the BSDF changes.
 
     Args:
         view: the scene.
-        moving_si, si: the surface interaction, attached and detached.
+        moving_si, si: the surface interaction, with and without gradients.
         ds: Mitsuba's direction sample of the emitter.
-        em_weight: its radiance divided by the sample's density.
-        active: where there is a sample.
+        em_weight: radiance of the emitter divided by the sample's density.
+        active: lanes in which there is a sample.
     """
     flags = ds.emitter.flags()
     is_near = active & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
     is_surface = is_near & mi.has_flag(flags, mi.EmitterFlags.Surface)
     to_light = ds.p - moving_si.p
     ds.d = dr.select(is_near, dr.replace_grad(ds.d, dr.normalize(to_light)), ds.d)
-    attached_weight = view.scene.eval_emitter_direction(moving_si, ds, is_near)
-    attached_weight = dr.select(
-        is_near, attached_weight / dr.select(is_near, ds.pdf, 1.0), em_weight
-    )
-    # cosine at the emitter over the squared distance
+    # the emitter's radiance towards the moving point
+    moving_radiance = view.scene.eval_emitter_direction(moving_si, ds, is_near)
+    moving_weight = moving_radiance / dr.select(is_near, ds.pdf, 1.0)
+    moving_weight = dr.select(is_near, moving_weight, em_weight)
+    # A sample on a surface counts by the solid angle that this covers: the cosine at
+    # the emitter over the squared distance. `em_weight` contains its value, so that
+    # only its relative change is multiplied; its sign cancels in that.
     falloff = dr.dot(ds.n, ds.d) / dr.select(
         is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
     )
-    em_weight = dr.replace_grad(em_weight, attached_weight) * dr.select(
-        is_surface, _with_relative_gradient(falloff), 1.0
-    )
+    em_weight = dr.replace_grad(em_weight, moving_weight)
+    em_weight = em_weight * dr.select(is_surface, _with_relative_gradient(falloff), 1.0)
     bsdf_value, bsdf_pdf = si.bsdf().eval_pdf(
         mi.BSDFContext(), moving_si, moving_si.to_local(ds.d), active
     )

@@ -1,5 +1,5 @@
-"""What the material form of the adjoint needs of a scene: camera, meshes, path tracer
-and random numbers; and its boundary terms.
+"""Camera, meshes, path tracer and random numbers of the material form of the adjoint,
+and its boundary terms.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from torch import Tensor
 from advsearch.scene.mitsuba_backend.meshes import FACES, POSITIONS
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
-# streams of random numbers of one seed; the interior term has stream 0
+# purposes of random numbers: each has streams of its own, see `make_stream`
+INTERIOR = 0
 _OUTLINES = 1
 _PATHS = 2
 _SHADOWS = 3
@@ -25,12 +26,13 @@ class Camera:
     """A pinhole camera, from Mitsuba's sensor.
 
     Attributes:
-        width, height, pixels: width, height and pixels of the film, in pixels, and
-            their product.
-        eye: where it stands.
+        width, height: width and height of the film in pixels.
+        pixels: number of pixels.
+        eye: position of the camera.
         forward: unit vector of the viewing axis.
-        to_film: projection from its local axes to the film, fractions of its size.
-        to_local: transform from the world to its local axes.
+        to_film: projection from the camera's axes to the film, in fractions of its
+            size.
+        to_local: transform from the world to the camera's axes.
     """
 
     def __init__(self, sensor: Any) -> None:
@@ -61,9 +63,9 @@ class Camera:
         return mi.Ray3f(self.eye, dr.normalize(direction))
 
     def is_in_frame(self, film: Any) -> Any:
-        """Return whether a film position can count.
+        """Return whether the cotangent may differ from 0 at a film position.
 
-        The cotangent reaches half a pixel past the border.
+        By interpolation it reaches half a pixel past the border.
         """
         inside = (film.x > -0.5) & (film.y > -0.5)
         return inside & (film.x < self.width + 0.5) & (film.y < self.height + 0.5)
@@ -116,7 +118,7 @@ class TriMesh:
 
 
 class FilmView:
-    """What the three terms of the adjoint share.
+    """Scene, camera and cotangent, which the three terms of the adjoint share.
 
     Args:
         scene, sensor, parameters: as in `material_adjoint`.
@@ -125,10 +127,13 @@ class FilmView:
         max_depth: longest light path in segments.
 
     Attributes:
-        padded_cotangent: the cotangent with a border of zeros, flat.
-        moving_meshes: those that move, in the order of their vertices in `moving`.
-        still_meshes: those that stand still but may hide or shade them; a single
-            rectangle is left out.
+        scene: Mitsuba's scene.
+        camera: camera of the scene.
+        max_depth: longest light path in segments.
+        padded_cotangent: flat cotangent with a border of zeros.
+        moving_meshes: meshes that move, in the order of their vertices in `moving`.
+        still_meshes: meshes that do not move but may hide or shade those that do. A
+            single rectangle, such as the ground, is left out.
     """
 
     def __init__(
@@ -168,7 +173,7 @@ class FilmView:
                 mesh = _make_mesh(shape, parameters, positions, normals)
                 dr.enable_grad(mesh.positions, mesh.normals)
                 moving_meshes[vertices_name] = mesh
-            # A single rectangle, of two faces, is left out, such as the ground.
+            # A rectangle, which has two faces, is left out, such as the ground.
             elif shape.is_mesh() and shape.face_count() > 2:
                 buffer = parameters[f"{shape.id()}.{POSITIONS}"]
                 positions = buffer.torch().reshape(-1, 3).clone()
@@ -176,7 +181,8 @@ class FilmView:
                 self.still_meshes.append(
                     _make_mesh(shape, parameters, positions, normals)
                 )
-        # `moving` has the names of normals too
+        # In the order of `moving`, which decides the random numbers of each mesh. The
+        # names of normals, which are in `moving` too, are skipped.
         self.moving_meshes = [
             moving_meshes[name] for name in moving if name in moving_meshes
         ]
@@ -189,23 +195,24 @@ class FilmView:
         width = self.camera.width
         height = self.camera.height
         active = active & self.camera.is_in_frame(dr.detach(film))
-        # From the center of the first pixel of the padded image, which is half a pixel
-        # outside of the film. Cells lie between pixel centers.
-        # + 1 for the border and - 0.5 to the pixel's center
+        # Positions count from the center of the first pixel of the padded image: + 1
+        # for the border and - 0.5 to the pixel's center. Cells lie between centers.
         padded_film = film + 0.5
         cell_position = dr.floor(dr.detach(padded_film))
         cell = mi.Point2u(
             dr.clip(cell_position.x, 0, width), dr.clip(cell_position.y, 0, height)
         )
         fraction = padded_film - mi.Point2f(cell)
-        # index of its upper left corner in the padded image, two columns wider
-        corner = cell.y * (width + 2) + cell.x
+        # index of the cell's upper left corner in the padded image
+        padded_width = width + 2
+        corner = cell.y * padded_width + cell.x
         cell_corners = [
             dr.gather(mi.Color3f, self.padded_cotangent, corner + offset, active)
-            for offset in (0, 1, width + 2, width + 3)
+            for offset in (0, 1, padded_width, padded_width + 1)
         ]
         top = dr.lerp(cell_corners[0], cell_corners[1], fraction.x)
         bottom = dr.lerp(cell_corners[2], cell_corners[3], fraction.x)
+        # In Dr.Jit, a value & a mask is 0 where the mask is False.
         return dr.lerp(top, bottom, fraction.y) & active
 
     def attach_hit(self, hit: Any) -> tuple[Any, Any, Any, Any]:
@@ -259,9 +266,10 @@ class FilmView:
         # without derivatives and state, which only the adjoint modes take
         derivative = None
         state = None
-        return tracer.sample(
+        radiance, *_ = tracer.sample(
             dr.ADMode.Primal, self.scene, sampler, ray, derivative, state, active
-        )[0]
+        )
+        return radiance
 
 
 def _make_mesh(
@@ -316,7 +324,7 @@ def make_sampler(stream: int, count: int, index: Any = None) -> Any:
 
     Args:
         stream: starting state, as from `make_stream`.
-        count: how many streams there are, and the number of lanes without an index.
+        count: number of streams; without an index, also the number of lanes.
         index: stream of each lane.
     """
     base = mi.PCG32(count, mi.UInt64(stream))
@@ -331,11 +339,15 @@ def make_stream(seed: int, purpose: int, index: int = 0) -> int:
     """Return a starting state below 2^63, far apart for neighbouring seeds.
 
     The factor is 2^64 over the golden ratio, which spreads consecutive numbers
-    (Fibonacci hashing). `purpose` is one of the streams above, and `index` that of a
-    mesh.
+    (Fibonacci hashing).
+
+    Args:
+        seed: seed of the random numbers.
+        purpose: one of the four purposes at the top, from `INTERIOR` to `_SHADOWS`.
+        index: index of a mesh, below 64.
     """
-    # Different for each: a seed has up to 64 meshes, and a mesh up to 4 purposes, which
-    # count from 0. With the 1, it is never 0, whose product would be 0.
+    # A different number for each seed, mesh and purpose. The 1 is added since the
+    # product with 0 would be 0.
     number = (seed * 64 + index) * 4 + purpose + 1
     return (number * 0x9E3779B97F4A7C15) % 2**63
 
@@ -373,13 +385,15 @@ def project_to_film(camera: Camera, points: Tensor) -> Tensor:
 
 # ---- boundary terms: outlines and shadows, by sampled edges (see `material_adjoint`)
 
-EDGE_OFFSET = 0.01  # pixels past an outline at which we look for what is behind it
-# something hides an edge if it is nearer than this fraction of the distance
+# distance past an outline, in pixels, of the ray that finds what is behind it
+EDGE_OFFSET = 0.01
+# A surface hides an edge if it is nearer by more than this fraction of the distance.
 DEPTH_TOLERANCE = 1e-3
-# how far past an edge a shadow ray passes, in extents of the mesh
+# distance at which a shadow ray passes an edge, as a fraction of the mesh's extent
 SHADOW_OFFSET = 1e-4
-MIN_COSINE = 0.02  # smallest cosine at a lit point that is divided by
-# smallest depth of an edge that is used, in world units; there is no clipping of edges
+MIN_COSINE = 0.02  # smallest cosine at a lit point to divide by
+# Smallest depth of an edge that is used, in world units. An edge with an end nearer
+# than that is left out, since edges are not clipped.
 MIN_DEPTH = 1e-3
 
 
@@ -389,14 +403,14 @@ def compute_outline_term(
     """Return a value whose gradient is the outline term of one mesh.
 
     Where an outline moves outwards on the film, it hides what is behind it. A point on
-    the outline contributes the product of three factors: the cotangent at its pixel,
-    the radiance behind it, and its speed along the outline's normal. If the surface
-    behind moves too, its speed is subtracted. A point that another surface hides
-    contributes 0.
+    the outline contributes the product of three factors: the cotangent at its pixel
+    (the derivative of the loss by the image), the radiance behind it, and its speed
+    along the outline's normal. If the surface behind moves too, its speed is
+    subtracted. A point that another surface hides contributes 0.
 
     Args:
         view: the scene.
-        mesh: one that moves, or one that stands still and may hide it.
+        mesh: mesh that moves, or that stands still and may hide one that moves.
         seed: seed of the samples.
         mesh_index: index of the mesh, which gives it random numbers of its own.
         spp: samples, in multiples of the number of pixels.
@@ -412,24 +426,42 @@ def compute_outline_term(
     edge_point = mesh.interpolate_edge(sampled.ends, sampled.fraction)
     edge_film = view.camera.project(edge_point)
     with dr.suspend_grad():
+        # A ray just past the edge, on the side away from the mesh, sees what the edge
+        # would hide if it moved outwards.
         ray = view.camera.make_ray(dr.detach(edge_film) + EDGE_OFFSET * film_normal)
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         edge_distance = dr.norm(dr.detach(edge_point) - view.camera.eye)
-        # The ray just past the edge must not hit anything nearer than the edge.
+        # If the ray hits something nearer than the edge, that hides the edge.
         is_visible = ~hit.is_valid() | (hit.t > edge_distance * (1.0 - DEPTH_TOLERANCE))
-        sampler = make_sampler(stream + _PATHS, len(sampled.fraction))
-        radiance_behind = view.sample_radiance(ray, sampler, view.max_depth, is_visible)
-        strength = dr.sum(
-            view.interpolate_cotangent(edge_film, is_visible) * radiance_behind
-        )
-        strength = dr.select(is_visible & dr.isfinite(strength), strength, 0.0)
+        strength = _sample_outline_strength(view, ray, edge_film, is_visible, stream)
+        # Evaluated here, so that the backward pass does not trace the rays again.
         dr.eval(strength, hit)
-    # Outside of `suspend_grad`: from here on it is differentiated by the vertices.
-    point_behind, _, _, moves_behind = view.attach_hit(hit)
+    # Outside of `suspend_grad`, since the motion is differentiated by the vertices.
+    # Only its gradient counts: where nothing moves, the position may be anything.
+    point_behind, _normal, _shading_normal, moves_behind = view.attach_hit(hit)
     film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
-    speed = dr.dot(film_normal, edge_film - film_behind)
+    motion = dr.dot(film_normal, edge_film - film_behind)
     # minus: where the outline moves outwards, the radiance behind is lost
-    return dr.sum(strength * speed) * -sampled.pixels_per_sample
+    return dr.sum(strength * motion) * -sampled.pixels_per_sample
+
+
+def _sample_outline_strength(
+    view: FilmView, ray: Any, edge_film: Any, is_visible: Any, stream: int
+) -> Any:
+    """Return the cotangent at points of an outline times the radiance behind them.
+
+    Args:
+        view: the scene.
+        ray: camera rays just past the outline.
+        edge_film: film positions of the points.
+        is_visible: lanes in which nothing hides the point; elsewhere the result is 0.
+        stream: stream of the outline's random numbers.
+    """
+    sampler = make_sampler(stream + _PATHS, dr.width(edge_film))
+    radiance_behind = view.sample_radiance(ray, sampler, view.max_depth, is_visible)
+    cotangent = view.interpolate_cotangent(edge_film, is_visible)
+    strength = dr.sum(cotangent * radiance_behind)
+    return dr.select(is_visible & dr.isfinite(strength), strength, 0.0)
 
 
 class _OutlineSamples(NamedTuple):
@@ -445,9 +477,11 @@ def _to_space_fraction(film_fraction: Tensor, depth: Tensor) -> Tensor:
     """Convert positions along edges on the film to positions along edges in space.
 
     Both are fractions (N,) from the first end of an edge to the second. They differ
-    because the nearer half of an edge is longer on the film. This inverts
+    because the nearer half of an edge is longer on the film. With depths d0 and d1 of
+    the ends,
 
-        film = space d1 / ((1 - space) d0 + space d1), with depths d0 and d1 of the ends
+        film = space d1 / ((1 - space) d0 + space d1)
+        space = film d0 / (film d0 + (1 - film) d1)
 
     Args:
         film_fraction: (N,) fractions on the film.
@@ -513,19 +547,19 @@ def _sample_outline(
     second_on_film = project_to_film(camera, mesh.vertices[ends[:, 1]])
     depth = (mesh.vertices[ends] - eye) @ forward
     length = _measure_on_film(camera, first_on_film, second_on_film, depth)
-    # no edge is on the film
-    if not float(length.sum()) > 0.0:
+    if not float(length.sum()) > 0.0:  # no edge is on the film
         return None
     edge_index, film_fraction = _sample_along(length, random)
 
-    # A short step away from the mesh tells on which side of the edge the mesh is.
+    # A short step away from the mesh, projected to the film, shows on which side of the
+    # edge the mesh is.
     midpoints = mesh.vertices[ends].mean(dim=1)
-    outwards_on_film = project_to_film(
-        camera, midpoints + 1e-3 * mesh.extent * outwards
-    ) - project_to_film(camera, midpoints)
+    outside_points = midpoints + 1e-3 * mesh.extent * outwards
+    outwards_on_film = project_to_film(camera, outside_points) - project_to_film(
+        camera, midpoints
+    )
     edge_on_film = second_on_film[edge_index] - first_on_film[edge_index]
     normal = _find_film_normals(edge_on_film, outwards_on_film[edge_index])
-    # even on the film is not even in space
     fraction = _to_space_fraction(film_fraction, depth[edge_index])
     pixels_per_sample = float(length.sum()) / len(random)
     return _OutlineSamples(ends[edge_index], fraction, normal, pixels_per_sample)
@@ -541,21 +575,24 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
         (E, 2) vertices of the edges, and (E, 3) that plane's unit normal, away from the
         mesh.
     """
-    ends, owner, across = _find_edges(mesh.vertices, mesh.corners)
+    edges = _find_edges(mesh.vertices, mesh.corners)
+    ends = edges.ends
     # (E, 3) normals of the planes
     plane = torch.linalg.cross(
         mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
     )
     plane = torch.nn.functional.normalize(plane, dim=1)
-    # (3 F,) signed distance of the third corner of each face from its edge's plane
-    offset_from_plane = (plane[owner] * (mesh.vertices[across] - eye)).sum(dim=1)
-    # (E,) the smallest and the largest over the faces of an edge
+    # (3 F,) for each side of a face: signed distance of the face's third corner from
+    # the plane of that edge
+    corner_from_eye = mesh.vertices[edges.third_corner] - eye
+    offset_from_plane = (plane[edges.edge_of_side] * corner_from_eye).sum(dim=1)
+    # (E,) the smallest and the largest distance over the faces at an edge
     min_offset = torch.full(
         (len(ends),), torch.inf, dtype=offset_from_plane.dtype
-    ).scatter_reduce(0, owner, offset_from_plane, "amin")
+    ).scatter_reduce(0, edges.edge_of_side, offset_from_plane, "amin")
     max_offset = torch.full(
         (len(ends),), -torch.inf, dtype=offset_from_plane.dtype
-    ).scatter_reduce(0, owner, offset_from_plane, "amax")
+    ).scatter_reduce(0, edges.edge_of_side, offset_from_plane, "amax")
     on_outline = (min_offset > 0.0) | (max_offset < 0.0)
     # away from the faces
     sign = torch.where(min_offset[on_outline] > 0.0, -1.0, 1.0)[:, None]
@@ -563,12 +600,12 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
-    """Spread n stratified samples over segments with given lengths.
+    """Spread n stratified samples over segments in proportion to their lengths.
 
     Args:
-        length: (E,) of the segments, of which at least one is positive; a segment of
-            length 0 gets no sample.
-        random: (n,) in [0, 1).
+        length: (E,) lengths of the segments, of which at least one is positive; a
+            segment of length 0 gets no sample.
+        random: (n,) random numbers in [0, 1).
 
     Returns:
         (n,) index of the segment, and (n,) position along it in [0, 1].
@@ -587,7 +624,15 @@ def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
     return segment, fraction
 
 
-def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+class _MeshEdges(NamedTuple):
+    """The E edges of a mesh, and the 3 F sides of its faces that lie on them."""
+
+    ends: Tensor  # (E, 2) vertices of each edge
+    edge_of_side: Tensor  # (3 F,) index of the edge on which each side lies
+    third_corner: Tensor  # (3 F,) vertex of the side's face that is not on the side
+
+
+def _find_edges(vertices: Tensor, corners: Tensor) -> _MeshEdges:
     """Find the edges of a mesh, each with all faces on it.
 
     Vertices at the same position count as one.
@@ -595,26 +640,23 @@ def _find_edges(vertices: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tens
     Args:
         vertices: (V, 3) positions.
         corners: (F, 3) vertices of the faces.
-
-    Returns:
-        (E, 2) vertices of each edge; and for each of the 3 F sides of faces, (3 F,) the
-        index of its edge and (3 F,) the vertex across, which is the face's third
-        corner.
     """
     # (V,) numbers, which are equal for vertices at the same position
     position_id = torch.unique(vertices, dim=0, return_inverse=True)[1]
     face_sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
+    third_corner = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
     lower, higher = position_id[face_sides].aminmax(dim=1)
     # one number for each pair of positions, in either direction
-    edge_keys, owner = torch.unique(lower * len(vertices) + higher, return_inverse=True)
-    side_index = torch.arange(len(owner))
+    edge_keys, edge_of_side = torch.unique(
+        lower * len(vertices) + higher, return_inverse=True
+    )
+    side_index = torch.arange(len(edge_of_side))
     # An edge has the vertices of the first side that lies on it. To assign them by
     # index would take those of any side, not the same one in each call.
-    first_side = torch.full((len(edge_keys),), len(owner)).scatter_reduce(
-        0, owner, side_index, "amin"
+    first_side = torch.full((len(edge_keys),), len(edge_of_side)).scatter_reduce(
+        0, edge_of_side, side_index, "amin"
     )
-    return face_sides[first_side], owner, across
+    return _MeshEdges(face_sides[first_side], edge_of_side, third_corner)
 
 
 def compute_shadow_term(
@@ -623,60 +665,58 @@ def compute_shadow_term(
     """Return a value whose gradient is the shadow term of one mesh.
 
     A line that touches the mesh at an edge separates light that passes from light that
-    is blocked. It ends at a lit point, where the border of a shadow lies. That point
-    counts by what the light past the edge adds to the image, and by the speed of the
-    border, relative to the lit surface if that moves too.
-
-    Of all sampled lines (`sampled`), `shadow` has those that end in a point which the
-    camera sees; its `sample_index` selects them from `sampled`.
+    is blocked. It comes from the light, and ends at a lit point on another surface,
+    where the border of the shadow lies. The contribution of a line is the product of
+    two factors: how much the light past the edge adds to the loss through the image
+    (`strength`), and the speed of the edge, relative to the lit point if that moves
+    too.
 
     Args:
         view: the scene.
-        mesh: one that moves, or one that stands still and may cast a shadow.
+        mesh: mesh that moves, or that stands still and may cast a shadow.
         seed: seed of the samples.
         mesh_index: index of the mesh, which gives it random numbers of its own.
         spp: samples, in multiples of the number of pixels.
     """
     stream = make_stream(seed, _SHADOWS, mesh_index)
     random = sample_uniform(stream, spp * view.camera.pixels, 4)
-    sampled = _sample_tangents(mesh, random)
-    if sampled is None:
+    lines = _sample_tangents(mesh, random)
+    if lines is None:
         return mi.Float(0)
     with dr.suspend_grad():
-        shadow = _sample_shadow_borders(view, mesh, sampled, stream)
+        shadow = _sample_shadow_borders(view, mesh, lines, stream)
     if shadow is None:
         return mi.Float(0)
-    lit_point, _, _, lit_point_moves = view.attach_hit(shadow.hit)
+    # Only the gradient of the motion counts: a point that does not move may be
+    # anywhere.
+    index = shadow.line_index
+    lit_point, _normal, _shading_normal, lit_point_moves = view.attach_hit(shadow.hit)
+    edge_point = mesh.interpolate_edge(lines.ends[index], lines.fraction[index])
+    moving_lit_point = dr.select(lit_point_moves, lit_point, 0.0)
+    motion = dr.dot(shadow.edge_normal, edge_point - moving_lit_point)
     # sine of the angle between each line and its edge: an edge along the line sweeps no
     # area
     sine = torch.linalg.cross(
-        sampled.direction, _compute_edge_directions(mesh.vertices, sampled.ends)
+        lines.direction, _compute_edge_directions(mesh.vertices, lines.ends)
     ).norm(dim=1)
-    edge_point = mesh.interpolate_edge(
-        sampled.ends[shadow.sample_index], sampled.fraction[shadow.sample_index]
-    )
-    speed = dr.dot(
-        shadow.edge_normal, edge_point - dr.select(lit_point_moves, lit_point, 0.0)
-    )
-    strength = shadow.strength * to_drjit_float(sine[shadow.sample_index])
-    # minus: where the edge moves outwards, light is blocked; and each sample stands for
-    # a measure of lines
-    return dr.sum(strength * speed) * -sampled.measure_per_sample
+    strength = shadow.strength * to_drjit_float(sine[index])
+    # minus: where the edge moves outwards, light is blocked
+    return dr.sum(strength * motion) * -lines.measure_per_sample
 
 
 class _ShadowBorders(NamedTuple):
-    """Points of shadows' borders that the camera sees, of some of the samples."""
+    """Points on the borders of shadows that the camera sees, for m of the lines."""
 
-    sample_index: Tensor  # (m,)
+    line_index: Tensor  # (m,) index of the line, among all sampled lines
     hit: Any  # the lit point, where the line past the edge ends
     edge_normal: Any  # unit vector, away from the mesh at the edge
-    strength: Any  # how the light that passes the edge counts in the image
+    strength: Any  # derivative of the loss by the light that passes the edge
 
 
 def _sample_shadow_borders(
-    view: FilmView, mesh: TriMesh, sampled: _TangentSamples, stream: int
+    view: FilmView, mesh: TriMesh, lines: _TangentLines, stream: int
 ) -> _ShadowBorders | None:
-    """Find the lines whose end is lit and seen by the camera; None if there is none.
+    """Find the lines that end in a point which the camera sees; None if there is none.
 
     A line comes from the light, touches the mesh at an edge and ends at the next
     surface.
@@ -684,126 +724,141 @@ def _sample_shadow_borders(
     Args:
         view: the scene.
         mesh: the mesh with the edges.
-        sampled: the sampled edge points and lines.
+        lines: sampled edge points, and lines through them.
         stream: stream of the random numbers, as from `make_stream`.
     """
     edge_points = torch.lerp(
-        mesh.vertices[sampled.ends[:, 0]],
-        mesh.vertices[sampled.ends[:, 1]],
-        sampled.fraction[:, None],
+        mesh.vertices[lines.ends[:, 0]],
+        mesh.vertices[lines.ends[:, 1]],
+        lines.fraction[:, None],
     )
     edge_position = to_drjit_vectors(mi.Point3f, edge_points)
-    light_direction = to_drjit_vectors(mi.Vector3f, sampled.direction)
-    edge_normal = to_drjit_vectors(mi.Vector3f, sampled.normal)
+    to_light = to_drjit_vectors(mi.Vector3f, lines.direction)
+    edge_normal = to_drjit_vectors(mi.Vector3f, lines.normal)
     offset = SHADOW_OFFSET * mesh.extent * edge_normal
-    # The line goes on from just past the edge, with the light, to the lit point.
-    ray = mi.Ray3f(edge_position + offset, -light_direction)
+    # The ray starts just past the edge, and goes the way of the light to the lit point.
+    ray = mi.Ray3f(edge_position + offset, -to_light)
     hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
     si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
-    lit = _eval_lit_points(view, si, light_direction)
-    dr.eval(lit, hit, si, edge_position, offset)
-    # Most lines end where the camera sees nothing: what follows is for the others.
-    lit_index = dr.compress(dr.any(lit != 0.0))
-    if dr.width(lit_index) == 0:
+    light_weight = _weigh_lit_points(view, si, to_light)
+    dr.eval(light_weight, hit, si, edge_position, offset)
+    # Most lines end where the camera sees nothing, and are dropped here.
+    line_index = dr.compress(dr.any(light_weight != 0.0))
+    if dr.width(line_index) == 0:
         return None
-    lit, hit, si, edge_position, offset, edge_normal = (
-        dr.gather(type(value), value, lit_index)
-        for value in (lit, hit, si, edge_position, offset, edge_normal)
+    light_weight, hit, si, edge_position, offset, edge_normal = (
+        dr.gather(type(value), value, line_index)
+        for value in (light_weight, hit, si, edge_position, offset, edge_normal)
     )
     # how much the loss changes as the lit point passes the shadow's border
     difference = _sample_radiance_difference(view, si, edge_position, offset, stream)
-    strength = dr.sum(lit * difference)
+    strength = dr.sum(light_weight * difference)
     strength = dr.select(dr.isfinite(strength), strength, 0.0)
     dr.eval(strength, hit)
     return _ShadowBorders(
-        sample_index=lit_index.torch().to("cpu", torch.int64),
+        line_index=line_index.torch().to("cpu", torch.int64),
         hit=hit,
         edge_normal=edge_normal,
         strength=strength,
     )
 
 
-def _eval_lit_points(view: FilmView, si: Any, d: Any) -> Any:
-    """Return the factor (RGB) by which light at lit points counts in the image.
+def _weigh_lit_points(view: FilmView, si: Any, to_light: Any) -> Any:
+    """Return the derivative (RGB) of the loss by light along lines to lit points.
 
-    It is a product of three factors, W, f and J' of the formula in `material_adjoint`:
-    the cotangent at the point's pixel; the BSDF with its cosine; and the area on the
-    film that a bundle of lines covers there, per unit of its spread in space and angle.
-    It is 0 where the camera does not see the point.
+    It is the product of three factors:
+
+    - the cotangent at the point's pixel,
+    - the BSDF towards the camera, times the cosine at which the light arrives,
+    - the area on the film that a bundle of lines around this one covers, per unit of
+      area across the bundle.
+
+    It is 0 where the camera does not see the point. In the formula of
+    `material_adjoint` these are W, f and J'.
 
     Args:
         view: the scene.
         si: surface interactions of the lit points; their `wi` is set to the camera.
-        d: unit directions from which the light comes.
+        to_light: unit directions from which the light comes.
     """
     camera = view.camera
     film = camera.project(si.p)
     depth = camera.compute_depth(si.p)
     to_eye = camera.eye - si.p
-    active = si.is_valid() & (depth > MIN_DEPTH) & camera.is_in_frame(film)
+    is_visible = si.is_valid() & (depth > MIN_DEPTH) & camera.is_in_frame(film)
     si.wi = si.to_local(dr.normalize(to_eye))
-    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(d), active)
-    active &= dr.any(value > 0.0)
-    active &= ~view.scene.ray_test(si.spawn_ray_to(camera.eye), active)
+    # In Mitsuba, the value of a BSDF contains the cosine.
+    weight = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_light), is_visible)
+    is_visible &= dr.any(weight > 0.0)
+    is_visible &= ~view.scene.ray_test(si.spawn_ray_to(camera.eye), is_visible)
     matrix = camera.to_film.matrix
-    # pixels per unit of the tangent, along both axes
-    pixel_area = abs(
+    # area in pixels of a unit square at depth 1 that faces the camera
+    pixels_at_unit_depth = abs(
         float(matrix[0, 0][0]) * camera.width * float(matrix[1, 1][0]) * camera.height
     )
-    film_area = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixel_area
-    # A line's spread is measured across it, and covers more of a surface that it meets
-    # at a grazing angle: hence over the cosine, which is also a factor of the value.
-    value *= film_area / dr.maximum(dr.abs(dr.dot(si.n, d)), MIN_COSINE)
-    return dr.select(active, value * view.interpolate_cotangent(film, active), 0.0)
+    # The same of a unit area of the surface at its depth. With the angle at the surface
+    # it is cos / depth^2, where `to_eye` has the length depth / cos of the axis.
+    film_area = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixels_at_unit_depth
+    # An area across the bundle covers 1 / cosine of the surface where the light
+    # arrives.
+    cosine = dr.abs(dr.dot(si.n, to_light))
+    weight *= film_area / dr.maximum(cosine, MIN_COSINE)
+    cotangent = view.interpolate_cotangent(film, is_visible)
+    return dr.select(is_visible, weight * cotangent, 0.0)
 
 
 def _sample_radiance_difference(
-    view: FilmView, si: Any, p: Any, offset: Any, stream: int
+    view: FilmView, si: Any, edge_point: Any, offset: Any, stream: int
 ) -> Any:
     """Return the radiance that a lit point gets just past an edge minus just inside.
 
-    The difference is 0 where something hides the edge from the lit point.
+    The difference is 0 where something else hides the edge from the lit point. That is
+    tested on the ray past the edge only: the other one hits the mesh itself.
 
     Args:
         view: the scene.
         si: the lit point.
-        p: the point on the edge.
+        edge_point: the point on the edge.
         offset: the step from the edge to just past it.
         stream: stream of random numbers; both sides have the same.
     """
 
     def make_ray(target: Any) -> Any:
+        """Return a ray from the lit point that does not end at the target."""
         ray = si.spawn_ray_to(target)
         return mi.Ray3f(ray.o, ray.d)
 
-    occluder = view.scene.ray_intersect_preliminary(
-        make_ray(p + offset), coherent=False
-    )
-    # shorter by a tolerance, so that the mesh at the edge itself does not count
-    distance_to_edge = dr.norm(p - si.p) * (1.0 - DEPTH_TOLERANCE) - 2.0 * dr.norm(
-        offset
-    )
+    past_edge = edge_point + offset
+    inside_edge = edge_point - offset
+    occluder = view.scene.ray_intersect_preliminary(make_ray(past_edge), coherent=False)
+    # Shorter by tolerances, so that the mesh at the edge itself does not count: the ray
+    # passes it at the distance of the offset.
+    distance_to_edge = dr.norm(edge_point - si.p) * (1.0 - DEPTH_TOLERANCE)
+    distance_to_edge -= 2.0 * dr.norm(offset)
     is_free = ~occluder.is_valid() | (occluder.t > distance_to_edge)
 
     def sample_radiance(target: Any) -> Any:
-        sampler = make_sampler(stream + _PATHS, dr.width(p))
+        """Return the radiance from the direction of a target, with equal noise."""
+        sampler = make_sampler(stream + _PATHS, dr.width(edge_point))
+        # The camera's segment is one of the path's `max_depth`.
         return view.sample_radiance(
             make_ray(target), sampler, view.max_depth - 1, is_free
         )
 
-    radiance_past = sample_radiance(p + offset)
-    radiance_inside = sample_radiance(p - offset)
-    return dr.select(is_free, radiance_past - radiance_inside, 0.0)
+    difference = sample_radiance(past_edge) - sample_radiance(inside_edge)
+    return dr.select(is_free, difference, 0.0)
 
 
-class _TangentSamples(NamedTuple):
+class _TangentLines(NamedTuple):
     """Points sampled on edges of a mesh, and lines through them that touch the mesh."""
 
     ends: Tensor  # (n, 2) vertices of the edge
     fraction: Tensor  # (n,) position along the edge, in [0, 1]
     direction: Tensor  # (n, 3) unit direction of the line
     normal: Tensor  # (n, 3) unit normal of edge and line, away from the mesh
-    measure_per_sample: float  # world units times steradians
+    # all lines that could be sampled (length times solid angle: world units times
+    # steradians), divided by the number of samples
+    measure_per_sample: float
 
 
 def _orient_outwards(vectors: Tensor, directions: Tensor) -> Tensor:
@@ -812,56 +867,58 @@ def _orient_outwards(vectors: Tensor, directions: Tensor) -> Tensor:
     return vectors * torch.where(points_inwards, -1.0, 1.0)
 
 
-def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentSamples | None:
+def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
     """Sample lines that touch the mesh at points of its edges, evenly.
 
     A line through a point of an edge touches the mesh if both faces at the edge are on
-    one side of it. That is so if the line lies within the edge's exterior angle, or
-    opposite to it. At an edge with a single face every line touches the mesh.
+    one side of it. Seen along the edge, such lines lie within its exterior angle,
+    between one face and the continuation of the other, or in the opposite direction. At
+    an edge with a single face every line touches the mesh.
 
     Args:
         mesh: the mesh.
-        random: (n, 4) in [0, 1), for the edge, the point, and both angles of the line.
+        random: (n, 4) random numbers in [0, 1). They choose the edge, the point on it,
+            the angle around the edge, and the angle to the edge.
 
     Returns:
         The samples; None if there is nothing to sample.
     """
-    vertices = mesh.vertices
     edges = _measure_exterior_angles(mesh)
-    edge_length = (vertices[edges.ends[:, 1]] - vertices[edges.ends[:, 0]]).norm(dim=1)
-    measure = edge_length * edges.angle
+    # length times exterior angle of each edge
+    measure = _compute_edge_vectors(mesh.vertices, edges.ends).norm(dim=1)
+    measure = measure * edges.angle
     if len(random) == 0 or not float(measure.sum()) > 0.0:
         return None
-    # only the choice of the edge counts: the point on it has a random number of its own
-    edge_index, _ = _sample_along(measure, random[:, 0])
+    # Only the choice of the edge is used: the point on it has a random number of its
+    # own.
+    edge_index, _fraction = _sample_along(measure, random[:, 0])
     axis = edges.axis[edge_index]
-    along_first = edges.along_first[edge_index]
     along_second = edges.along_second[edge_index]
+    # Both faces go from the edge to the side where the mesh is.
+    inwards = edges.along_first[edge_index] + along_second
 
-    # A direction perpendicular to the edge, within the exterior angle.
+    # A direction perpendicular to the edge, within the exterior angle: `along_second`
+    # rotated about the edge towards `opening`.
     angle = random[:, 2:3] * edges.angle[edge_index][:, None]
     perpendicular = (
         torch.cos(angle) * along_second + torch.sin(angle) * edges.opening[edge_index]
     )
-    # from -2 to 2: the sign chooses the exterior angle or its opposite, and the
-    # magnitude minus 1 is the cosine with the edge
-    edge_cosine = 4.0 * random[:, 3:4] - 2.0
-    perpendicular = torch.where(edge_cosine < 0.0, -perpendicular, perpendicular)
-    edge_cosine = edge_cosine.abs() - 1.0
-    direction = (
-        edge_cosine * axis
-        + (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt() * perpendicular
-    )
+    # One random number gives two values. From -2 to 2, its sign chooses the exterior
+    # angle or the opposite one, and its magnitude minus 1 is the cosine with the edge.
+    signed_choice = 4.0 * random[:, 3:4] - 2.0
+    perpendicular = torch.where(signed_choice < 0.0, -perpendicular, perpendicular)
+    edge_cosine = signed_choice.abs() - 1.0
+    edge_sine = (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt()
+    direction = edge_cosine * axis + edge_sine * perpendicular
 
-    normal = _orient_outwards(
-        torch.linalg.cross(axis, perpendicular), along_first + along_second
-    )
-    return _TangentSamples(
+    normal = _orient_outwards(torch.linalg.cross(axis, perpendicular), inwards)
+    # `measure` contains the edge's length and the exterior angle. The range of
+    # `signed_choice`, 4, is the rest: cosines from -1 to 1, for two opposite angles.
+    return _TangentLines(
         ends=edges.ends[edge_index],
         fraction=random[:, 1],
         direction=direction,
         normal=normal,
-        # two sides, and cosines from -1 to 1
         measure_per_sample=4.0 * float(measure.sum()) / len(random),
     )
 
@@ -887,30 +944,34 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     Edges with more faces, or of length 0, are left out.
     """
     vertices = mesh.vertices
-    ends, owner, across = _find_edges(vertices, mesh.corners)
+    edges = _find_edges(vertices, mesh.corners)
     # Sort the sides of faces by their edge, so that those of one edge follow one
-    # another; the first and the last of them belong to its two faces.
-    sorted_sides = torch.argsort(owner, stable=True)
-    n_faces = torch.bincount(owner, minlength=len(ends))
-    # where the last side of each edge is among the sorted ones
-    last_entry = n_faces.cumsum(dim=0) - 1
-    length = (vertices[ends[:, 1]] - vertices[ends[:, 0]]).norm(dim=1)
+    # another. The first and the last of them belong to its two faces; at an edge with a
+    # single face they are the same.
+    sorted_sides = torch.argsort(edges.edge_of_side, stable=True)
+    n_faces = torch.bincount(edges.edge_of_side, minlength=len(edges.ends))
+    last_index = n_faces.cumsum(dim=0) - 1  # indices into `sorted_sides`
+    first_index = last_index - n_faces + 1
+    length = _compute_edge_vectors(vertices, edges.ends).norm(dim=1)
     is_measured = (n_faces <= 2) & (length > 0.0)
-    ends = ends[is_measured]
-    is_single = n_faces[is_measured] == 1
+    ends = edges.ends[is_measured]
     axis = _compute_edge_directions(vertices, ends)
 
-    def along_face(entry: Tensor) -> Tensor:
-        """Return unit vectors along one of an edge's faces, perpendicular to it."""
-        side = sorted_sides[entry[is_measured]]
-        vector = vertices[across[side]] - vertices[ends[:, 0]]
+    def compute_face_directions(index: Tensor) -> Tensor:
+        """Return unit vectors along faces, perpendicular to the measured edges.
+
+        Args:
+            index: (E,) for every edge the index of a side in `sorted_sides`.
+        """
+        side = sorted_sides[index[is_measured]]
+        vector = vertices[edges.third_corner[side]] - vertices[ends[:, 0]]
         return torch.nn.functional.normalize(
             vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
         )
 
-    # at an edge with a single face both are the same vector
-    along_first = along_face(last_entry - n_faces + 1)
-    along_second = along_face(last_entry)
+    along_first = compute_face_directions(first_index)
+    along_second = compute_face_directions(last_index)
+    is_single = n_faces[is_measured] == 1
     opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)
     return _ExteriorAngles(
         ends=ends,
@@ -943,18 +1004,24 @@ def _measure_between_faces(
     cosine = (along_first * along_second).sum(dim=1, keepdim=True)
     # the part of the first direction that is perpendicular to the second
     perpendicular = along_first - cosine * along_second
-    # away from the first face; at a single face either direction is right
+    # From the second face the exterior angle opens away from the first one (hence the
+    # minus). At a single face it is half a turn, and may open to either side.
     opening = torch.where(
         is_single[:, None],
         torch.linalg.cross(axis, along_second),
         -torch.nn.functional.normalize(perpendicular, dim=1),
     )
-    angle = torch.pi - torch.atan2(perpendicular.norm(dim=1), cosine[:, 0])
-    return opening, angle
+    # At a single face both directions are the same: sine 0 and cosine 1 make an
+    # interior angle of 0.
+    interior_angle = torch.atan2(perpendicular.norm(dim=1), cosine[:, 0])
+    return opening, torch.pi - interior_angle
+
+
+def _compute_edge_vectors(vertices: Tensor, ends: Tensor) -> Tensor:
+    """Return vectors (n, 3) from the first to the second vertex of edges (n, 2)."""
+    return vertices[ends[:, 1]] - vertices[ends[:, 0]]
 
 
 def _compute_edge_directions(vertices: Tensor, ends: Tensor) -> Tensor:
     """Return unit vectors (n, 3) along edges with vertices (n, 2)."""
-    return torch.nn.functional.normalize(
-        vertices[ends[:, 1]] - vertices[ends[:, 0]], dim=1
-    )
+    return torch.nn.functional.normalize(_compute_edge_vectors(vertices, ends), dim=1)

@@ -220,7 +220,7 @@ def to_repeating_uv(
     """
     if "to_uv" in options:
         matrix = torch.as_tensor(np.asarray(options["to_uv"]), dtype=uv.dtype)
-        uv = uv @ matrix[:2, :2].T + matrix[:2, -1]
+        uv = uv @ matrix[:2, :2].T + matrix[:2, -1]  # (3, 3) or (4, 4)
     texture_size = torch.tensor((size[1], size[0]), dtype=uv.dtype)
     wrap_mode = options.get("wrap_mode", "repeat")
     if wrap_mode == "mirror":
@@ -230,6 +230,7 @@ def to_repeating_uv(
         uv = torch.minimum(
             torch.maximum(uv, 0.5 / texture_size), 1.0 - 0.5 / texture_size
         )
+    # At the center of a texel, interpolation returns that texel alone.
     if options.get("filter_type") == "nearest":
         return (torch.floor(uv * texture_size) + 0.5) / texture_size
     return uv
@@ -326,7 +327,8 @@ def _to_plain_entry(value: object) -> object:
     """Convert one value of a dictionary, see `to_plain`."""
     if isinstance(value, Mapping):
         return to_plain(value)
-    matrix = getattr(value, "matrix", None)
+    matrix = getattr(value, "matrix", None)  # of a transform
     if matrix is None:
         return value
+    # Some of Dr.Jit's matrices have a further axis, of one lane.
     return np.array(matrix, dtype=np.float64).reshape(len(matrix), len(matrix))

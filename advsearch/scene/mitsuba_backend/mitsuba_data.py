@@ -86,7 +86,9 @@ def _find_numbers(
         if there is one; and the type of everything else by its key, for messages.
     """
     scene = MitsubaScene(description, SMALL_RESOLUTION)
-    inputs = {
+    # Names of inputs that are numbers or colors, by Mitsuba's key. These are written
+    # with the functions `to_flat_array` and `to_color`; textures and poses are not.
+    input_of_key = {
         key: name
         for name, (key, scene_input) in scene.declared_inputs.items()
         if scene_input.write in (to_flat_array, to_color)
@@ -95,7 +97,8 @@ def _find_numbers(
     other_types: dict[str, str] = {}
     for key in scene.parameters.keys():
         value = scene.parameters[key]
-        is_plain = isinstance(value, float)  # a constant of Mitsuba's
+        # A Python float is a constant that Mitsuba compiles into its kernels.
+        is_plain = isinstance(value, float)
         is_single_number = isinstance(value, mi.Float) and len(value) == 1
         if is_plain:
             values: tuple[float, ...] = (value,)
@@ -106,7 +109,7 @@ def _find_numbers(
             continue
         estimators = _find_valid_estimators(scene.parameters.flags(key))
         numbers[key] = PluginNumber(
-            key, values, inputs.get(key, ""), estimators, is_plain
+            key, values, input_of_key.get(key, ""), estimators, is_plain
         )
     return numbers, other_types
 

@@ -26,19 +26,18 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi
 # refracted into the water (Snell's law; the sheet itself is plane and changes no
 # direction) and out of it at the cap, or is lost where it would be totally reflected.
 # Where caps overlap, the higher one counts. The transmittance is Fresnel's for
-# unpolarised light (Born and Wolf, Principles of Optics, section 1.5).
+# unpolarized light (Born and Wolf, Principles of Optics, section 1.5).
 #
 # Only directions change: the scene is taken to be far away compared to the sheet.
 
 WATER_IOR = 1.33  # index of refraction
-SHEET_DISTANCE = 60.0  # of the sheet from the camera, millimetres
-APERTURE_RADIUS = 1.0  # radius of the camera's aperture, millimetres
+SHEET_DISTANCE = 60.0  # distance of the sheet from the camera, millimeters
+APERTURE_RADIUS = 1.0  # radius of the camera's aperture, millimeters
 # range of angles between a drop's surface and the glass at its rim, degrees
 CONTACT_ANGLES = (25.0, 42.0)
 LOG_RADIUS_SPREAD = 0.45  # standard deviation of the logarithm of radii
-SHEET_HALF_WIDTH = (
-    1.1  # half width of the square with drops, in half widths of the image
-)
+# width of the square with drops divided by the width that the camera sees of the sheet
+SHEET_WIDTH_FACTOR = 1.1
 GRID_SIZE = 1024  # cells along each side of the grid that holds the drop of a position
 
 
@@ -48,36 +47,36 @@ def sample_raindrops(
     """Sample raindrops on a square of the glass sheet before a camera.
 
     Args:
-        count: how many drops.
-        size: median radius of a drop on the sheet, millimetres.
+        count: number of drops.
+        size: median radius of a drop on the sheet, millimeters.
         seed: seed of the positions and radii.
         tangent: tangent of half the camera's field of view along its larger side.
 
     Returns:
-        Half the width of the square, millimetres; the camera looks at its center.
+        Half the width of the square, millimeters; the camera looks at its center.
         (count, 4) float32, for each drop the x and y of its center, its radius on the
-        sheet and the radius of its curvature, millimetres.
-        (GRID, GRID) index of the drop that is highest at the center of each cell, rows
-        along y; `count` where there is none.
+        sheet and the radius of its curvature, millimeters.
+        (GRID_SIZE, GRID_SIZE) index of the drop that is highest at the center of each
+        cell of the square, rows along y; `count` where there is none.
     """
     random = np.random.default_rng(seed)
-    # The sheet is wider than what the camera sees of it.
-    half_width = SHEET_HALF_WIDTH * SHEET_DISTANCE * tangent
+    half_visible_width = SHEET_DISTANCE * tangent
+    half_width = SHEET_WIDTH_FACTOR * half_visible_width
     centers = random.uniform(-half_width, half_width, (count, 2))
-    radii = size * np.exp(
-        # no huge and no tiny ones
-        LOG_RADIUS_SPREAD * random.standard_normal(count).clip(-2.5, 2.5)
-    )
+    # The logarithm of a radius is normal; the limit leaves out huge and tiny drops.
+    log_factors = LOG_RADIUS_SPREAD * random.standard_normal(count).clip(-2.5, 2.5)
+    radii = size * np.exp(log_factors)
     contact_angles = np.radians(random.uniform(*CONTACT_ANGLES, count))
     curvature_radii = radii / np.sin(contact_angles)
     drops = np.column_stack([centers, radii, curvature_radii])
-    return half_width, drops.astype(np.float32), _find_highest_drops(drops, half_width)
+    highest_drop = _find_highest_drops(drops, half_width)
+    return half_width, drops.astype(np.float32), highest_drop
 
 
 def _compute_cap_height(
     distance_squared: Float64Array, radius: float, curvature_radius: float
 ) -> Float64Array:
-    """Return the height of a drop's surface over the sheet, in millimetres.
+    """Return the height of a drop's surface over the sheet, in millimeters.
 
     A drop is the cap that the sheet cuts off a sphere. The height is negative outside
     of the drop's circle; callers mask that.
@@ -101,8 +100,8 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
 
     Args:
         drops: (count, 4) x and y of each drop's center, its radius on the sheet, and
-            the radius of its curvature, millimetres.
-        half_width: half the width of the grid, which is around 0, millimetres.
+            the radius of its curvature, millimeters.
+        half_width: half the width of the grid, which is around 0, millimeters.
     """
     # coordinates of the cells' centers, the same for x and y
     cell_centers = (
@@ -127,16 +126,16 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
 
 common: Any = mi.ad.integrators.common
 PRBIntegrator: Any = mi.ad.integrators.prb.PRBIntegrator
-PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that takes the shadow
-COAT_FRACTION = 0.5  # of the paths from a plane with a coat: those that leave its coat
-MIN_DENSITY = 1e-20  # per steradian
+PLANE_SHAPE = "ground"  # Mitsuba's id of the plane that receives the shadow
+COAT_FRACTION = 0.5  # fraction of the paths from a coated plane that leave its coat
+MIN_DENSITY = 1e-20  # smallest density to divide by, per steradian
 ISOTROPIC_PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
-MIN_EXTINCTION = 1e-20
+MIN_EXTINCTION = 1e-20  # smallest extinction to divide by
 MAX_SCATTERINGS = 8
 """Largest number of scatterings in the haze along a path.
 
-They do not count as bounces off surfaces, so that haze of density 0 is no haze. Where
-the haze's optical radius is 1.2, what is cut off is below 1 % of the light.
+They do not count as bounces off surfaces, so that haze of density 0 changes nothing. If
+the haze's optical radius is 1.2, the light of longer paths is below 1 %.
 """
 
 
@@ -155,21 +154,21 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
     replay backpropagation (Vicini et al. 2021, Path Replay Backpropagation, sections 4
     and 5) with detached samples.
 
-    Why not Mitsuba's `prbvolpath`: it starts every path outside of all media, so that a
-    camera inside haze sees none up to the first surface (its source has the note "TODO:
-    support sensors inside media"). To know that there is one uniform medium in one ball
-    also saves the intersections with the ball's surface.
+    Mitsuba's `prbvolpath` cannot be used: it starts every path outside of all media, so
+    that a camera inside haze sees none up to the first surface (its source has the note
+    "TODO: support sensors inside media"). Since there is one uniform medium in one
+    ball, no intersections with the ball's surface are traced either.
 
     Derivatives are right for the haze's color, for emission, for everything that
-    surfaces look up, and for the density where it is greater than 0. Moving geometry
-    has none.
+    surfaces look up, and for the density where it is greater than 0. There is no
+    derivative by moving geometry.
 
     Attributes:
-        haze: the medium.
-        radius: radius of the ball that it fills.
+        haze: medium that fills the ball.
+        radius: radius of the ball, which is around the origin.
 
     Properties in addition to those of `prb`: `medium`, a homogeneous medium with grey
-    extinction, and `radius`, that of the ball around the origin which the medium fills.
+    extinction, and `radius`, the radius of the ball.
     """
 
     def __init__(self, props: Any) -> None:
@@ -337,9 +336,12 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         if self.hide_emitters:
             is_emitter = si.shape.emitter() != None  # noqa: E711 (for each lane)
             skipped = active & is_first & si.is_valid() & is_emitter
-            next_hit = self.skip_area_emitters(
-                scene, si.spawn_ray(ray.d), True, skipped
-            )
+            behind_ray = si.spawn_ray(ray.d)
+            is_coherent = True
+            next_hit = self.skip_area_emitters(scene, behind_ray, is_coherent, skipped)
+            # Distances count from the camera, since haze lies in front of the skipped
+            # surface too.
+            next_hit.t += si.t
             si[skipped] = next_hit.compute_surface_interaction(
                 ray, mi.RayFlags.All, skipped
             )
@@ -383,9 +385,12 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             active: lanes that are traced.
 
         Returns:
-            Whether it is scattered within the haze; the distance; a weight, attached to
-            the haze's parameters, of which only the relative gradient counts; the
-            detached albedo per channel; and the extinction, which is grey.
+            Whether it is scattered within the haze; the distance; the density of light
+            at the end of the flight, attached to the haze's parameters; the detached
+            albedo per channel; and the extinction, which is grey.
+
+            Of that density, callers use only the gradient divided by the value
+            (`dr.relative_grad`). So it need not be divided by the sampling density.
         """
         scattering, _, extinction = self.haze.get_scattering_coefficients(
             dr.zeros(mi.MediumInteraction3f)
@@ -421,19 +426,21 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             lanes there is a sample.
         """
         ds, weight = scene.sample_emitter_direction(
-            event, sampler.next_2d(), True, active
+            event, sampler.next_2d(), test_visibility=True, active=active
         )
         active = active & (ds.pdf != 0.0)
-        # Towards the environment the haze goes on up to the border of the ball.
-        is_outside = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        distance = dr.select(is_outside, dr.inf, ds.dist)
+        # Towards the environment the haze goes on up to the border of the ball. There
+        # `ds.dist` is only a distance outside of the scene.
+        is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        distance = dr.select(is_environment, dr.inf, ds.dist)
         _, haze_length = self._find_haze_segment(event.p, ds.d, distance)
         if not primal:
+            # The sampled weight has no gradient. The emitter is evaluated again with
+            # gradients; the value stays that of the sample.
             with dr.resume_grad():
-                attached = scene.eval_emitter_direction(event, ds, active)
-                weight = dr.replace_grad(
-                    weight, attached * dr.select(active, dr.rcp(ds.pdf), 0.0)
-                )
+                radiance = scene.eval_emitter_direction(event, ds, active)
+                inverse_density = dr.select(active, dr.rcp(ds.pdf), 0.0)
+                weight = dr.replace_grad(weight, radiance * inverse_density)
         return ds, weight, haze_length, active
 
 
@@ -487,8 +494,9 @@ class _Coat:
     """A rough, clear coat (GGX, Walter et al. 2007) without color.
 
     Args:
-        reflectance: that at a right angle, in [0, 1]; Fresnel's elsewhere.
-        roughness: in [0, 1], the square root of the distribution's width.
+        reflectance: reflectance at a right angle, in [0, 1]. At other angles it follows
+            Fresnel's equations.
+        roughness: square root of the distribution's width, in [0, 1].
     """
 
     def __init__(self, reflectance: float, roughness: float) -> None:
@@ -499,11 +507,13 @@ class _Coat:
     def sample(self, incident: Any, point: Any) -> Any:
         """Sample a direction of light; all directions are local, z is the normal.
 
+        `evaluate` returns the density of a direction.
+
         Args:
             incident: unit direction to the viewer.
             point: two random numbers.
         """
-        normal, _ = self._make_distribution().sample(incident, point)
+        normal, _normal_density = self._make_distribution().sample(incident, point)
         return mi.reflect(incident, normal)
 
     def evaluate(self, incident: Any, direction: Any) -> tuple[Any, Any]:
@@ -531,22 +541,30 @@ class _Coat:
 class _PlaneHits:
     """Camera rays that meet the plane first, and where their paths go on.
 
-    Its changes are those of the light that the matt ground reflects and, if there is a
-    coat, that the coat reflects; the last is all of the environment in the coat.
+    The plane stands for ground in a photograph, which already contains the light of the
+    environment. What is computed is the change of the ground's radiance by the objects
+    and lamps in the scene, in one or three quantities of three channels each:
+
+        0. the change of the light that the matt ground reflects
+        1. with a coat, the change of the light that the coat reflects
+        2. with a coat, the light that the coat reflects of the environment if no object
+           hides any of it
 
     Args:
-        scene, sampler: as in `mi.ad.integrators.common.RBIntegrator`.
+        scene, sampler: Mitsuba's scene and random numbers.
         ray: camera rays.
-        active: which are traced at all.
+        active: lanes that are traced.
         coat: coat of the plane; None if it is matt.
 
     Attributes:
         is_hit: whether a ray meets the plane first.
-        direct_changes: the changes by what hides the environment, and by lamps.
-        weights: for each change the weight of the light that comes along the path's
-            next segment.
-        path_ray: that segment as a ray; of other rays, the camera ray.
-        is_traced: whether there is such a segment.
+        direct_changes: for each quantity its part from blocked light of the environment
+            and from lamps.
+        weights: for each quantity the weight of the light that arrives along the next
+            segment of the path, which other surfaces send to the plane.
+        path_ray: next segment of a path that met the plane, as a ray. For a camera ray
+            that did not, the camera ray itself.
+        is_traced: whether `path_ray` has to be traced.
     """
 
     def __init__(
@@ -565,14 +583,15 @@ class _PlaneHits:
         self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
         self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
         self._coat = coat
-        # Of a plane with a coat the matt part alone; ratios need no transmittance.
+        # The reflectance of the matt part. What a coat takes from it is left out: the
+        # changes are used as ratios to the plane's radiance, in which it cancels.
         self._albedo = self._si.bsdf().eval_diffuse_reflectance(self._si, self.is_hit)
         light = self._sample_emitter(scene, sampler)  # which also sets `_factors`
         self.direct_changes = [
             dr.select(self.is_hit, factor * light, 0.0) for factor in self._factors
         ]
-        # The random number is taken even without a coat, where it has no effect.
-        is_off_coat = sampler.next_1d() < COAT_FRACTION
+        # The random number is drawn even without a coat, where it has no effect.
+        leaves_coat = sampler.next_1d() < COAT_FRACTION
         # The density is in proportion to the cosine, so that the weight of a path from
         # the matt ground is its albedo alone.
         direction = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
@@ -580,7 +599,7 @@ class _PlaneHits:
         is_bounced = direction.z > 0.0
         if coat is not None:
             direction, is_bounced = self._choose_bounce(
-                coat, direction, is_off_coat, sampler
+                coat, direction, leaves_coat, sampler
             )
         bounced_ray = self._si.spawn_ray(self._si.to_world(direction))
         self.path_ray = dr.select(self.is_hit, bounced_ray, ray)
@@ -591,40 +610,56 @@ class _PlaneHits:
     def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
         """Sample an emitter from the plane, and return its radiance over the density.
 
-        This also sets `_factors`: one factor of that radiance for each kind of change.
-        A factor is the fraction of the light that the plane reflects, times a sign.
-        For light of the environment, which the photograph already has, the sign is -1
-        where something blocks it and else 0. For a lamp, which the photograph does not
-        have, it is 0 where something blocks it and else 1.
+        This also sets `_factors`: a factor on that radiance for each quantity of the
+        class. It is the fraction of the light that the plane reflects; for the changes
+        it is multiplied by a sign. The photograph already has the light of the
+        environment: the sign is -1 where something blocks it, else 0. It does not have
+        the light of a lamp: the sign is 0 where something blocks it, else 1.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
-            si, sampler.next_2d(), False, self.is_hit
+            si, sampler.next_2d(), test_visibility=False, active=self.is_hit
         )
         is_sampled = self.is_hit & (ds.pdf != 0.0)
         is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
         is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        # of a lamp: 0 where it is blocked, 1 where its light passes; of the environment
-        # -1 and 0, since the photograph has its light already
-        sign = dr.select(is_blocked, 0.0, 1.0)
-        sign = dr.select(is_environment, sign - 1.0, sign)
+        visibility = dr.select(is_blocked, 0.0, 1.0)
+        sign = dr.select(is_environment, visibility - 1.0, visibility)
         direction = si.to_local(ds.d)
-        reflected = self._albedo * dr.inv_pi * dr.maximum(direction.z, 0.0)
+        matt_fraction = self._albedo * dr.inv_pi * dr.maximum(direction.z, 0.0)
         self._emitter_sample = ds
-        self._factors = [dr.select(is_sampled, sign * reflected, 0.0)]
+        self._factors = [dr.select(is_sampled, sign * matt_fraction, 0.0)]
         if self._coat is not None:
-            value, density = self._coat.evaluate(si.wi, direction)
-            # A path off the coat may meet the environment too. The two samples share
-            # its light by the balance heuristic (Veach 1997).
-            share = ds.pdf / (ds.pdf + COAT_FRACTION * density)
-            value *= dr.select(is_environment, share, 1.0)
-            self._factors.append(mi.Color3f(dr.select(is_sampled, sign * value, 0.0)))
-            is_met = is_sampled & is_environment
-            self._factors.append(mi.Color3f(dr.select(is_met, value, 0.0)))
+            coat_fraction = self._compute_coat_fraction(
+                self._coat, direction, ds.pdf, is_environment
+            )
+            change = dr.select(is_sampled, sign * coat_fraction, 0.0)
+            environment = dr.select(is_sampled & is_environment, coat_fraction, 0.0)
+            self._factors += [mi.Color3f(change), mi.Color3f(environment)]
         return light
 
+    def _compute_coat_fraction(
+        self, coat: _Coat, direction: Any, emitter_density: Any, is_environment: Any
+    ) -> Any:
+        """Return the fraction of an emitter sample's light that the coat reflects.
+
+        A path from the coat, which is sampled too, may find the same light of the
+        environment (`_reflect_environment`). So each of the two samples is weighted by
+        its fraction of both densities, the balance heuristic (Veach 1997). A path
+        cannot meet a lamp, whose sample counts in full.
+
+        Args:
+            coat: coat of the plane.
+            direction: local direction to the emitter.
+            emitter_density: density of the emitter sample.
+            is_environment: lanes in which the emitter is the environment.
+        """
+        fraction, coat_density = coat.evaluate(self._si.wi, direction)
+        mis_weight = emitter_density / (emitter_density + COAT_FRACTION * coat_density)
+        return fraction * dr.select(is_environment, mis_weight, 1.0)
+
     def _choose_bounce(
-        self, coat: _Coat, matt_direction: Any, is_off_coat: Any, sampler: Any
+        self, coat: _Coat, matt_direction: Any, leaves_coat: Any, sampler: Any
     ) -> tuple[Any, Any]:
         """Choose whether a path goes on from the matt ground or from its coat.
 
@@ -634,7 +669,7 @@ class _PlaneHits:
         Args:
             coat: coat of the plane.
             matt_direction: local direction of a path from the matt ground.
-            is_off_coat: whether it goes on from the coat.
+            leaves_coat: lanes whose path goes on from the coat.
             sampler: Mitsuba's random numbers.
 
         Returns:
@@ -644,23 +679,25 @@ class _PlaneHits:
         value, density = coat.evaluate(self._si.wi, reflected)
         is_reflected = density > 0.0
         coat_weight = dr.select(is_reflected, value / density, 0.0) / COAT_FRACTION
+        matt_weight = self._albedo / (1.0 - COAT_FRACTION)
         self.weights = [
-            dr.select(is_off_coat, 0.0, self._albedo / (1.0 - COAT_FRACTION)),
-            mi.Color3f(dr.select(is_off_coat, coat_weight, 0.0)),
+            dr.select(leaves_coat, 0.0, matt_weight),
+            mi.Color3f(dr.select(leaves_coat, coat_weight, 0.0)),
+            # The environment in the coat has no light that other surfaces send.
             mi.Color3f(0.0),
         ]
-        direction = dr.select(is_off_coat, reflected, matt_direction)
-        is_bounced = dr.select(is_off_coat, is_reflected, matt_direction.z > 0.0)
+        direction = dr.select(leaves_coat, reflected, matt_direction)
+        is_bounced = dr.select(leaves_coat, is_reflected, matt_direction.z > 0.0)
         return direction, is_bounced
 
     def _reflect_environment(self, scene: Any, coat: _Coat, direction: Any) -> None:
-        """Add the changes by the environment that a bounce off the coat would meet.
+        """Add the light of the environment that a bounce off the coat would meet.
 
-        Where the object blocks it, the light is subtracted from the coat's change. The
-        light itself is added to the last change, the environment in the coat.
+        It is added to the environment in the coat, and where the object blocks it,
+        subtracted from the coat's change.
 
-        The emitter sample of `_sample_emitter` finds the same light; by the balance
-        heuristic it counts there by one fraction, and here by the rest.
+        The emitter sample of `_sample_emitter` finds the same light. By the balance
+        heuristic each of the two counts by its fraction of both densities.
 
         Args:
             scene: Mitsuba's scene.
@@ -672,22 +709,29 @@ class _PlaneHits:
         ds.d = self.path_ray.d
         ds.emitter = mi.EmitterPtr(environment)
         is_bounced = self.is_hit & self.is_traced
-        density = COAT_FRACTION * coat.evaluate(self._si.wi, direction)[1]
-        both = density + scene.pdf_emitter_direction(self._si, ds, is_bounced)
-        share = density / dr.maximum(both, MIN_DENSITY)
-        beyond = dr.zeros(mi.SurfaceInteraction3f)  # a ray that leaves the scene
-        beyond.wi = -ds.d
-        beyond.wavelengths = self._si.wavelengths
-        met = self.weights[1] * share * environment.eval(beyond, is_bounced)
-        met = dr.select(is_bounced, met, 0.0)
+        _value, coat_density = coat.evaluate(self._si.wi, direction)
+        density = COAT_FRACTION * coat_density
+        both_densities = density + scene.pdf_emitter_direction(self._si, ds, is_bounced)
+        mis_weight = density / dr.maximum(both_densities, MIN_DENSITY)
+        # the interaction of a ray that leaves the scene
+        escaped = dr.zeros(mi.SurfaceInteraction3f)
+        escaped.wi = -ds.d
+        escaped.wavelengths = self._si.wavelengths
+        # `weights[1]` is 0 in lanes where the path leaves the matt ground.
+        reflected = self.weights[1] * mis_weight * environment.eval(escaped, is_bounced)
+        reflected = dr.select(is_bounced, reflected, 0.0)
         is_blocked = scene.ray_test(self.path_ray, is_bounced)
-        self.direct_changes[1] -= dr.select(is_blocked, met, 0.0)
-        self.direct_changes[2] += met
+        # 1 is the coat's change, 2 the environment in the coat.
+        self.direct_changes[1] -= dr.select(is_blocked, reflected, 0.0)
+        self.direct_changes[2] += reflected
 
     def list_changes(self, path_radiance: Any) -> list[Any]:
-        """Return the changes, three channels each, with the light that paths bring.
+        """Return the quantities of the class, three channels each.
 
-        `path_radiance` is the radiance that arrives along the path's next segment.
+        They include the light that other surfaces send to the plane.
+
+        Args:
+            path_radiance: radiance that arrives along the path's next segment.
         """
         channels: list[Any] = []
         for weight, change in zip(self.weights, self.direct_changes, strict=True):
@@ -699,7 +743,8 @@ class _PlaneHits:
         """Add the derivatives of the direct changes by the lights' parameters.
 
         The emitter sample is that of the primal pass, evaluated again with gradients.
-        The environment that a bounce meets has none: in a photograph it is fixed.
+        The environment that a bounce meets has no derivative: in a photograph it is
+        fixed.
 
         Args:
             scene: Mitsuba's scene.
@@ -714,14 +759,15 @@ class _PlaneHits:
             light = scene.eval_emitter_direction(self._si, ds, is_sampled)
             light *= dr.select(is_sampled, dr.rcp(ds.pdf), 0.0)
         path_cotangent = mi.Spectrum(0.0)
+        # one factor and one weight for each quantity of the class
         for index, factor in enumerate(self._factors):
             cotangent = mi.Spectrum(*cotangents[3 * index : 3 * index + 3])
             path_cotangent += self.weights[index] * cotangent
             with dr.resume_grad():
                 change = cotangent * factor * light
                 if dr.grad_enabled(change):
-                    # The replay of the path needs the same edges of the graph later, so
-                    # only the inner ones are cleared.
+                    # The replay of the path needs the edges at the lights' parameters
+                    # later, so that only the interior ones are cleared.
                     dr.backward_from(change, dr.ADFlag.ClearInterior)
         return path_cotangent
 
@@ -729,22 +775,24 @@ class _PlaneHits:
 class PhotographPath(PRBIntegrator):  # type: ignore[misc]
     """Trace paths for a scene that is rendered into a photograph, with an adjoint.
 
-    It is the integrator `advsearch_photograph`. The plane that takes the shadow, the
-    shape `ground`, is not seen. Where a camera ray meets it first, the change of its
-    radiance by all that is in the scene beside it and the environment is in three more
-    channels:
+    It is the integrator `advsearch_photograph`. The shape `ground` is a plane that
+    receives shadows, and is itself invisible. Where a camera ray meets it first, three
+    more channels contain the change of the plane's radiance by everything else in the
+    scene but the environment:
 
-        - light of the environment that is kept from it + light of lamps
-        + light that other surfaces send to it
+        - light of the environment that is blocked + light of lamps
+        + light that other surfaces send to the plane
 
-    Both are exactly zero where nothing is in the way, so that the photograph stays as
-    it is there, without noise. The object sees the plane as any other surface.
+    The change is exactly zero where nothing blocks or sends light, so that the
+    photograph there stays as it is, without noise. Other surfaces see the plane as any
+    other surface.
 
-    With a `reflectance` above 0 (and a `roughness`) the plane has a clear coat, and six
-    further channels are the same change of what that reflects, and the environment in
-    it without the object. Other surfaces see the plane's own plugin, which may differ.
+    With a `reflectance` above 0 (and a `roughness`) the plane has a clear coat. Then
+    six further channels contain the same change of the light that the coat reflects,
+    and the environment in the coat without the object. Other surfaces see the plane's
+    own plugin, which may differ.
 
-    The derivative is that of `prb` on what is left of the path.
+    The derivative is that of `prb` for the rest of the path.
     """
 
     def __init__(self, props: Any) -> None:
@@ -768,9 +816,9 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
     ) -> Any:
         """Sample paths of light, or in the adjoint modes replay them.
 
-        Where a ray meets the plane that takes the shadow, the color is 0, and the
-        changes of the plane's radiance are returned in further channels, three each
-        (`δaovs` are their cotangents).
+        A path that meets the plane first goes on from there; `prb` traces that rest.
+        Its radiance is part of the change of the plane's radiance, which is returned in
+        the further channels, while the color is 0. See `_PlaneHits`.
 
         Args:
             mode: primal (trace the image) or an adjoint mode of Dr.Jit.
@@ -789,8 +837,10 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         camera_ray = mi.Ray3f(dr.detach(ray))
         plane = _PlaneHits(scene, sampler, camera_ray, mi.Bool(active), self.coat)
         if mode != dr.ADMode.Primal:
-            # Rays that meet the plane count only by the further channels.
-            δL = dr.select(plane.is_hit, plane.backpropagate(scene, δaovs), δL)
+            # A ray that meets the plane has color 0. Its rest, which `prb` traces,
+            # counts by the further channels only.
+            path_cotangent = plane.backpropagate(scene, δaovs)
+            δL = dr.select(plane.is_hit, path_cotangent, δL)
         L, valid, _, state_out = super().sample(
             mode=mode,
             scene=scene,
@@ -805,10 +855,11 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         return color, valid & ~plane.is_hit, plane.list_changes(L), state_out
 
     def sample_rays(self, scene: Any, sensor: Any, sampler: Any, **rest: Any) -> Any:
-        """Return rays, weights and positions, with weights that are plain numbers.
+        """Return rays, weights and positions, with weights of one channel.
 
-        Mitsuba 3.9.1 multiplies each further channel by a weight of three channels in
-        `render_backward`, which fails. Our cameras' weights are grey.
+        Mitsuba's weights have three channels. `render_backward` of Mitsuba 3.9.1
+        multiplies each further channel, a plain number, by them, which fails. The
+        weights of our cameras are equal in all channels.
         """
         ray, weight, position = super().sample_rays(scene, sensor, sampler, **rest)
         return ray, mi.Float(weight[0]), position
@@ -824,20 +875,22 @@ mi.register_integrator("advsearch_photograph", lambda props: PhotographPath(prop
 
 
 class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
-    """Render what guides the denoiser: diffuse reflectance and shading normal.
+    """Render the guides of the denoiser: diffuse reflectance and shading normal.
 
-    It is the integrator `advsearch_guides`: three channels each, of the first hit that
-    light does not pass. Mitsuba's `aov` takes the very first hit, and the outline of
-    what is cut off would show.
+    It is the integrator `advsearch_guides`. Each guide has three channels, of the first
+    hit that light does not pass. Mitsuba's `aov` uses the very first hit: then the
+    guides would contain the outlines of cut-out surfaces.
     """
 
     @dr.syntax  # type: ignore[untyped-decorator]
     def sample(
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> Any:
-        """Return reflectance, coverage and guides of camera rays.
+        """Return color, coverage and further channels of camera rays.
 
-        A ray goes on through a surface with the probability with which light passes it.
+        Mitsuba expects a color, which is the reflectance here. The further channels are
+        the guides: the reflectance again, and the normal. A ray goes on through a
+        surface with the probability with which light passes it.
 
         Args:
             scene, sampler: Mitsuba's scene and random numbers.
@@ -860,6 +913,7 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
             albedo[is_stopped] = bsdf.eval_diffuse_reflectance(si, is_stopped)
             normal[is_stopped] = si.sh_frame.n
             is_covered |= is_stopped
+            # the same direction from the hit on
             ray = si.spawn_ray(ray.d)
             active = passes_through
         return albedo, is_covered, [*albedo, *normal]
@@ -873,15 +927,17 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
 mi.register_integrator("advsearch_guides", Guides)
 
 
-MIN_CELLS = 128  # along a side of the grid of ray directions
-MAX_CELLS = 512
-NO_DROP = (0.0, 0.0, -1.0, 1.0)  # center, radius and curvature: a drop without inside
+MIN_CELLS = 128  # smallest number of cells along a side of the grid of ray directions
+MAX_CELLS = 512  # largest number
+# x and y of the center, radius and curvature radius. The radius below 0 marks that
+# there is no drop.
+NO_DROP = (0.0, 0.0, -1.0, 1.0)
 
 
 def _compute_transmittance(
     cos_incident: Any, cos_refracted: Any, ior_incident: float, ior_refracted: float
 ) -> Any:
-    """Return Fresnel's transmittance of unpolarised light between two media.
+    """Return Fresnel's transmittance of unpolarized light between two media.
 
     It is 1 minus the mean reflectance of the two polarisations.
 
@@ -889,13 +945,13 @@ def _compute_transmittance(
         cos_incident, cos_refracted: cosines of the angles to the normal.
         ior_incident, ior_refracted: indices of refraction of the two media.
     """
-    s_polarised = (ior_incident * cos_incident - ior_refracted * cos_refracted) / (
+    s_polarized = (ior_incident * cos_incident - ior_refracted * cos_refracted) / (
         ior_incident * cos_incident + ior_refracted * cos_refracted
     )
-    p_polarised = (ior_refracted * cos_incident - ior_incident * cos_refracted) / (
+    p_polarized = (ior_refracted * cos_incident - ior_incident * cos_refracted) / (
         ior_refracted * cos_incident + ior_incident * cos_refracted
     )
-    return 1.0 - 0.5 * (s_polarised * s_polarised + p_polarised * p_polarised)
+    return 1.0 - 0.5 * (s_polarized * s_polarized + p_polarized * p_polarized)
 
 
 def _refract_through_drop(
@@ -905,13 +961,17 @@ def _refract_through_drop(
 
     Args:
         direction: unit direction before the drop.
-        dx, dy: where the ray enters, from the drop's center, millimetres.
-        drop: center, radius and curvature radius, as in `sample_raindrops`.
+        dx, dy: where the ray enters, from the drop's center, millimeters.
+        drop: x and y of the center, radius on the sheet, and radius of the sphere of
+            which the drop is a cap, as in `sample_raindrops`.
 
     Returns:
-        The direction behind the drop, not normalised; the fraction of the light that
+        The direction behind the drop, not normalized; the fraction of the light that
         passes; and whether the ray is lost by total reflection.
     """
+    radius_on_sheet = drop.z
+    curvature_radius = drop.w
+
     # Snell's law at the flat side, whose normal is z
     inside_direction = mi.Vector3f(
         direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0
@@ -922,13 +982,13 @@ def _refract_through_drop(
         - inside_direction.y * inside_direction.y
     )
 
-    # Entry and exit point are relative to the sphere's center of curvature.
-    radius = drop.z
-    curvature_radius = drop.w
+    # Entry and exit point are measured from the center of the sphere.
     entry = mi.Vector3f(
         dx,
         dy,
-        dr.safe_sqrt(curvature_radius * curvature_radius - radius * radius),
+        dr.safe_sqrt(
+            curvature_radius * curvature_radius - radius_on_sheet * radius_on_sheet
+        ),
     )
     entry_cosine = dr.dot(entry, inside_direction)
     # length of the ray inside, up to the sphere: the larger root of
@@ -942,7 +1002,7 @@ def _refract_through_drop(
         - entry_cosine
     )
     exit_point = entry + inside_direction * exit_distance
-    normal = exit_point / curvature_radius
+    normal = exit_point / curvature_radius  # of the cap, outwards
 
     cos_inside = dr.dot(inside_direction, normal)
     # Snell's law at the cap; below 0 is total reflection
@@ -952,8 +1012,18 @@ def _refract_through_drop(
         WATER_IOR * inside_direction + (cos_outside - WATER_IOR * cos_inside) * normal
     )
     transmitted = _compute_transmittance(
-        direction.z, inside_direction.z, 1.0, WATER_IOR
-    ) * _compute_transmittance(cos_inside, cos_outside, WATER_IOR, 1.0)
+        cos_incident=direction.z,
+        cos_refracted=inside_direction.z,
+        ior_incident=1.0,
+        ior_refracted=WATER_IOR,
+    )
+    transmitted *= _compute_transmittance(
+        cos_incident=cos_inside,
+        cos_refracted=cos_outside,
+        ior_incident=WATER_IOR,
+        ior_refracted=1.0,
+    )
+    # A ray that leaves the cap towards the sheet does not reach the scene.
     is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
     return outside_direction, transmitted, is_lost
 
@@ -961,18 +1031,18 @@ def _refract_through_drop(
 class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     """Sample rays of a `CameraModel` at a pose: the sensor `advsearch_camera`.
 
-    The directions of rays are stored on a grid over the image, from Newton's method,
-    and in between are bilinear: the grid is so fine that this is off by less than a
-    hundredth of a pixel, but for the last pixels before a fold. Every sample of an
-    image has a ray of its own, so that edges are as sharp as a pinhole's.
+    The directions of rays are computed by Newton's method on a grid over the image, and
+    interpolated bilinearly in between. The grid is so fine that the error is less than
+    a hundredth of a pixel, except in the last pixels before the lens folds. Every
+    sample of an image has a ray of its own, so that edges are as sharp as a pinhole's.
 
     Raindrops before the camera bend the rays, see the comment at the top.
 
-    Parameters: `to_world`; `lens`, its numbers in the order of `NUMBER_NAMES`.
+    Parameters: `to_world`; `lens`, the lens's numbers in the order of `NUMBER_NAMES`.
 
     Attributes:
         pose: Mitsuba's transform from the camera's axes (left, up, ahead) to the world.
-        lens: the numbers.
+        lens: numbers of the lens.
         rays: four numbers for each grid point, row by row: direction and margin, see
             `CameraModel.make_ray_table`.
     """
@@ -981,6 +1051,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         """Read model, clipping and perhaps drops from the sensor's properties."""
         super().__init__(props)
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
+        # "reach" is the largest angle to the axis at which the lens has rays
         self._model = CameraModel(
             str(props["kind"]), values, max_angle=float(props["reach"])
         )
@@ -990,39 +1061,46 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             max(MIN_CELLS, min(MAX_CELLS, int(size)))
             for size in self.film().crop_size()
         )
+        # The transform that Mitsuba read from the properties. From here on
+        # `world_transform` returns `pose`.
         self.pose = mi.Transform4f(super().world_transform())
         self.lens = mi.TensorXf(list(values), (len(NUMBER_NAMES),))
         self._make_rays()
-        self._sheet_half_width = 0.0  # width of the square with drops; 0 without drops
+        # half the width of the square with drops, millimeters; 0 without drops
+        self._sheet_half_width = 0.0
         if "drops" in props:
             self._make_drops(props)
 
     def _make_drops(self, props: Any) -> None:
         """Sample the raindrops that the sensor's properties describe.
 
-        From then on rays take a sample of the aperture (`sample3`).
+        From then on rays need a sample of the aperture (`sample3`).
         """
         self._sheet_half_width, drops, grid = sample_raindrops(
-            int(props["drops"]),
-            float(props["drop_size"]),
-            int(props["drop_seed"]),
-            float(props["drop_tangent"]),
+            count=int(props["drops"]),
+            size=float(props["drop_size"]),
+            seed=int(props["drop_seed"]),
+            tangent=float(props["drop_tangent"]),
         )
         self._drop_of_cell = mi.UInt32(grid.reshape(-1).astype("uint32"))
-        # The grid has the index after the last drop where there is none.
+        # A cell without a drop has the index after the last drop, which is `NO_DROP`.
         table = np.concatenate([drops, [NO_DROP]]).astype("float32")
         self._drops = mi.Float(table.reshape(-1))
         dr.eval(self._drop_of_cell, self._drops)
+        # Mitsuba's integrators read this flag, and sample the aperture if it is set.
         self.m_needs_sample_3 = True
 
     def traverse(self, cb: Any) -> None:
-        """Tell Mitsuba the parameters that may be set."""
+        """Report to Mitsuba the parameters that may be set."""
         super().traverse(cb)
         cb.put("to_world", self.pose, mi.ParamFlags.NonDifferentiable)
         cb.put("lens", self.lens, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: Any) -> None:
-        """Compute the rays anew after the lens has changed, or possibly has."""
+        """Compute the rays again after the lens may have changed.
+
+        Mitsuba passes no keys if it does not know what has changed.
+        """
         if not keys or "lens" in keys:
             self._make_rays()
         super().parameters_changed(keys)
@@ -1050,10 +1128,11 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         if self._sheet_half_width > 0.0:
             direction, transmitted = self._bend_by_drops(direction, sample3)
         weight = dr.select(is_inside, transmitted, 0.0)
-        # Every field is set: Dr.Jit differentiates no ray with fields of different
-        # lengths.
+        # Each field has one entry a lane, `maxt` too: Dr.Jit cannot differentiate a ray
+        # whose fields have different lengths.
         ray = dr.zeros(mi.RayDifferential3f)
         ray.time = time
+        # The near distance counts along the ray: a wide lens has no near plane.
         ray.o = self.pose @ mi.Point3f(self._near * direction)
         ray.d = self.pose @ mi.Vector3f(direction)
         ray.maxt = dr.select(weight > 0.0, mi.Float(self._far), 0.0)
@@ -1073,9 +1152,9 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         return mi.Ray3f(ray), weight
 
     def sample_ray_without_drops(self, time: Any, position: Any) -> Any:
-        """Sample rays as if no drop were before the camera.
+        """Sample rays as if there were no drops before the camera.
 
-        Ground truth such as depth is that of the scene behind the drops.
+        Ground truth, such as depth, describes the scene behind the drops.
         """
         half_width = self._sheet_half_width
         self._sheet_half_width = 0.0  # no sheet, so no drops
@@ -1110,7 +1189,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         return refracted_direction, weight
 
     def _find_drop(self, x: Any, y: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """Find the drop at a point of the sheet, in millimetres.
+        """Find the drop at a point of the sheet, in millimeters.
 
         Args:
             x, y: the point; (0, 0) is on the camera's axis.
@@ -1155,10 +1234,9 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         dr.eval(self.rays)
 
     def _look_up_direction(self, position: Any) -> tuple[Any, Any]:
-        """Return the ray direction at a position in [0, 1]^2 of the image, from the ray
-        table.
+        """Return the ray direction at a position in [0, 1]^2 of the image.
 
-        It is interpolated between the four nearest points of the table. The second
+        It is interpolated between the four nearest points of the ray table. The second
         value is whether the lens has a direction there at all.
         """
         n_columns, n_rows = self._grid_cells

@@ -68,10 +68,11 @@ def to_transform(value: Any) -> Any:
 
 def to_torch(value: Any) -> Tensor:
     """Convert a Dr.Jit value to a torch tensor with memory of its own."""
-    # Dr.Jit's own conversion gives a color six entries
+    # A color or point becomes its three components. Dr.Jit's own conversion of a color
+    # has six entries.
     if isinstance(value, (mi.Color3f, mi.Point3f)):
         return torch.cat([to_torch(component) for component in value])
-    value = getattr(value, "matrix", value)
+    value = getattr(value, "matrix", value)  # of a transform
     if hasattr(value, "torch"):
         tensor: Tensor = value.torch()
     else:
@@ -94,19 +95,19 @@ class SceneInput:
     """One named input of a scene."""
 
     name: str  # the input's name, e.g. "key.position"
-    # Mitsuba's parameter path, or its beginning and end with one "*" between for an
-    # unknown middle
+    # key of Mitsuba's parameter; an asterisk stands for any text, as in
+    # "mug.*.base_color.data"
     key: str
-    # converts the tensor; None where Mitsuba takes it itself, as for textures and grids
+    # function that converts the tensor to Mitsuba's type; None if Mitsuba takes a
+    # tensor, as for textures and grids
     write: Write | None = None
-    is_interior: bool = (
-        False  # the interior adjoint (`prb`) differentiates it correctly
-    )
-    # Shape of the tensor; None takes it from Mitsuba's own value.
+    # whether the interior adjoint (`prb`) differentiates it correctly
+    is_interior: bool = False
+    # shape of the tensor; None takes it from Mitsuba's own value
     shape: tuple[int, ...] | None = None
-    # Mitsuba's object that has the parameter, where `key` alone may mean several
+    # Mitsuba's object that has the parameter, if several may match `key`
     owner: Any = None
-    # the range that is rendered; a value beyond is clamped to it, and keeps its
+    # range of values that are rendered; a value outside is clamped to it, and keeps its
     # derivative
     rendered_range: tuple[float, float] | None = None
 
@@ -166,18 +167,19 @@ class Translation:
     # entries of the scene's dictionary by name; one that the scene has already
     # ("environment") is replaced
     plugins: Plugin
-    # what may be set; the base values are those of `plugins`
+    # inputs that may be set; their base values are those of `plugins`
     inputs: tuple[SceneInput, ...] = ()
-    # entries that replace those of the path integrator's dictionary (another type, for
-    # a medium)
+    # entries that replace those of the path integrator's dictionary; a medium needs
+    # another type
     integrator: Plugin = field(default_factory=dict)
 
 
 @singledispatch
 def translate_part(part: parts.ScenePart) -> Translation:
-    """Return what a part is inside Mitsuba.
+    """Return the plugins and inputs of a part in Mitsuba.
 
-    Each kind of part registers a function of its own, by `@translate_part.register`.
+    Each kind of part registers a function of its own, by `@translate_part.register`,
+    which finds the kind from the type of the first argument.
     """
     raise TypeError(
         f"part {part.name}: {type(part).__name__} has no translation for "
@@ -187,12 +189,12 @@ def translate_part(part: parts.ScenePart) -> Translation:
 
 @translate_part.register
 def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
-    """Return what a mesh is inside Mitsuba: its shape, and the inputs that it has.
+    """Return the shape of a mesh in Mitsuba, and its inputs.
 
     Args:
         part: the mesh.
-        lobes: further entries of the principled plugin, such as `IDLE_LOBES`; not used
-            if the mesh has a surface of the user's.
+        lobes: entries of the principled plugin for further lobes of its reflection,
+            such as `IDLE_LOBES`; not used if the mesh has a surface of the user's.
     """
     name = part.name
     shape = (len(part.mesh.vertices), 3)
@@ -252,17 +254,22 @@ def _load_user_surface(
         )
         return texture
 
-    return meshes.fill_base_color(surface, load_base_texture), inputs
+    # `load_base_texture` is called here, if there is a base color, and adds the input.
+    filled_surface = meshes.fill_base_color(surface, load_base_texture)
+    return filled_surface, inputs
 
 
 def _make_principled_inputs(name: str) -> list[SceneInput]:
     """Return the inputs of the principled surface of the mesh with a name.
 
     They are its base color and its numbers, such as "object.roughness". None of them
-    moves an outline, so the interior adjoint differentiates all of them.
+    moves an outline, so the interior adjoint differentiates all of them. In the keys,
+    the asterisk stands for plugins around the principled one, such as "twosided".
     """
     base_color = SceneInput(
-        f"{name}.base_color", f"{name}.*.base_color.data", is_interior=True
+        name=f"{name}.base_color",
+        key=f"{name}.*.base_color.data",
+        is_interior=True,
     )
     numbers = [
         SceneInput(
@@ -283,7 +290,8 @@ def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:
 
     Args:
         name: name of the part.
-        parameter: what the input is called after it, such as "radiance".
+        parameter: name of the input within the part, such as "radiance" in
+            "lamp.radiance".
         key: Mitsuba's key of the color within the part.
     """
     return SceneInput(
@@ -296,9 +304,18 @@ def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:
 
 
 def _make_pose_input(name: str, parameter: str) -> SceneInput:
-    """Return the input of a part's pose."""
+    """Return the input of a part's pose.
+
+    Args:
+        name: name of the part.
+        parameter: name of the input within the part, such as "to_world". Mitsuba's key
+            is always "to_world".
+    """
     return SceneInput(
-        f"{name}.{parameter}", f"{name}.to_world", to_transform, shape=(4, 4)
+        name=f"{name}.{parameter}",
+        key=f"{name}.to_world",
+        write=to_transform,
+        shape=(4, 4),
     )
 
 
@@ -312,22 +329,25 @@ def _translate_plugin(part: parts.PluginPart) -> Translation:
 
 @translate_part.register
 def _translate_numbers(part: parts.PluginNumbers) -> Translation:
-    """Return inputs for numbers of other plugins; other parts have theirs already."""
-    return Translation(
-        {},
-        tuple(
-            _make_number_input(plugin_number)
-            for plugin_number in part.numbers
-            if plugin_number.input.startswith(f"{part.name}.")
-        ),
-    )
+    """Return the inputs of numbers of Mitsuba's plugins, and no plugin.
+
+    Some numbers belong to another part, such as "object.roughness", which has that
+    input already. They are left out here.
+    """
+    inputs = [
+        _make_number_input(plugin_number)
+        for plugin_number in part.numbers
+        if plugin_number.input.startswith(f"{part.name}.")
+    ]
+    return Translation(plugins={}, inputs=tuple(inputs))
 
 
 def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
     """Return the input of a number or a color of a Mitsuba scene.
 
-    A plain number is a constant that Mitsuba compiles into its kernels. A number of a
-    principled surface is clamped to the range that Mitsuba renders correctly.
+    A plain number is a constant that Mitsuba compiles into its kernels. A number with
+    the key of one of a principled surface, such as "roughness", is clamped to the range
+    that Mitsuba renders correctly.
     """
     write: Write
     if plugin_number.plain:
@@ -349,6 +369,7 @@ def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
         plugin_number.input,
         plugin_number.key,
         write,
+        # `valid` are the estimators that are valid for it.
         is_interior="adjoint" in plugin_number.valid,
         shape=(len(plugin_number.values),),
         rendered_range=rendered_range,
@@ -364,10 +385,14 @@ def _translate_point_lamp(part: parts.PointLamp) -> Translation:
         "position": list(part.position),
         "intensity": _make_rgb(part.intensity),
     }
-    position = SceneInput(f"{name}.position", f"{name}.position", to_point, shape=(3,))
-    return Translation(
-        {name: lamp}, (position, _make_light_input(name, "intensity", "intensity"))
+    position = SceneInput(
+        name=f"{name}.position",
+        key=f"{name}.position",
+        write=to_point,
+        shape=(3,),
     )
+    intensity = _make_light_input(name, parameter="intensity", key="intensity")
+    return Translation({name: lamp}, (position, intensity))
 
 
 @translate_part.register
@@ -381,9 +406,8 @@ def _translate_spot_lamp(part: parts.SpotLamp) -> Translation:
         "cutoff_angle": cutoff,
         "beam_width": beam,
     }
-    return Translation(
-        {part.name: lamp}, (_make_light_input(part.name, "intensity", "intensity"),)
-    )
+    intensity = _make_light_input(part.name, parameter="intensity", key="intensity")
+    return Translation({part.name: lamp}, (intensity,))
 
 
 @translate_part.register
@@ -401,8 +425,9 @@ def _translate_ball_lamp(part: parts.BallLamp) -> Translation:
         "emitter": {"type": "area", "radiance": _make_rgb(part.radiance)},
     }
     inputs = (
+        # Named "ball", since this pose is not the base pose of a mesh.
         _make_pose_input(part.name, "ball"),
-        _make_light_input(part.name, "radiance", "emitter.radiance"),
+        _make_light_input(part.name, parameter="radiance", key="emitter.radiance"),
     )
     return Translation({part.name: ball}, inputs)
 
@@ -415,6 +440,7 @@ def _translate_projector(part: parts.ProjectorPart) -> Translation:
     So a texel is the radiance of a white screen there.
     """
     name = part.name
+    # black until the input `pattern` is set
     image = {
         "type": "bitmap",
         "bitmap": mi.Bitmap(np.zeros((*part.sides, 3), np.float32)),
@@ -427,7 +453,11 @@ def _translate_projector(part: parts.ProjectorPart) -> Translation:
         "fov_axis": "x",
         "irradiance": image,
     }
-    pattern = SceneInput(f"{name}.pattern", f"{name}.irradiance.data", is_interior=True)
+    pattern = SceneInput(
+        name=f"{name}.pattern",
+        key=f"{name}.irradiance.data",
+        is_interior=True,
+    )
     return Translation({name: projector}, (_make_pose_input(name, "pose"), pattern))
 
 
@@ -435,17 +465,18 @@ def _translate_projector(part: parts.ProjectorPart) -> Translation:
 def _translate_beam(part: parts.BeamLamp) -> Translation:
     """Return a headlamp's beam as a projector.
 
-    The table has the intensity I of each direction. On a plane at distance 1 an
-    intensity makes the irradiance I cos^3 of the angle to the axis: the plane is 1 /
-    cos away there (squared), and tilted by the angle. Mitsuba's projector makes pi
-    times its texture there, so the texture is I cos^3 / pi.
+    The table has the intensity I of each direction. On a plane at distance 1, at an
+    angle a to the axis, the distance is 1 / cos a and the plane is tilted by a. So the
+    irradiance there is I cos a / (1 / cos a)^2 = I cos^3 a. Mitsuba's projector makes
+    pi times its texture there, so the texture is I cos^3 a / pi.
     """
     height, width = part.table.shape
-    # Centers of the table's cells on a plane at distance 1. A field of view of 90
-    # degrees is 2 wide there. Points at half cells are borders and centers in turn, so
-    # that every second one, from index 1 on, is a center.
+    # Centers of the table's cells on that plane, in fractions of half its width and
+    # height. The points of `linspace` are half a cell apart: borders and centers of
+    # cells alternate, and the first is a border.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
+    # A field of view of 90 degrees is 2 wide at distance 1, and less high.
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
     image = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
     lamp = {
@@ -472,7 +503,8 @@ def _translate_haze(part: parts.HazePart) -> Translation:
         {"type": "homogeneous", "albedo": albedo, "sigma_t": part.density},
         optimize=False,
     )
-    # Owned by the population itself, so never freed: Mitsuba does not release media.
+    # Mitsuba does not release media. So the medium is held as long as its owner lives,
+    # here the population itself: forever.
     population.add(population, media=(medium,))
     inputs = (
         SceneInput(
@@ -491,9 +523,13 @@ def _translate_haze(part: parts.HazePart) -> Translation:
         ),
     )
     return Translation(
-        {name: medium},
-        inputs,
-        {"type": "advsearch_haze", "medium": medium, "radius": part.radius},
+        plugins={name: medium},
+        inputs=inputs,
+        integrator={
+            "type": "advsearch_haze",
+            "medium": medium,
+            "radius": part.radius,
+        },
     )
 
 
@@ -503,8 +539,8 @@ def _make_rgb(value: Sequence[float]) -> Plugin:
 
 
 GROUND_NAME = "ground"
-# of the plane's coat in a photograph, as other surfaces see it: a smoother one would
-# make fireflies on them
+# smallest roughness of the plane's coat in a photograph, as other surfaces see it: a
+# smoother coat would make fireflies on them
 MIN_PLANE_ROUGHNESS = 0.3
 
 
@@ -563,25 +599,27 @@ def make_scene_dict(
 
 
 def _make_ground(description: SceneDescription) -> Any:
-    """Return the ground: a photographed one, a plain one, or None.
+    """Return the ground, or None if the scene has none.
 
-    A plain ground is a two-sided square of the width `ground.size`. It is None if the
-    size is 0, or if the ground is a road or a square with meshes of its own. In a scene
-    with a photograph in the background, it is the plane that takes the shadow.
+    There are two kinds of photographs. The map of the environment may be one that shows
+    its ground (`photograph`): then that ground is a mesh with its colors. Or the scene
+    is rendered into a photograph (`backdrop_photograph`): then the ground is an
+    invisible plane that receives the shadow. Otherwise it is a plain square.
+
+    The two latter are two-sided squares of the width `ground.size`. The result is None
+    if that is 0, or if the ground is a road or a square with meshes of its own.
     """
-    photograph = description.photograph
-    if photograph is not None:
-        surface = meshes.make_diffuse(photograph.base_color.numpy())
+    photographed_ground = description.photograph
+    if photographed_ground is not None:
+        surface = meshes.make_diffuse(photographed_ground.base_color.numpy())
         return meshes.make_mitsuba_mesh(
-            GROUND_NAME, photograph.mesh, np.eye(4), surface
+            GROUND_NAME, photographed_ground.mesh, np.eye(4), surface
         )
     size = description.get_number("ground.size")
     if not size > 0.0 or is_paved(description):
         return None
     level = 0.0
     if description.backdrop_photograph is not None:
-        # The photograph shows the ground already. Our plane only takes the shadow of
-        # the object, and the scene may have none.
         if not has_plane(description):
             return None
         level = description.get_number("ground.level")
@@ -618,6 +656,7 @@ def convert_refusals(description: SceneDescription) -> Iterator[None]:
         InputError: Mitsuba refuses them.
     """
     object_asset = description.object
+    # An object with finishes has a surface that we made from a table of materials.
     has_user_surface = object_asset.surface is not None and not object_asset.finishes
     has_user_plugins = any(
         isinstance(part, parts.PluginPart) for part in description.parts
@@ -651,8 +690,10 @@ def _check_background(
             "leave one of the two out"
         )
     has_plain_backdrop = description.backdrop and not description.backdrop_photograph
-    # A searched lens, which has no name, may fold, and leaves parts black then.
-    may_leave_black = model.black_fraction > 0.0 or not model.name
+    # A searched lens has no name. At some of its numbers, two directions fall on one
+    # point of the image (it folds), and other parts of the image stay black.
+    is_searched = not model.name
+    may_leave_black = model.black_fraction > 0.0 or is_searched
     if has_plain_backdrop and may_leave_black:
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
@@ -678,15 +719,17 @@ def _make_lens(description: SceneDescription) -> Plugin:
             "fov": description.get_number("camera.fov"),
             "fov_axis": "larger",
         }
-        # Aperture and focus are inputs, which are set later.
+        if not description.thin_lens:
+            return pinhole
+        # Aperture and focus are inputs, which are set later. The type replaces the
+        # pinhole's, whose field of view stays.
         thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
-        # the thin lens has the pinhole's field of view
-        return pinhole | thin_lens if description.thin_lens else pinhole
+        return pinhole | thin_lens
     _check_background(description, model, drops)
     camera: Plugin = {
         "type": "advsearch_camera",
         "kind": model.kind,
-        "reach": model.max_angle,
+        "reach": model.max_angle,  # largest angle to the axis
         **model.values,
     }
     if drops > 0.0:
@@ -694,13 +737,14 @@ def _make_lens(description: SceneDescription) -> Plugin:
             name: description.get_number(f"camera.{name}")
             for name in ("drops", "drop_size", "drop_seed")
         }
-        # Drops cover what the lens sees; a searched lens, without a name, is taken for
-        # the pinhole with the same field of view.
-        if model.name:
-            camera["drop_tangent"] = max(model.visible_tangents)
-        else:
+        # Drops cover the part of the glass through which the lens sees. A searched
+        # lens, whose view changes, gets the drops of a pinhole with its field of view.
+        is_searched = not model.name
+        if is_searched:
             half_fov = math.radians(description.get_number("camera.fov")) / 2.0
             camera["drop_tangent"] = math.tan(half_fov)
+        else:
+            camera["drop_tangent"] = max(model.visible_tangents)
     return camera
 
 
@@ -716,34 +760,36 @@ CAMERA_KEYS = {
 def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     """Return the inputs of camera, environment and ground.
 
-    `resolution` is (height, width): `camera.fov` is along the image's larger side, and
-    is converted to Mitsuba's, which is along the width.
+    Args:
+        resolution: (height, width) of the image. `camera.fov` is along its larger side,
+            and is converted to Mitsuba's, which is along the width.
     """
     height, width = resolution
 
     def to_horizontal_fov(value: Any) -> Any:
         """Convert a field of view along the larger side to one along the width."""
         half_angle = dr.deg2rad(value.array) / 2.0
-        # an upright image is narrower than its larger side
-        half_tangent = dr.tan(half_angle) * min(1.0, width / height)
+        # In an upright image the width is smaller than the larger side. The tangents
+        # are in proportion to the sides.
+        width_to_larger_side = min(1.0, width / height)
+        half_tangent = dr.tan(half_angle) * width_to_larger_side
         return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 
     camera_inputs = [
-        SceneInput(f"camera.{name}", f"camera.{key}", to_flat_array, shape=(1,))
+        SceneInput(f"camera.{name}", f"camera.{key}", write=to_flat_array, shape=(1,))
         for name, key in CAMERA_KEYS.items()
     ]
     return (
         _make_pose_input("camera", "to_world"),
-        SceneInput("camera.fov", "camera.x_fov", to_horizontal_fov, shape=(1,)),
+        SceneInput("camera.fov", "camera.x_fov", write=to_horizontal_fov, shape=(1,)),
         SceneInput("camera.lens", "camera.lens", shape=(len(NUMBER_NAMES),)),
         *camera_inputs,
         # (H, W + 2, 3): a copy of the last column before the first, and of the first
         # after the last
         SceneInput("environment.padded", "environment.data", is_interior=True),
-        # of the plane that takes the shadow in a photograph
+        # pose of the plane that receives the shadow in a photograph
         _make_pose_input(GROUND_NAME, "to_world"),
-        # (h, w, 3): of a ground that shows the environment's photograph
-        # (`advsearch.scene.grounds`)
+        # (h, w, 3): colors of a ground that the map of the environment shows
         SceneInput(
             "ground.reflectance", f"{GROUND_NAME}.*.reflectance.data", is_interior=True
         ),

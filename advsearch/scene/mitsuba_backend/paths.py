@@ -1,13 +1,14 @@
-"""Trace light paths of an image one by one, and tell which ones meet some surfaces.
+"""Trace samples of an image, and separate the light that depends on some surfaces.
 
 `trace_paths` is Mitsuba's integrator `path` (next-event estimation and BSDF sampling,
 weighted by the power heuristic) with two additions. It takes the indices of the samples
 of an image that it traces: each sample has the random numbers that it has in the full
-image. And it returns the part of a sample that depends on the surfaces of some shapes
-apart from the rest: what a path carries from its first vertex on such a shape on.
+image. And it returns the radiance of a sample in two parts. The second part, what a
+path collects from its first vertex on one of some shapes on, depends on the surfaces of
+these shapes; the first one does not.
 
-So an image in which only these surfaces have changed needs only those samples again
-that have met them (`advsearch.scene.mitsuba_backend.shared_paths`).
+So if only these surfaces change, only the samples whose paths have met them are traced
+again (`advsearch.scene.mitsuba_backend.shared_paths`).
 
 Import this only where a Mitsuba scene is built, which needs the variant.
 """
@@ -24,10 +25,10 @@ MAX_SURVIVAL = 0.95  # largest probability to survive Russian roulette, as in Mi
 
 
 class PathSamples:
-    """Random numbers of some samples of an image, those of Mitsuba's samplers.
+    """Random numbers of some samples of an image, equal to those of Mitsuba's samplers.
 
-    It is the sampler `multijitter` (Kensler 2013), or `independent`, for samples whose
-    indices in the image are given; Mitsuba's own begin at the first.
+    It is the sampler `multijitter` (Kensler 2013), or `independent`, for any samples of
+    an image. Mitsuba's own samplers always begin with the first sample.
 
     Attributes:
         rng: random-number generator of each sample.
@@ -35,14 +36,14 @@ class PathSamples:
         index: index of each sample in its pixel.
         dimension: how many numbers or pairs were drawn.
         spp: samples per pixel.
-        is_stratified: whether it is `multijitter`.
+        is_stratified: whether the sampler is `multijitter`.
 
     Args:
         seed: seed of the image, a number of Dr.Jit.
         sample: indices of the samples in the image; those of a pixel follow one
             another.
-        spp: samples per pixel, rounded for the sampler.
-        is_stratified: as the attribute.
+        spp: samples per pixel, as rounded for the sampler.
+        is_stratified: whether the sampler is `multijitter`, else `independent`.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
@@ -71,11 +72,15 @@ class PathSamples:
         """
         if sample is None:
             return
+        # The hashes (`sample_tea_32`) and their arguments are those of Mitsuba's
+        # samplers, so that the numbers are the same.
         state, increment = mi.sample_tea_32(seed, sample)
         self.rng = mi.PCG32(initstate=state, initseq=increment)
         self.index = sample % spp
-        # the seed of a pixel is that of its first sample
-        self.permutation = mi.sample_tea_32(0, sample - self.index + seed)[0]
+        # All samples of a pixel have one permutation seed, made from the index of the
+        # pixel's first sample.
+        first_sample = sample - self.index
+        self.permutation, _ = mi.sample_tea_32(0, first_sample + seed)
         self.dimension = mi.UInt32(0)
         self.spp = spp
         self.is_stratified = is_stratified
@@ -84,33 +89,41 @@ class PathSamples:
         """Draw a number in [0, 1) for each sample."""
         if not self.is_stratified:
             return self.rng.next_float32()
-        seed = self._next_permutation()
+        seed = self._next_permutation_seed()
         stratum = mi.permute_kensler(self.index, self.spp, seed * 0x45FBE943)
         return (mi.Float(stratum) + self.rng.next_float32()) * (1.0 / self.spp)
 
     def next_2d(self) -> Any:
         """Draw a point in [0, 1)^2 for each sample.
 
-        With stratification, a pixel's samples have one point in each stratum, and also
-        one in each of `spp` columns and rows (correlated multi-jittered sampling,
-        Kensler 2013). The constants are those of Mitsuba's `multijitter`, whose numbers
-        these are.
+        With stratification, the samples of a pixel have one point in each stratum of a
+        grid. They also have one point in each of `spp` narrow columns, and one in each
+        of `spp` narrow rows (correlated multi-jittered sampling, Kensler 2013). The
+        constants are those of Mitsuba's `multijitter`, so that the numbers are the
+        same.
         """
         if not self.is_stratified:
             x = self.rng.next_float32()
             return mi.Point2f(x, self.rng.next_float32())
         columns, rows = self.strata
-        seed = self._next_permutation()
+        seed = self._next_permutation_seed()
         stratum = mi.permute_kensler(self.index, self.spp, seed * 0x51633E2D)
-        y = stratum // columns
-        x = stratum - y * columns
-        jitter_x = mi.permute_kensler(x, columns, seed * 0x68BC21EB)
-        jitter_y = mi.permute_kensler(y, rows, seed * 0x02E5BE93)
-        fine_x = (mi.Float(jitter_y) + self.rng.next_float32()) * (1.0 / rows)
-        fine_y = (mi.Float(jitter_x) + self.rng.next_float32()) * (1.0 / columns)
+        row = stratum // columns
+        column = stratum - row * columns
+        # A column of strata has `rows` samples, one in each row. It is divided into
+        # `rows` narrow columns, and each sample gets the one with its permuted row: so
+        # no two have the same. Narrow rows are assigned by columns in the same manner.
+        narrow_row = mi.permute_kensler(column, columns, seed * 0x68BC21EB)
+        narrow_column = mi.permute_kensler(row, rows, seed * 0x02E5BE93)
+        x_in_stratum = (mi.Float(narrow_column) + self.rng.next_float32()) * (
+            1.0 / rows
+        )
+        y_in_stratum = (mi.Float(narrow_row) + self.rng.next_float32()) * (
+            1.0 / columns
+        )
         return mi.Point2f(
-            (mi.Float(x) + fine_x) * (1.0 / columns),
-            (mi.Float(y) + fine_y) * (1.0 / rows),
+            (mi.Float(column) + x_in_stratum) * (1.0 / columns),
+            (mi.Float(row) + y_in_stratum) * (1.0 / rows),
         )
 
     @property
@@ -119,7 +132,7 @@ class PathSamples:
         rows = math.isqrt(self.spp)
         return math.ceil(self.spp / rows), rows
 
-    def _next_permutation(self) -> Any:
+    def _next_permutation_seed(self) -> Any:
         """Return the seed of the next permutation of each pixel."""
         seed = self.permutation + self.dimension
         self.dimension += 1
@@ -146,21 +159,28 @@ def sample_rays(sensor: Any, numbers: PathSamples, sample: Any) -> Any:
 
 
 class LightPath:
-    """Light paths on their way from the camera, with what they have collected.
+    """Light paths on their way from the camera, with the radiance collected so far.
+
+    Some shapes of the scene are `changed`: their surfaces may differ from image to
+    image. A path's light is collected in two parts, up to the first changed surface and
+    from there on.
 
     Attributes:
-        ray: the next segment.
-        throughput: throughput up to there.
-        eta: relative index of refraction there.
-        depth: number of surfaces that were met.
-        vertex: the last vertex.
-        pdf: density of the direction in which the path left it.
-        is_delta: whether no other direction was possible.
+        ray: next segment of the path.
+        throughput: throughput up to that segment.
+        eta: product of the indices of refraction of the surfaces that were passed,
+            relative to the camera's medium.
+        depth: number of surfaces that the path has met.
+        vertex: last vertex.
+        pdf: density of the direction in which the path left the last vertex.
+        is_delta: whether no other direction was possible, as at a mirror.
         active: whether the path goes on.
-        radiance: radiance since the first changed surface, or since the camera.
-        radiance_before: radiance up to that surface.
+        radiance: radiance collected since the first changed surface; if the path has
+            not met any, since the camera.
+        radiance_before: radiance collected before the first changed surface; 0 if the
+            path has not met any.
         has_met: whether the path has met a changed surface.
-        has_met_first: whether that was the first hit.
+        has_met_first: whether its first hit was on a changed surface.
         albedo: reflectance of the first hit.
         normal: shading normal of the first hit.
     """
@@ -183,7 +203,15 @@ class LightPath:
     }
 
     def __init__(self, ray: Any = None) -> None:
-        """Start at the camera; Dr.Jit calls it without arguments."""
+        """Start at the camera.
+
+        The camera counts as a vertex with a single direction (`is_delta`), so that the
+        emission of the first hit has all the weight.
+
+        Args:
+            ray: camera rays. Dr.Jit calls the function without them, to make an object
+                that it fills itself.
+        """
         if ray is None:
             return
         self.ray = mi.Ray3f(ray)
@@ -209,16 +237,20 @@ class LightPath:
             si: surface interaction where the path arrives.
         """
         ds = mi.DirectionSample3f(scene, si, self.vertex)
+        # After a mirror, no light was sampled: the density is 0 and the weight 1.
         emitter_pdf = scene.pdf_emitter_direction(self.vertex, ds, ~self.is_delta)
-        emitted = ds.emitter.eval(si, self.pdf > 0.0)
+        # Where the last surface sampled no direction, nothing arrives.
+        has_direction = self.pdf > 0.0
+        emitted = ds.emitter.eval(si, has_direction)
         emitted *= _compute_weight(self.pdf, emitter_pdf)
         self.radiance = dr.fma(self.throughput, emitted, self.radiance)
 
     def meet(self, si: Any, bsdf: Any, changed: Sequence[Any]) -> None:
-        """Record whether a surface is one of the changed shapes.
+        """Record whether the path has arrived at one of the changed shapes.
 
-        At the first changed surface, the radiance so far is put aside as unchanged. At
-        the first hit, what guides the denoiser is recorded.
+        At the first changed surface, the radiance collected so far becomes
+        `radiance_before`; its emission, which `add_emission` has added already, is part
+        of that. At the first hit, the guides of the denoiser are recorded.
 
         Args:
             si: surface interaction where the path arrives.
@@ -253,15 +285,19 @@ class LightPath:
         """
         self.active = (self.depth + 1 < max_depth) & si.is_valid()
         is_lit = self.active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, light = scene.sample_emitter_direction(si, numbers.next_2d(), True, is_lit)
+        ds, light = scene.sample_emitter_direction(
+            si, numbers.next_2d(), test_visibility=True, active=is_lit
+        )
         is_lit &= ds.pdf != 0.0
-        choice = numbers.next_1d()
+        # Drawn in this order, as in Mitsuba's `path`.
+        component_number = numbers.next_1d()
+        direction_numbers = numbers.next_2d()
         value, pdf, sample, weight = bsdf.eval_pdf_sample(
             mi.BSDFContext(),
             si,
             si.to_local(ds.d),
-            choice,
-            numbers.next_2d(),
+            component_number,
+            direction_numbers,
             self.active,
         )
         light *= dr.select(ds.delta, 1.0, _compute_weight(ds.pdf, pdf))
@@ -280,23 +316,27 @@ class LightPath:
         """End paths by Russian roulette from a number of bounces on.
 
         As in Mitsuba's `path`, the probability to survive is the throughput times the
-        squared index of refraction, which cancels the compression of radiance in glass.
+        squared index of refraction. Radiance in glass is larger by that square, and the
+        throughput of a path that enters glass smaller, although no light is lost.
         """
-        largest = dr.max(self.throughput)
-        survival = dr.minimum(largest * dr.square(self.eta), MAX_SURVIVAL)
+        max_throughput = dr.max(self.throughput)  # over the color channels
+        survival = dr.minimum(max_throughput * dr.square(self.eta), MAX_SURVIVAL)
         has_roulette = self.depth >= roulette_depth
         survives = ~has_roulette | (numbers.next_1d() < survival)
+        # A survival of 0 gives NaN, in a path that ends in the next line.
         self.throughput = dr.select(
             has_roulette, self.throughput * dr.rcp(survival), self.throughput
         )
-        self.active &= survives & (largest != 0.0)
+        self.active &= survives & (max_throughput != 0.0)
 
     def list_channels(self) -> tuple[list[Any], list[Any]]:
-        """Return the channels without and with a changed surface, nine of each.
+        """Return the channels in two parts, which add up to those of the image.
 
-        They are radiance, albedo and normal.
+        The first part does not depend on the changed surfaces, the second one does.
+        Each has nine channels: radiance, albedo and normal.
         """
         guides = [*self.albedo, *self.normal]
+        # Without a changed surface, `radiance` is all of the radiance.
         unchanged = [
             *dr.select(self.has_met, self.radiance_before, self.radiance),
             *(dr.select(self.has_met_first, 0.0, channel) for channel in guides),
@@ -317,7 +357,7 @@ def trace_paths(
     max_depth: int,
     roulette_depth: int,
 ) -> Any:
-    """Trace radiance, and what guides the denoiser, in two parts.
+    """Trace radiance and guides of the denoiser, each in two parts that add up.
 
     Args:
         scene: scene without media and cut-outs, whose emitters are not hidden.
@@ -329,12 +369,13 @@ def trace_paths(
 
     Returns:
         Nine channels that do not depend on the changed surfaces: radiance, and albedo
-        and shading normal of the first hit. The same that do. And whether a path has
-        met one of them.
+        and shading normal of the first hit. Nine such channels that do. And whether
+        each path has met a changed surface.
     """
     path = LightPath(ray)
     while dr.hint(path.active, max_iterations=max_depth, label="Paths of an image"):
-        si = scene.ray_intersect(path.ray, mi.RayFlags.All, path.depth == 0)
+        is_coherent = path.depth == 0  # camera rays, whose neighbors are similar
+        si = scene.ray_intersect(path.ray, mi.RayFlags.All, is_coherent)
         bsdf = si.bsdf(path.ray)
         path.add_emission(scene, si)
         path.meet(si, bsdf, changed)

@@ -60,13 +60,14 @@ NO_ROULETTE_DEPTH = 1000
 ROULETTE_DEPTH = 2
 """Bounces from which on Russian roulette may end a path of a primal render.
 
-It never does where paths soon leave the scene by themselves. Among houses, 2 takes a
-fifth less time than 3, at a tenth less squared error times time of denoised images
-(`benchmarks/avenue.py --roulette`). From 1 on it is less still, but there the denoiser
-loses more: the model's margin falls by .4 at 16 samples, and verification needs more.
+There is no roulette in open scenes, where paths soon leave the scene by themselves.
+Among houses, 2 takes a fifth less time than 3, at a tenth less squared error times time
+of denoised images (`benchmarks/avenue.py --roulette`). With 1 it is less still, but
+then the denoiser loses more: the model's margin falls by .4 at 16 samples, and
+verification needs more.
 """
 GRADIENT_ROULETTE_DEPTH = 2
-"""Likewise of an adjoint, which counts one bounce less: from 1 on, single gradients
+"""The same depth for an adjoint, which counts one bounce less. With 1, single gradients
 were a fifth off.
 """
 # samples per pixel of the shadow term; without it the gradient of an object on the
@@ -80,31 +81,31 @@ class MitsubaScene:
     """Render one scene at one size.
 
     Attributes:
-        depth: current longest light path in segments.
-        assembly: turns the inputs of a space into those of this scene.
-        definition: the description, and the filter.
-        input_names: every input that can be set.
-        parameters: Mitsuba's own.
-        plane_radiance: (3,) of the plane that takes the shadow in a photograph, without
-            the object; None if there is none.
+        max_depth: longest light path in segments, as the argument.
+        depth: current longest light path; `limit_depth` makes it smaller for a time.
+        assembly: function that turns the inputs of a space into those of this scene.
+        definition: description of the scene, and name of the filter.
+        input_names: names of all inputs that can be set.
+        parameters: Mitsuba's parameters of the scene, from `mi.traverse`.
+        plane_radiance: (3,) radiance, without the object, of the plane that receives
+            the shadow in a photograph; None if there is no plane.
         integrator: Mitsuba's name of the path integrator of primal renders.
         roulette_depth: bounces from which on Russian roulette may end a path there.
         declared_inputs: for each input its key in `parameters`, and its definition.
-        interior_inputs: the inputs that the interior adjoint differentiates correctly.
-        window: the window of the image that is rendered; None for all of it.
+        interior_inputs: inputs that the interior adjoint differentiates correctly.
+        window: part of the image that is rendered; None for all of it.
 
     Args:
         description: the scene.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
-        leave_out: names from `advsearch.scene.formation.OMISSIONS`; less than
-            everything only to measure what it saves.
+        leave_out: names from `advsearch.scene.formation.OMISSIONS`: work that is not
+            needed. The default is all of it; less is only for measuring what it saves.
         max_depth: longest light path in segments.
         sampler: Mitsuba's name of the sampler; some round sample counts up, see
             `round_sample_count`.
-        integrator: Mitsuba's name of the path integrator of primal renders, where there
-            is no medium. None takes `path` where there is roulette, and `prb`
-            elsewhere.
+        integrator: Mitsuba's name of the path integrator of primal renders without
+            media. None chooses `path` in scenes with roulette, and else `prb`.
     """
 
     def __init__(
@@ -124,31 +125,33 @@ class MitsubaScene:
             description: the scene.
             resolution: (height, width) in pixels.
             filter: reconstruction filter, "box" or "gaussian".
-            leave_out: names of work that is saved, such as "tracing"; see the class.
+            leave_out: names of work that is left out; see the class.
             max_depth: longest light path in segments.
             sampler: Mitsuba's name of the sampler, such as "independent".
             integrator: Mitsuba's name of the path integrator; None chooses one.
         """
         with mitsuba_lock:
-            # it registers the plugins, which needs the variant
+            # The import registers the plugins, which needs the variant.
             import advsearch.scene.mitsuba_backend.own_plugins  # noqa: F401
 
-            # First: kernels are compiled for the ids of their objects, which this
-            # releases.
+            # Free unused scenes before the new one is loaded: their objects have ids,
+            # for which kernels are compiled, and which are used again then.
             if population.unused:
                 population.free_unused()
             self.definition = (description, filter)
             self.resolution = resolution
             self.sampler = sampler
             self.assembly = Assembly(description, resolution)
-            self.max_depth = self.depth = max_depth
+            self.max_depth = max_depth
+            self.depth = max_depth
             self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
-            # Dr.Jit can record neither a thin lens nor a textured emission
-            unrecorded = description.thin_lens or any(
+            # "tracing" is the work that recordings save. Dr.Jit can record neither a
+            # thin lens nor a textured emission.
+            can_be_recorded = not description.thin_lens and not any(
                 map(has_textured_emission, description.meshes.values())
             )
-            self._freeze = "tracing" in leave_out and not unrecorded
+            self._uses_recordings = "tracing" in leave_out and can_be_recorded
             self._set_integrator(integrator)
             self._pinhole = (
                 not description.thin_lens and description.camera_model is None
@@ -156,27 +159,19 @@ class MitsubaScene:
             self._backdrop = description.backdrop
             self.plane_radiance = compute_plane_radiance(description)
             _check_emission(description)
-            # what guides the denoiser; Mitsuba's own knows no cut-outs
-            self._guides: Plugin = {
-                "type": "aov",
-                "aovs": "albedo:albedo,normal:sh_normal",
-            }
-            if description.has_opacity:
-                self._guides = {"type": "advsearch_guides"}
+            self._guides = _make_guides_plugin(description)
             self.is_volumetric = any(part.volumetric for part in description.parts)
             # entries of every path integrator, which `_load_scene` fills in
-            self._path: Plugin = {}
+            self._path_entries: Plugin = {}
             inputs = self._load_scene()
             self._sensor = self._scene.sensors()[0]
             self.parameters = mi.traverse(self._scene)
-            for name, weight in compute_sampling_weights(
-                description.meshes.values()
-            ).items():
-                self.parameters[f"{name}.emitter.sampling_weight"] = weight
-            self.parameters.update()
+            self._set_sampling_weights()
             self._integrators: dict[tuple[str, int], Any] = {}
             self._declare_inputs(inputs)
+            # base values of inputs that were changed at least once
             self._base: dict[str, Any] = {}
+            # values of inputs that do not have their base value now
             self._applied: dict[str, Tensor] = {}
             self._recorded = Recordings()
             population.add(
@@ -186,12 +181,20 @@ class MitsubaScene:
                 self.parameters,
                 media=self._find_media(),
             )
-            # the base values of all inputs, if all of them are set at each render
-            self._every: dict[str, Tensor] = {}
+            # "uploads" is the work of setting inputs that do not change. If it is not
+            # left out, these base values of all inputs are set at each render.
+            self._values_to_upload: dict[str, Tensor] = {}
             if "uploads" not in leave_out:
-                self._every = {
+                self._values_to_upload = {
                     name: self.get_base_value(name) for name in sorted(self.input_names)
                 }
+
+    def _set_sampling_weights(self) -> None:
+        """Set how often each mesh that emits light is sampled as a light."""
+        meshes = self.definition[0].meshes.values()
+        for name, weight in compute_sampling_weights(meshes).items():
+            self.parameters[f"{name}.emitter.sampling_weight"] = weight
+        self.parameters.update()
 
     def _set_integrator(self, integrator: str | None) -> None:
         """Set the integrator of images, and the lengths from which paths may end early.
@@ -211,7 +214,7 @@ class MitsubaScene:
     def _load_scene(self) -> list[parts.SceneInput]:
         """Load Mitsuba's scene, and return the inputs that it may have.
 
-        This also extends `_path`, the entries that every path integrator of the scene
+        This also extends `_path_entries`, which every path integrator of the scene
         needs.
         """
         description, filter_name = self.definition
@@ -219,6 +222,7 @@ class MitsubaScene:
             description, self.resolution, filter_name, self.sampler
         )
         with parts.convert_refusals(description):
+            # lobes of the principled plugin that have no effect, but take time
             lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
             translations = [parts.translate_mesh(description.meshes[OBJECT], lobes)]
             # each part becomes Mitsuba's plugins, entries of integrators, and inputs
@@ -228,7 +232,7 @@ class MitsubaScene:
             ]
             for translation in translations:
                 plugins |= translation.plugins
-                self._path |= translation.integrator
+                self._path_entries |= translation.integrator
             # Lamps that are dark by default are not sampled as lights. If an input
             # switches one on, paths still find it when they meet it by chance.
             if "emitters" in self._leave_out:
@@ -266,7 +270,7 @@ class MitsubaScene:
             if key.endswith((POSITIONS, NORMALS))
         )
         # Numbers that Mitsuba compiles into its kernels, as constants.
-        self._literals = frozenset(
+        self._constants = frozenset(
             name
             for name, (_, scene_input) in self.declared_inputs.items()
             if scene_input.write is parts.to_constant
@@ -283,7 +287,7 @@ class MitsubaScene:
         """Return another scene, made with the same arguments except for some changes.
 
         `changes` may have `max_depth`, `sampler`, `integrator` and `leave_out`. The
-        integrator is chosen anew if it is not among them.
+        integrator is chosen again if it is not among them.
         """
         description, filter_name = self.definition
         arguments = {
@@ -295,10 +299,10 @@ class MitsubaScene:
         other = MitsubaScene(
             description, self.resolution, filter=filter_name, **arguments
         )
-        # Load both now: one that is loaded later makes the recordings of all scenes
-        # stale.
+        # Both integrators are loaded on first use, which makes the recordings of all
+        # scenes stale. So that happens now, and not later between renders.
         for method in ("path", "guides"):
-            other._integrator(method)
+            other._get_integrator(method)
         return other
 
     @contextmanager
@@ -360,9 +364,12 @@ class MitsubaScene:
         return round_sample_count(sampler or self.sampler, samples)
 
     def get_base_value(self, name: str) -> Tensor:
-        """Return the base value of an input, as a fresh tensor of the input's shape."""
+        """Return the base value of an input, as a fresh tensor of the input's shape.
+
+        All inputs of the scene are reset to their base values.
+        """
         key, scene_input = self.declared_inputs[name]
-        self._set({})
+        self._set({})  # Mitsuba's parameter then has the base value
         value = parts.to_torch(self.parameters[key])
         if scene_input.shape is None:
             return value
@@ -378,10 +385,11 @@ class MitsubaScene:
         under a film of 32 x 32 pixels, say), and the gain there is small.
 
         Args:
-            inputs: what differs from the base values.
-            seeds: the seed of each image, by its kind. "path" is the linear radiance;
+            inputs: inputs that differ from the base values.
+            seeds: seed of each image, by its kind. "path" is the linear radiance;
                 "hidden" is the same without the environment that the camera sees
-                directly, for a backdrop; "guides" is what guides the denoiser.
+                directly, for a backdrop; "guides" is the image of the denoiser's
+                guides.
             spp: samples per pixel.
 
         Returns:
@@ -390,14 +398,14 @@ class MitsubaScene:
 
             - (H, W, 3), the radiance;
             - (H, W, 4) with a backdrop: radiance, and coverage by surfaces;
-            - (H, W, 7) with a plane that takes the shadow in a photograph: the last
+            - (H, W, 7) with a plane that receives the shadow in a photograph: the last
               three are the change of the plane's radiance;
             - (H, W, 13) if that plane has a coat: then also the change of what the coat
               reflects, and the environment in the coat;
             - (H, W, 6) for "guides": the first hit's albedo in [0, 1], and its shading
               normal.
         """
-        INTERRUPTS.look()
+        INTERRUPTS.look()  # stops here if the user has interrupted the run
         with mitsuba_lock, self._crop_film():
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
@@ -410,7 +418,8 @@ class MitsubaScene:
                     develop=True,
                     evaluate=False,
                 )
-                # otherwise the sampler's state keeps the whole render alive
+                # After the render the sampler's state refers to its full computation.
+                # A new seed, for a single sample, releases that.
                 sensor.sampler().seed(0, 1)
                 return image
 
@@ -418,14 +427,16 @@ class MitsubaScene:
             if population.unused:
                 population.free_unused()
             spp = self.round_sample_count(spp)
-            integrators = [self._integrator(method) for method in seeds]
+            # All are loaded before the first render: to load one makes the recordings
+            # stale.
+            integrators = [self._get_integrator(method) for method in seeds]
             media = population.list_media() if self.is_volumetric else []
             images: list[Tensor] = []
             for (method, seed), integrator in zip(
                 seeds.items(), integrators, strict=True
             ):
                 function: Callable[..., Any] = render
-                if self._freeze:
+                if self._uses_recordings:
                     key = (method, spp, self.depth, self.window)
                     function = self._recorded.get_or_record(key, render, media)
                 # opaque: a literal seed would be a constant of the recorded kernel
@@ -450,7 +461,7 @@ class MitsubaScene:
 
         It is recorded at the first call with a key, and replayed later.
         """
-        if self._freeze:
+        if self._uses_recordings:
             media = population.list_media() if self.is_volumetric else []
             function = self._recorded.get_or_record(key, function, media)
         return function(self._scene, self._sensor, *args)
@@ -470,7 +481,7 @@ class MitsubaScene:
     def render_guides(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[Tensor, Tensor]:
-        """Render what guides the denoiser.
+        """Render the guides of the denoiser.
 
         Args:
             inputs: what differs from the base values.
@@ -490,11 +501,12 @@ class MitsubaScene:
             return self._scene
 
     def set_geometry(self, inputs: Mapping[str, Tensor]) -> None:
-        """Set the vertices and normals among some inputs, unless they are set already.
+        """Make sure that the scene has the vertices and normals of some inputs.
 
-        If anything has to be set, all of `inputs` are; otherwise other inputs keep the
-        values that they have.
+        If it has them already, nothing is set, so that other inputs keep the values
+        that they have. Otherwise all of `inputs` are set.
         """
+        # In both, buffers without an entry have their base values.
         requested = {name: inputs[name] for name in inputs if name in self._buffers}
         applied = {
             name: self._applied[name] for name in self._applied if name in self._buffers
@@ -508,12 +520,12 @@ class MitsubaScene:
     def find_surfaces(
         self, inputs: Mapping[str, Tensor], subdivision: int = 1
     ) -> Surfaces:
-        """Find what the camera sees first through the center of each pixel.
+        """Find the first surface that the camera sees through the center of each pixel.
 
         Lengths are in object sizes.
 
         Args:
-            inputs: what differs from the base values.
+            inputs: inputs that differ from the base values.
             subdivision: look-ups along each side of a pixel; the images of the result
                 are larger by this factor.
         """
@@ -556,35 +568,35 @@ class MitsubaScene:
             wrt: the inputs whose gradients are returned; None means all of `inputs`.
             method: "path", the interior adjoint (path replay backpropagation, Vicini et
                 al. 2021), unbiased for inputs that do not move silhouettes; "hidden",
-                the same without the visible environment. Where boundary terms are not
-                left out, Mitsuba's projective integrator (Zhang et al. 2023) takes the
-                place of "path".
+                the same without the visible environment. If boundary terms are not left
+                out, Mitsuba's projective integrator (Zhang et al. 2023) takes the place
+                of "path".
 
         Returns:
             For each of `wrt` a float32 tensor of the input's shape.
         """
         with mitsuba_lock:
             requested = tuple(inputs if wrt is None else wrt)
-            # Inputs that are differentiated although they are not requested. With
-            # "gradients" left out there are none.
+            # Inputs that are differentiated although they are not requested. "gradients"
+            # is that work: it is left out, except to measure what it takes.
             extra = set[str]()
             if "gradients" not in self._leave_out:
                 extra = set(self.interior_inputs)
-            # the projective integrator knows no lens and no medium
+            # The projective integrator supports no lens and no medium.
             can_be_projective = (
                 method == "path" and self._pinhole and not self.is_volumetric
             )
             if can_be_projective and "boundary" not in self._leave_out:
                 method = "boundary"
                 extra = extra | self._buffers
-            # the integrator of images may have no adjoint; `prb` has
+            # The integrator of images may be "path", which has no adjoint; "prb" has.
             if method == "path" and self.integrator != "prb":
                 method = "adjoint"
             image_gradient = self._make_image_gradient(cotangent)
             self._set(inputs)
             names = (*sorted(extra - set(requested)), *requested)
             with self._tracked(names, inputs) as tracked, self._crop_film():
-                self._integrator(method).render_backward(
+                self._get_integrator(method).render_backward(
                     self._scene,
                     self.parameters,
                     mi.TensorXf(image_gradient),
@@ -606,25 +618,30 @@ class MitsubaScene:
         Without a backdrop these are the 3 channels of the radiance. With a backdrop,
         coverage is the fourth; its cotangent is 0, since it has no derivative here. The
         channels after it, of a plane in a photograph, are copied.
+
+        Args:
+            cotangent: (H, W, C), where C may also be 3 with a backdrop.
         """
         gradient = cotangent.detach().to(torch.float32)
         image_gradient = gradient[..., :3]
         if self._backdrop:
-            n_others = 1 + gradient[..., 4:].shape[-1]
-            others = torch.zeros(*gradient.shape[:2], n_others)
-            others[..., 1:] = gradient[..., 4:]
-            image_gradient = torch.cat([image_gradient, others], dim=-1)
+            coverage_gradient = torch.zeros(*gradient.shape[:2], 1)
+            plane_gradient = gradient[..., 4:]  # may have no channels
+            image_gradient = torch.cat(
+                [image_gradient, coverage_gradient, plane_gradient], dim=-1
+            )
         return image_gradient.contiguous()
 
     @contextmanager
     def _tracked(
         self, names: Sequence[str], inputs: Mapping[str, Tensor]
     ) -> Iterator[dict[str, Any]]:
-        """Set inputs as Dr.Jit tensors with gradients inside the `with`; then restore
-        them.
+        """Replace inputs by Dr.Jit tensors with gradients inside the `with`.
+
+        Afterwards the inputs have their old values again.
 
         Args:
-            names: the inputs that are tracked.
+            names: inputs that are tracked.
             inputs: values of some of them; the others keep the values that they have.
 
         Yields:
@@ -640,24 +657,29 @@ class MitsubaScene:
                 # a copy: the parameter itself is replaced below
                 old_values[key] = type(value)(value)
                 if name in inputs:
-                    tracked[name] = mi.TensorXf(scene_input.to_rendered(inputs[name]))
+                    # `to_rendered` limits the value to what Mitsuba can render.
+                    tensor = mi.TensorXf(scene_input.to_rendered(inputs[name]))
                 else:
-                    tracked[name] = mi.TensorXf(parts.to_torch(value))
-                dr.enable_grad(tracked[name])
-                if scene_input.write:
-                    self.parameters[key] = scene_input.write(tracked[name])
-                else:
-                    self.parameters[key] = tracked[name]
+                    tensor = mi.TensorXf(parts.to_torch(value))
+                dr.enable_grad(tensor)
+                tracked[name] = tensor
+                # Mitsuba's parameter may have another type than a tensor.
+                self.parameters[key] = (
+                    scene_input.write(tensor) if scene_input.write else tensor
+                )
             self.parameters.update()
-            # it warns at every call of a film that samples beyond its border
+            # Mitsuba warns at every call if a film samples beyond its border.
             mi.set_log_level(mi.LogLevel.Error)
             yield tracked
         finally:
             mi.set_log_level(level)
-            # taken out of the dictionary: what is put back must have no second owner,
-            # see `_set`
+            # Each value is taken out of the dictionary as it is put back. If two
+            # objects owned its array, Dr.Jit would later write to a copy instead of
+            # the memory to which recordings refer, see `_write`.
             while old_values:
-                self.parameters.__setitem__(*old_values.popitem())
+                key, value = old_values.popitem()
+                self.parameters[key] = value
+                del value
             self.parameters.update()
 
     def render_material_adjoint(
@@ -669,25 +691,27 @@ class MitsubaScene:
         *,
         meshes: Collection[str],
     ) -> dict[str, Tensor]:
-        """Return the gradient by the vertices and normals of some meshes, by the
-        material form.
+        """Return the gradient by the vertices and normals of some meshes.
+
+        It is computed by the material form of the adjoint, see `material_adjoint`.
 
         Args:
-            inputs: what differs from the base values; they include `NAME.vertices` and
-                `NAME.normals` of each of the meshes.
+            inputs: inputs that differ from the base values; they include
+                `NAME.vertices` and `NAME.normals` of each of the meshes.
             cotangent: (H, W, 3) derivative of the loss by the radiance.
             seed: seed of the samples, which should differ from the primal render's.
             spp: samples per pixel of the interior term.
             meshes: names of the meshes.
         """
         with mitsuba_lock:
-            # few scenes search a material
+            # Imported here, since few searches need it.
             from advsearch.scene.mitsuba_backend.material_adjoint import (
                 material_adjoint,
             )
 
             self._set(inputs)
-            population.changes += 1  # the first call loads integrators of its own
+            # The first call loads integrators of its own, which makes recordings stale.
+            population.changes += 1
             buffers = ("vertices", "normals")
             moving = [f"{name}.{buffer}" for name in meshes for buffer in buffers]
             return material_adjoint(
@@ -705,7 +729,7 @@ class MitsubaScene:
     @property
     def material_limits(self) -> tuple[str, ...]:
         """What `material_adjoint` leaves out or gets wrong, in sentences."""
-        # few scenes search a material
+        # Imported here, since few searches need it.
         from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
 
         return tuple(LIMITS)
@@ -727,14 +751,16 @@ class MitsubaScene:
         """
         with mitsuba_lock, self._crop_film():
             self._set(inputs)
-            key = self.declared_inputs[name][0]
+            key, _scene_input = self.declared_inputs[name]
             spp = self.round_sample_count(spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
-            height, width = self.window_size
-            noise.seed(dr.opaque(mi.UInt32, seed), height * width * spp)
+            n_samples = math.prod(self.window_size) * spp
+            # `opaque`: a literal seed would be compiled into the kernel as a constant.
+            noise.seed(dr.opaque(mi.UInt32, seed), n_samples)
+            # "mug.base_color" belongs to a mesh, and a pattern to a projector, which is
+            # one of Mitsuba's emitters.
             part = name.partition(".")[0]
-            # A pattern's part is a projector, an emitter; a base color's is a mesh.
             projector = None
             if name.endswith(PATTERN_SUFFIX):
                 emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
@@ -744,23 +770,25 @@ class MitsubaScene:
                 self.parameters,
                 key,
                 noise,
-                self.window_size,
-                self.depth,
-                spp,
-                projector,
-                self._find_plane(),
-                self.roulette_depth,
+                size=self.window_size,
+                depth=self.depth,
+                spp=spp,
+                projector=projector,
+                unseen=self._find_plane(),
+                roulette_depth=self.roulette_depth,
             )
-            # Coordinates are converted to those of a repeating texture, which a
-            # principled surface of ours has already.
-            size = self.parameters[key].shape[:2]
+            # The matrix that is made of the vertices repeats the texture. A surface of
+            # ours does the same, so that its coordinates stay. One of Mitsuba's own
+            # surfaces may mirror or clamp, and a projector's image ends at its border
+            # (no surface): their coordinates are converted.
             surface = None
             if projector is None:
                 surface = self.definition[0].meshes[part].surface
                 if surface is None:
                     return paths
+            texture_size = self.parameters[key].shape[:2]
             vertices = [
-                replace(vertex, uv=_to_repeating(vertex.uv, surface, size))
+                replace(vertex, uv=_to_repeating(vertex.uv, surface, texture_size))
                 for vertex in paths.vertices
             ]
             return replace(paths, vertices=vertices)
@@ -768,7 +796,7 @@ class MitsubaScene:
     # ---- implementation
 
     def _find_plane(self) -> Any:
-        """Return Mitsuba's shape of the plane that takes the shadow, or None."""
+        """Return Mitsuba's shape of the plane that receives the shadow, or None."""
         if self.plane_radiance is None:
             return None
         shapes = {shape.id(): shape for shape in self._scene.shapes()}
@@ -783,19 +811,20 @@ class MitsubaScene:
         recordings are stale, which `population.changes` counts.
         """
         self._check_known(inputs)
-        if self._every:
-            # All inputs are written at each call, as if none were set.
-            inputs = {**self._every, **inputs}
+        if self._values_to_upload:
+            # Write all inputs: without `_applied`, all of them count as changed.
+            inputs = {**self._values_to_upload, **inputs}
             self._applied.clear()
         changes = self._find_changes(inputs)
-        if not self._literals.isdisjoint(changes):
+        changes_constants = not self._constants.isdisjoint(changes)
+        if changes_constants:
             population.changes += 1
-        for name, fresh in changes.items():
-            self._write(name, fresh)
-            if fresh is None:
+        for name, value in changes.items():
+            self._write(name, value)
+            if value is None:  # back to the base value
                 del self._applied[name]
             else:
-                self._applied[name] = fresh.clone()
+                self._applied[name] = value.clone()
         if changes:
             self.parameters.update()
 
@@ -805,7 +834,7 @@ class MitsubaScene:
         if any(name.endswith(".base_color") for name in unknown):
             raise InputError(
                 f"{unknown[0]}: the surface is one of Mitsuba's own without a base "
-                "colour that can be searched; leave "
+                "color that can be searched; leave "
                 "out what changes it, such as texture, material or patch, or search "
                 "mitsuba:KEY=[low, high]"
             )
@@ -834,46 +863,53 @@ class MitsubaScene:
                 changes[name] = value
         return changes
 
-    def _write(self, name: str, fresh: Tensor | None) -> None:
-        """Write a value of an input, or its base value if `fresh` is None, to Mitsuba.
+    def _write(self, name: str, tensor: Tensor | None) -> None:
+        """Write a value of an input to Mitsuba, or its base value if it is None.
 
-        At the first write the base value is stored. Vertices and normals are written
-        into the memory that they have, to which recordings refer.
+        At the first write the base value is stored.
 
         Raises:
             InputError: the value has the wrong number of elements.
         """
         key, scene_input = self.declared_inputs[name]
         current = self.parameters[key]
-        if fresh is not None and scene_input.shape is not None:
-            if fresh.numel() != math.prod(scene_input.shape):
+        if tensor is not None and scene_input.shape is not None:
+            if tensor.numel() != math.prod(scene_input.shape):
                 raise InputError(
                     f"{name}: expected shape {scene_input.shape}, got "
-                    f"{tuple(fresh.shape)}, from what sets it"
+                    f"{tuple(tensor.shape)}, from what sets it"
                 )
+        is_buffer = name in self._buffers
         if name not in self._base:
-            is_buffer = name in self._buffers
-            # a copy of what is overwritten in place below
+            # A buffer is copied, since it is overwritten in place below.
             base = current.torch().clone() if is_buffer else current
             self._base[name] = type(current)(base)
-        if fresh is None:
+        if tensor is None:
+            # a copy, so that the stored value is not what Mitsuba changes
             value = type(current)(self._base[name])
         else:
-            value = mi.TensorXf(fresh)
+            value = mi.TensorXf(tensor)
             if scene_input.write:
                 value = scene_input.write(value)
-        if name in self._buffers:
-            address = current.torch().data_ptr()
-            dr.scatter(current, value, dr.arange(mi.UInt32, len(current)))
-            dr.eval(current)
-            # If another array shared the memory, Dr.Jit has written to a copy. Then the
-            # address differs: recordings refer to the old memory, and are stale.
-            population.changes += current.torch().data_ptr() != address
+        if is_buffer:
+            self._overwrite_buffer(current, value)
             self.parameters.set_dirty(key)
         else:
             self.parameters[key] = value
 
-    def _integrator(self, method: str) -> Any:
+    def _overwrite_buffer(self, buffer: Any, value: Any) -> None:
+        """Write vertices or normals into the memory that they have.
+
+        Recordings refer to that memory. If another array shares it, Dr.Jit writes to a
+        copy instead. Then the address differs, and all recordings are stale.
+        """
+        address = buffer.torch().data_ptr()
+        dr.scatter(buffer, value, dr.arange(mi.UInt32, len(buffer)))
+        dr.eval(buffer)
+        has_moved = buffer.torch().data_ptr() != address
+        population.changes += has_moved
+
+    def _get_integrator(self, method: str) -> Any:
         """Return the integrator of a method at the current depth, loaded on first use.
 
         Args:
@@ -881,24 +917,27 @@ class MitsubaScene:
                 both, without the environment that the camera sees; "guides" for the
                 denoiser; "boundary" for derivatives with the terms of moving outlines.
         """
-        key = method, self.depth
+        key = (method, self.depth)
         if key not in self._integrators:
-            # `_path` has what a part of the scene needs, such as haze
+            # `_path_entries` has what a part of the scene needs, such as haze; it may
+            # replace the type.
             adjoint = {
                 "type": "prb",
                 "max_depth": self.depth,
                 "rr_depth": self._gradient_roulette_depth,
-                **self._path,
+                **self._path_entries,
             }
             path = {
                 "type": self.integrator,
                 "max_depth": self.depth,
                 "rr_depth": self.roulette_depth,
-                **self._path,
+                **self._path_entries,
             }
+            # Made of `adjoint`, since it has to have derivatives as well as images.
             hidden = {**adjoint, "hide_emitters": True}
             if self.plane_radiance is not None:
                 hidden["type"] = "advsearch_photograph"
+                # `PhotographPath` names them as the properties of the plane's coat.
                 hidden["reflectance"] = self.definition[0].get_number("ground.gloss")
                 hidden["roughness"] = self.definition[0].get_number("ground.roughness")
             recipes: dict[str, Plugin] = {
@@ -916,6 +955,16 @@ class MitsubaScene:
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1
         return self._integrators[key]
+
+
+def _make_guides_plugin(description: SceneDescription) -> Plugin:
+    """Return the integrator of the denoiser's guides.
+
+    Mitsuba's own does not see through cut-outs.
+    """
+    if description.has_opacity:
+        return {"type": "advsearch_guides"}
+    return {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
 
 
 def _check_emission(description: SceneDescription) -> None:

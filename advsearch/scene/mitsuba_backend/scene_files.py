@@ -67,8 +67,9 @@ Y_TO_Z = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-MAX_PLUGINS = 2000  # plugins at the top of a scene
-# of the film to which Mitsuba's `focal_length` refers, millimetres
+MAX_PLUGINS = 2000  # largest number of plugins at the top of a scene
+MAX_DEPTH = 6  # longest light path of ours in segments, as `scene.MAX_DEPTH`
+# size of the film to which Mitsuba's `focal_length` refers, millimeters
 FILM_DIAGONAL = math.hypot(36.0, 24.0)
 NUMERIC_ENTRIES: Mapping[str, tuple[tuple[int, ...], str]] = {
     **dict.fromkeys(("radius", "fov", "width", "height"), ((), "a number")),
@@ -81,7 +82,7 @@ NUMERIC_ENTRIES: Mapping[str, tuple[tuple[int, ...], str]] = {
 
 
 def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
-    """Read a scene file or a dictionary, with arrays for transforms.
+    """Read a scene file or a dictionary; transforms become arrays (4, 4).
 
     Args:
         scene: path of an XML file, or a dictionary of the type "scene".
@@ -127,7 +128,8 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
         InputError: an entry is no number, or not of the right shape.
     """
     for key, value in plugin.items():
-        # a color is written as a plugin, but is a value here
+        # A color is written as a plugin, such as {"type": "rgb", "value": ...}, but is
+        # a value here. A dictionary without a type counts as one, and is rejected.
         is_color = isinstance(value, Mapping) and value.get("type", "rgb") in (
             "rgb",
             "spectrum",
@@ -162,7 +164,7 @@ class PluginContents:
 
 
 def read_contents(path: Path) -> PluginContents:
-    """Return what is understood of a scene file.
+    """Return the objects, cameras, lights and other plugins of a scene file.
 
     Raises:
         FileFormatError: the file is missing or corrupt, or it names a plugin or a file
@@ -178,6 +180,7 @@ def read_contents(path: Path) -> PluginContents:
     )
     cameras = tuple(name for name, kind in type_by_name.items() if kind in CAMERAS)
     known_names = {*objects, *cameras}
+    # Plugins of these types are replaced by our own; all others stay unchanged.
     replaced_types = INTEGRATOR_TYPES | SENSOR_TYPES
     unchanged = {
         name: kind
@@ -237,10 +240,11 @@ def import_mitsuba_scene(
     mesh, has_uvs = shapes.load_shape_mesh(shape, object_id)
     frame = _ObjectFrame(mesh, object_id, z_up=_is_z_up(plugins))
     # A haze replaces the plugins that it is made of.
-    haze, haze_names = shapes.find_haze(plugins, frame.matrix) or (
-        None,
-        frozenset[str](),
-    )
+    haze = None
+    haze_names = frozenset[str]()
+    haze_and_names = shapes.find_haze(plugins, frame.matrix)
+    if haze_and_names is not None:
+        haze, haze_names = haze_and_names
     emission = _find_radiance(shape)
     clauses = [
         *_describe_left_out(
@@ -395,10 +399,13 @@ def _paint(
         uvs=mesh.uvs.astype(np.float64) if keeps_uvs else None,
         surface=surface_color,
     )
+    # The functions of mesh import make new texture coordinates if the part has none,
+    # and a texture of the color.
     soup, maps = apply_textures(
         join_parts([part], where, np.eye(3)), [surface_color], Notes(where)
     )
-    return assemble(soup)[0], maps.color
+    textured_mesh = assemble(soup)[0]
+    return textured_mesh, maps.color
 
 
 def _list_plugins(
@@ -530,21 +537,21 @@ def _describe_left_out(
 
 
 def _describe_integrator(name: str, plugin: Mapping[str, object]) -> Iterator[str]:
-    """Yield clauses about what an integrator states and our own does not follow."""
+    """Yield clauses about settings of an integrator that ours does not have."""
     kind = plugin["type"]
     if kind not in PATH_INTEGRATORS:
         yield (
             f"the integrator {name} is left out: a {kind}; light takes all paths of up "
-            "to 6 segments"
+            f"to {MAX_DEPTH} segments"
         )
         return
     if plugin.get("hide_emitters"):
         yield f"hide_emitters of the integrator {name} is left out: lights are seen"
-    depth = plugin.get("max_depth", -1)
-    if isinstance(depth, int) and 0 <= depth < 6:
+    depth = plugin.get("max_depth", -1)  # -1, Mitsuba's default, is no limit
+    if isinstance(depth, int) and 0 <= depth < MAX_DEPTH:
         yield (
             f"the integrator's max_depth of {depth} is left out: light takes all "
-            "paths of up to 6 segments"
+            f"paths of up to {MAX_DEPTH} segments"
         )
 
 
@@ -584,7 +591,7 @@ class _ObjectFrame:
     """
 
     def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
-        """Measure a mesh, in the scene's coordinates, for the object of a name.
+        """Measure a mesh in the scene's coordinates, which becomes the object.
 
         Args:
             mesh: the mesh, in the scene's coordinates.
@@ -610,8 +617,10 @@ class _ObjectFrame:
             -(lower[1] + upper[1]) / 2,
             -lower[2],
         )
-        # z up first, then centered on the ground, then of extent 1
-        self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ translation @ to_z_up
+        # The last factor is applied first: z up, then centered on the ground, then
+        # scaled to the extent 1.
+        scaling = np.diag([1.0 / self.size] * 3 + [1.0])
+        self.matrix = scaling @ translation @ to_z_up
 
     def move_plugin(
         self, plugin: Mapping[str, object], *, at_top: bool = True
@@ -670,16 +679,18 @@ class _ObjectFrame:
         """Return a lamp in the object's coordinates, with its power scaled.
 
         Lengths are divided by the object's size. The intensity of a lamp is an
-        irradiance times a squared length, so it is divided by the squared size. So is a
-        projector's irradiance, which is that at a distance of 1.
+        irradiance times a squared length, so it is divided by the squared size. The
+        irradiance of a projector is that at a distance of 1, which is another distance
+        now: it is divided by the squared size, too.
         """
         kind = str(plugin["type"])
         entries = dict(plugin)
         if "position" in entries:
             position = np.asarray(entries["position"], dtype=np.float64)
+            # rotates, scales and shifts the position
             moved = self.matrix[:3, :3] @ position + self.matrix[:3, 3]
             entries["position"] = moved.tolist()
-        else:
+        else:  # the lamp has a pose
             entries = self._with_pose(plugin)
         power = "irradiance" if kind == "projector" else "intensity"
         entries[power] = _scale_power(entries.get(power, 1.0), self.size**-2, kind)
@@ -774,7 +785,8 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
     width, height = _read_film_size(film)
     axis = str(sensor.get("fov_axis", "x"))
     fov = float(np.asarray(sensor.get("fov", 0.0)))
-    if not fov:  # the sensor states a focal length, or nothing
+    has_no_fov = fov == 0.0
+    if has_no_fov:  # the sensor states a focal length, or nothing
         axis = "diagonal"
         fov = _compute_diagonal_fov(str(sensor.get("focal_length", "50mm")))
     larger_side = max(width, height)
@@ -785,7 +797,7 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
         "larger": larger_side,
         "smaller": min(width, height),
     }
-    axis_length = length_of_axis.get(axis, width)
+    axis_length = length_of_axis.get(axis, width)  # an unknown axis counts as x
     half_tangent = math.tan(math.radians(fov) / 2.0) * larger_side / axis_length
     return PosedCamera(matrix, 2.0 * math.degrees(math.atan(half_tangent)))
 

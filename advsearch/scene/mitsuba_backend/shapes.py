@@ -30,16 +30,16 @@ from advsearch.scene.parts import BASE_COLOR, HazePart, iterate_plugins
 
 
 class Buffers(NamedTuple):
-    """The buffers of a mesh in a Mitsuba scene."""
+    """Buffers of a mesh in a Mitsuba scene."""
 
     vertices: Float64Array  # (V, 3)
     faces: IntArray  # (F, 3)
-    normals: Float64Array | None  # (V, 3), if it has any
-    uvs: Float64Array | None  # (V, 2) texture coordinates, if it has any
+    normals: Float64Array | None  # (V, 3); None if the mesh has none
+    uvs: Float64Array | None  # (V, 2) texture coordinates; None if the mesh has none
     attributes: dict[str, Float32Array]  # (V or F, n), by name
 
 
-# texture coordinates of a face that has none, as in Mitsuba
+# texture coordinates of the corners of a face without any, as in Mitsuba
 DEFAULT_FACE_UVS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 ROUND_SEGMENTS = 64  # segments around a round shape
 # shapes for which Mitsuba has no triangles
@@ -66,7 +66,7 @@ SHAPE_ENTRIES = MESH_ENTRIES | {
     "sampling_weight",
     "silhouette_sampling_weight",
 }
-"""The same for any shape."""
+"""Entries of any shape that are no surface, light or medium."""
 
 
 def _load_any_buffers(shape: Mapping[str, object], name: str) -> Buffers:
@@ -93,8 +93,8 @@ def _load_any_buffers(shape: Mapping[str, object], name: str) -> Buffers:
 def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
     """Return the triangles of a shape in a Mitsuba scene.
 
-    Where Mitsuba has a mesh, it is Mitsuba's own; round shapes become triangles here.
-    Of a mesh with `face_normals`, or without texture coordinates, every face has
+    If Mitsuba has a mesh of the shape, it is loaded; other shapes are tessellated here.
+    If a mesh has `face_normals`, or no normals or texture coordinates, every face gets
     vertices of its own.
 
     Normals are unit vectors, reversed by `flip_normals`, and faces are wound so that
@@ -123,24 +123,20 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
         buffers = buffers._replace(normals=None)
     vertices, faces, normals, uvs, attributes = buffers
     if uvs is None or normals is None:
+        # Default values belong to the corners of a face. So each corner becomes a
+        # vertex, with default values for what is missing.
         vertices, faces, normals, uvs, attributes = _separate_faces(buffers)
 
-    # vertices that no face has are left out
+    # Leave out vertices that no face has.
     used_vertices, vertex_index = np.unique(faces, return_inverse=True)
     faces = vertex_index.reshape(-1, 3)
     vertices = vertices[used_vertices]
-    # v points up in our meshes and down in Mitsuba's, so that it becomes 1 - v
+    # v points up in our meshes and down in Mitsuba's, so that it becomes 1 - v.
     uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
     normal_sign = -1.0 if shape.get("flip_normals") else 1.0
-    # NaN where a face has no area
+    # The normals of a face without area are NaN.
     normals = np.nan_to_num(normals)[used_vertices] * normal_sign
-    # positive if the faces' fronts are where the normals point: summed over the corners
-    # of all faces, weighted by area
-    agreement = np.einsum(
-        "fk,fck->", compute_area_vectors(vertices[faces]), normals[faces]
-    )
-    if agreement < 0.0:
-        # Mitsuba shades by the normals, in whatever order the corners of faces are
+    if _has_opposite_winding(vertices, faces, normals):
         faces = faces[:, ::-1]
     mesh = Mesh(
         vertices.astype(np.float32),
@@ -150,6 +146,25 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
         _select_vertices(attributes, used_vertices),
     )
     return mesh, has_uvs
+
+
+def _has_opposite_winding(
+    vertices: Float64Array, faces: IntArray, normals: Float64Array
+) -> bool:
+    """Return whether the fronts of most faces are opposite to the normals.
+
+    The front of a face follows from the order of its corners. Mitsuba shades by the
+    normals instead, for any order, so that a file may have either. The cosines between
+    fronts and normals are added up over the corners of all faces, weighted by area.
+
+    Args:
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertices of the faces.
+        normals: (V, 3) normals.
+    """
+    area_vectors = compute_area_vectors(vertices[faces])  # (F, 3), along the fronts
+    agreement = np.einsum("fk,fck->", area_vectors, normals[faces])
+    return bool(agreement < 0.0)
 
 
 def _select_vertices(
@@ -304,28 +319,27 @@ def _make_unit_shape(
     Returns:
         Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
     """
-    fractions = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # of a turn, for a round kind
+    turns = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # fractions of a full turn
     normals = None  # for flat shapes, (0, 0, 1) below
     if kind == "sphere":
-        # half as many segments from pole to pole as around
-        uvs, faces = _make_grid(fractions, fractions[::2])
+        # u goes around, and v from pole to pole, with half as many segments.
+        uvs, faces = _make_grid(turns, turns[::2])
         polar = np.pi * uvs[:, 1]
-        vertices = np.stack(
-            [*(np.sin(polar) * _compute_circle_points(uvs[:, 0])), np.cos(polar)],
-            axis=1,
-        )
+        x, y = np.sin(polar) * _compute_circle_points(uvs[:, 0])
+        vertices = np.stack([x, y, np.cos(polar)], axis=1)
         normals = vertices
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        uvs, faces = _make_grid(fractions, np.array([0.0, 1.0]))
-        vertices = np.stack([*_compute_circle_points(uvs[:, 0]), uvs[:, 1]], axis=1)
+        # u goes around, and v along the axis.
+        uvs, faces = _make_grid(turns, np.array([0.0, 1.0]))
+        x, y = _compute_circle_points(uvs[:, 0])
+        vertices = np.stack([x, y, uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
     elif kind == "disk":
-        # u is the radius, along which it is flat: an eighth of the segments is enough
-        uvs, faces = _make_grid(fractions[::8], fractions)
-        vertices = np.stack(
-            [*(uvs[:, 0] * _compute_circle_points(uvs[:, 1])), np.zeros(len(uvs))],
-            axis=1,
-        )
+        # v goes around. u is the radius, along which the disk is flat: an eighth of the
+        # segments is enough.
+        uvs, faces = _make_grid(turns[::8], turns)
+        x, y = uvs[:, 0] * _compute_circle_points(uvs[:, 1])
+        vertices = np.stack([x, y, np.zeros(len(uvs))], axis=1)
     else:  # a rectangle
         uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
         vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
@@ -368,20 +382,25 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
 def _make_grid(u: Float64Array, v: Float64Array) -> tuple[Float64Array, IntArray]:
     """Return the points (n, 2) of a grid and its triangles (m, 3).
 
-    Points are row by row: `u` runs along rows, and `v` is that of each row. A cell is
-    two triangles.
+    Each cell of the grid is cut into two triangles. Their corners are in
+    counterclockwise order, with u to the right and v up.
+
+    Args:
+        u: coordinates of the points in each row.
+        v: coordinate of each row.
     """
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     row_starts = np.arange(len(v) - 1)[:, None] * len(u)
+    # index of the point at the corner of each cell with the smallest u and v
     corner = (row_starts + np.arange(len(u) - 1)).reshape(-1)
-    corner_above = corner + len(u)
+    corner_above = corner + len(u)  # in the next row
     lower = np.stack([corner, corner + 1, corner_above + 1], axis=1)
     upper = np.stack([corner, corner_above + 1, corner_above], axis=1)
     return points, np.concatenate([lower, upper])
 
 
 def _compute_circle_points(turns: Float64Array) -> Float64Array:
-    """Return x and y on the unit circle, for fractions of a turn."""
+    """Return x and y (2, n) on the unit circle, for fractions (n,) of a turn."""
     return np.asarray([np.cos(2.0 * np.pi * turns), np.sin(2.0 * np.pi * turns)])
 
 
@@ -404,9 +423,10 @@ def find_haze(
 ) -> tuple[HazePart, frozenset[str]] | None:
     """Find the haze of a scene.
 
-    A haze is one grey medium in a ball that the camera stands in. Mitsuba's
-    `prbvolpath` does not see it between the camera and the first surface, so our own
-    integrator renders it, from a `HazePart`. All other media stay as they are.
+    A haze is one grey medium in a ball that the camera stands in: the camera names it
+    as its medium. Mitsuba's `prbvolpath` does not see it between the camera and the
+    first surface, so our own integrator renders it, from a `HazePart`. All other media
+    stay as they are.
 
     Args:
         named: the scene's plugins by name.
@@ -424,9 +444,10 @@ def find_haze(
     ball_name, medium_name = names
     ball = named[ball_name]
     pose = matrix @ get_pose(ball)
-    center = pose @ np.append(
-        np.broadcast_to(_parse_numbers(ball.get("center", np.zeros(3))), (3,)), 1.0
-    )
+    # Numbers that are not understood are NaN here, for which the comparisons below are
+    # false.
+    ball_center = np.broadcast_to(_parse_numbers(ball.get("center", np.zeros(3))), (3,))
+    center = pose @ np.append(ball_center, 1.0)
     scene_radius = float(_parse_numbers(ball.get("radius", 1.0))[0])
     # the cube root of the determinant is the scale of lengths
     radius = scene_radius * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
@@ -438,7 +459,8 @@ def find_haze(
     coefficients = _read_haze_medium(named[medium_name], matrix)
     if coefficients is None:
         return None
-    haze = HazePart(ball_name, radius, *coefficients)
+    extinction, albedo = coefficients
+    haze = HazePart(ball_name, radius, extinction, albedo)
     return haze, frozenset((ball_name, medium_name))
 
 
@@ -462,7 +484,8 @@ def _read_haze_medium(
     # factor.
     length_scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / length_scale
-    # one value for all channels
+    # A color has three values, which are equal if it is grey. NaN is not equal to
+    # itself.
     is_grey = float(extinction.min()) == float(extinction.max())
     is_in_range = 0.0 < float(extinction.min()) <= MAX_EXTINCTION
     albedo = np.broadcast_to(_parse_numbers(medium.get("albedo", 0.75)), (3,)).tolist()
@@ -481,7 +504,7 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     and the medium may have only the entries in `_OF_BALL` and `_OF_MEDIUM`: a haze has
     no others.
     """
-    # only cameras name a medium that they stand in
+    # Of all plugins only cameras have an entry "medium", the one that they stand in.
     camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
     camera_media.discard(None)
     # spheres that are filled with it
@@ -496,7 +519,8 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
         for name, plugin in named.items()
         if plugin["type"] in ("homogeneous", "heterogeneous")
     ]
-    if not len(camera_media) == len(ball_names) == len(medium_names) == 1:
+    is_single_haze = len(camera_media) == len(ball_names) == len(medium_names) == 1
+    if not is_single_haze:
         return None
     (ball_name,) = ball_names
     (medium_name,) = medium_names
@@ -575,27 +599,30 @@ IMAGE_ENTRIES = frozenset(
 
 @dataclass(frozen=True, eq=False)
 class ShapeSurface:
-    """The surface of a shape, with its base color taken out."""
+    """Surface of a shape, separated from its base color."""
 
-    # its dictionary, with `{"type": BASE_COLOR}` and how the texture is looked up
-    # (`wrap_mode`, `filter_type`) in the place of the base color, if it has one
+    # Dictionary of the surface. The base color, if there is one, is replaced by
+    # `{"type": BASE_COLOR}` with the options of its look-up (`wrap_mode`,
+    # `filter_type`).
     plugin: Plugin
-    # (H, W, 3) float32 display-referred, row 0 on top; `DEFAULT_REFLECTANCE` if it has
-    # no base color
+    # (H, W, 3) float32 display-referred, row 0 on top; `DEFAULT_REFLECTANCE` if the
+    # surface has no base color
     base_color: Float32Array
     is_textured: bool  # whether the base color varies over the surface
     # (3, 3) from the mesh's texture coordinates to those of the base color and of
     # `plugin`, v downwards
     to_uv: Float64Array
-    is_bound: bool  # the mesh must keep its own texture coordinates and attributes
-    notes: tuple[str, ...]  # clauses about what is not as in the scene
+    # whether the surface would look different on a mesh with other texture coordinates
+    # or attributes
+    is_bound: bool
+    notes: tuple[str, ...]  # clauses about differences from the scene
 
 
 class _Color(NamedTuple):
     """A base color."""
 
     linear: Float32Array  # (H, W, 3)
-    options: Plugin  # how it is looked up
+    options: Plugin  # entries that control the look-up, such as "wrap_mode"
     to_uv: object = None  # its own transform of texture coordinates
 
 
@@ -612,14 +639,13 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
         grey = np.full(
             (CONSTANT_SIZE, CONSTANT_SIZE, 3), DEFAULT_REFLECTANCE, np.float32
         )
-        color = _Color(grey, {})
+        color = _Color(linear=grey, options={})
     linear = color.linear
-    # Only what has the size of a constant color may be one: a larger image, even of one
-    # color, is a texture.
-    is_constant = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE) and not bool(
-        np.ptp(linear, axis=(0, 1)).any()
-    )
-    # whether it looks different on a mesh with other texture coordinates
+    # `_parse_base_color` gives a constant color this size. A larger image is a texture,
+    # even if all its texels are equal.
+    has_constant_size = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE)
+    varies = bool(np.ptp(linear, axis=(0, 1)).any())
+    is_constant = has_constant_size and not varies
     is_bound = any(
         plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)
@@ -660,25 +686,27 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
 
 
 def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
-    """Return clauses about what of a surface is not as in the scene.
+    """Return clauses about how a surface differs from the one in the scene.
 
-    `linear` are the linear values of its base color, of any shape.
+    Args:
+        surface: the surface, with the placeholder `BASE_COLOR` if it has a base color.
+        linear: linear values of its base color, of any shape.
     """
     clauses = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
         kinds = sorted(types & {"mesh_attribute", "volume"})
         if kinds:
-            reason = f"its colour is a {kinds[0]}"
+            reason = f"its color is a {kinds[0]}"
         else:
             reason = f"a {surface['type']} has none"
         clauses.append(
-            f"it has no base colour that can be searched ({reason}): not for "
-            "texture, patch and material"
+            f"it has no base color that can be searched ({reason}), so that the "
+            "controls texture, patch and material cannot be used on it"
         )
     # with a tolerance for rounding; NaN is out of range too
     if not (linear.min() >= 0.0 and linear.max() <= 1.0 + 1e-4):
-        clauses.append("its base colour is cut to reflectances from 0 to 1")
+        clauses.append("its base color is clipped to reflectances from 0 to 1")
     return clauses
 
 
@@ -687,7 +715,8 @@ def _apply_uv_transform(
 ) -> tuple[Plugin, Float64Array]:
     """Apply a base color's transform of texture coordinates to those of the mesh.
 
-    All other textures of the surface then undo it first, by its inverse. That is
+    Then the base color, which is searched, needs no transform. All other textures of
+    the surface undo it first, by its inverse, so that they look the same. That is
     possible only if the transform has an inverse. If the surface uses tangents along u,
     their direction must also stay the same. Otherwise the base color keeps its
     transform, and the mesh is not changed.
@@ -705,13 +734,15 @@ def _apply_uv_transform(
         plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)
     )
-    # v does not depend on u, which grows in the same direction as before
+    # A step along u must remain one along u, in the same direction: it must not change
+    # v, and the new u must grow with the old one.
     keeps_tangents = to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0
     is_invertible = abs(np.linalg.det(to_uv)) > 1e-12
     if not is_invertible or (uses_tangents and not keeps_tangents):
         return _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
     if not np.array_equal(to_uv, np.eye(3)):
         inverse = np.asarray(np.linalg.inv(to_uv), np.float64)
+        # The base color, a `BASE_COLOR`, is none of these types.
         surface = _with_transform(surface, inverse, *UV_TEXTURES)
     return surface, to_uv
 
@@ -719,8 +750,7 @@ def _apply_uv_transform(
 def _with_transform(
     plugin: Mapping[str, object], before: Float64Array, *kinds: str
 ) -> Plugin:
-    """Return a plugin whose textures of some kinds have one more transform of
-    coordinates.
+    """Return a plugin in which textures of some kinds get a transform of coordinates.
 
     Inner plugins are changed too, at any depth.
 
@@ -752,14 +782,11 @@ def to_uv_matrix(value: object) -> Float64Array:
 
 
 def _parse_base_color(value: object) -> _Color | None:
-    """Return a color, a checkerboard or a bitmap as a base color; None of all else.
-
-    A checkerboard is a texture of 2 x 2 texels, of which none is interpolated.
-    """
+    """Return a color, a checkerboard or a bitmap as a base color; else None."""
     constant = parse_constant_color(value)
     if constant is not None:
         size = (CONSTANT_SIZE, CONSTANT_SIZE, 3)
-        return _Color(np.broadcast_to(constant, size), {})
+        return _Color(linear=np.broadcast_to(constant, size), options={})
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
@@ -767,16 +794,18 @@ def _parse_base_color(value: object) -> _Color | None:
     pixels = _read_pixels(value) if value["type"] == "bitmap" else None
     if pixels is None:
         return None
+    # Without `to_uv`, which is stored apart: it is one of `IMAGE_ENTRIES`.
     options = {key: entry for key, entry in value.items() if key not in IMAGE_ENTRIES}
     if options.get("filter_type") == "nearest":
         pixels = _repeat_texels(pixels)
-    return _Color(pixels, options, value.get("to_uv"))
+    return _Color(linear=pixels, options=options, to_uv=value.get("to_uv"))
 
 
 def _parse_checkerboard(plugin: Mapping[str, object]) -> _Color | None:
     """Return a checkerboard as a base color; None if its fields are textures.
 
-    Also None for a plugin with entries that are not known here.
+    It is a texture of 2 x 2 texels that are not interpolated. The result is also None
+    for a plugin with entries that are not known here.
     """
     # the defaults are Mitsuba's
     first_color = parse_constant_color(plugin.get("color0", 0.4))
@@ -784,19 +813,23 @@ def _parse_checkerboard(plugin: Mapping[str, object]) -> _Color | None:
     unknown = set(plugin) - {"type", "id", "color0", "color1", "to_uv"}
     if first_color is None or second_color is None or unknown:
         return None
+    # Rows are along Mitsuba's v. The first color is where u and v are both in the lower
+    # half or both in the upper half.
     checkerboard = np.array(
         [[first_color, second_color], [second_color, first_color]], np.float32
     )
     return _Color(
-        _repeat_texels(checkerboard), {"filter_type": "nearest"}, plugin.get("to_uv")
+        linear=_repeat_texels(checkerboard),
+        options={"filter_type": "nearest"},
+        to_uv=plugin.get("to_uv"),
     )
 
 
 def _repeat_texels(texture: Float32Array) -> Float32Array:
     """Enlarge a texture by repeating texels, to at least `MIN_NEAREST_SIZE` a side.
 
-    It is for textures that are not interpolated: a control may keep the texture's size
-    and interpolate, which then blurs only the borders of texels.
+    It is for textures that are not interpolated. A control that changes the texture may
+    interpolate it. In the larger texture, that blurs only the borders of the texels.
     """
     # twice negated, so that the quotients are rounded up
     row_repeats, column_repeats = (

@@ -1,9 +1,9 @@
-"""Images of one seed, among which only the surfaces of some shapes change.
+"""Render images of one seed in which only the surfaces of some shapes change.
 
 A light path that meets none of these surfaces is the same in all images of a seed. So
-only the first image is traced in full. Of each further image, those samples are traced
-again, with the random numbers that they have, whose path has met one of the surfaces in
-the first. Every sample is bit for bit what it is in an image that is traced in full.
+only the first image is traced in full. For each further image, only the samples are
+traced again whose path has met one of the surfaces in the first image, with the same
+random numbers. Every sample is bit for bit that of an image that is traced in full.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ from advsearch.scene.assets import Float64Array
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import dr, mi, mitsuba_lock, population
 
-SAMPLERS = ("independent", "multijitter")  # those whose numbers are known by sample
-MAX_SAMPLES = 1 << 21  # of one launch, for its memory
-MAX_STORED_BYTES = 1 << 28
+# samplers whose numbers `paths.PathSamples` can compute for any sample
+SAMPLERS = ("independent", "multijitter")
+MAX_SAMPLES = 1 << 21  # largest number of samples of one launch, for its memory
+MAX_STORED_BYTES = 1 << 28  # memory limit of what is stored for all seeds
 N_CHANNELS = 9  # radiance, albedo and normal
 
 
 @dataclass(frozen=True, eq=False)
 class StoredPaths:
-    """What the images of one seed have in common.
+    """The light that the images of one seed have in common.
 
     Attributes:
-        sums: (pixels, channels) float64, the sums over samples of what depends on no
-            changed surface.
-        samples: for each launch the indices (Dr.Jit's) of the samples that have met
-            one.
+        sums: (pixels, channels) float64 sums over samples, without the light that
+            depends on a changed surface.
+        samples: for each launch the indices, a Dr.Jit array, of the samples whose path
+            has met a changed surface.
     """
 
     sums: Float64Array
@@ -43,31 +44,38 @@ class StoredPaths:
 
     @property
     def n_bytes(self) -> int:
-        """Memory that it takes."""
+        """Memory, bytes: 4 for the index of each sample."""
         return int(self.sums.nbytes + 4 * sum(map(dr.width, self.samples)))
 
 
 class SharedPaths:
-    """Render images of one scene, each path that is common to several only once.
+    """Render images of one scene, and trace paths that images share only once.
 
-    The latest seeds are stored, `MAX_STORED_BYTES` of them.
+    The light of the seeds that were used last is stored, up to `MAX_STORED_BYTES`.
 
     Attributes:
         scene: the scene.
 
     Args:
-        scene: scene; see `can_share_paths`.
-        inputs: names of the inputs that may change: of surfaces of shapes that emit no
-            light and don't move.
+        scene: the scene; see `can_share_paths`.
+        inputs: names of the inputs that may change between images, such as
+            "object.roughness". They belong to surfaces of shapes that emit no light and
+            do not move.
     """
 
     def __init__(self, scene: MitsubaScene, inputs: Collection[str]) -> None:
-        """Store the scene and which inputs may change, as "object.roughness"."""
+        """Store the scene, and which inputs may change.
+
+        Args:
+            scene: the scene.
+            inputs: names of the inputs that may change, such as "object.roughness".
+        """
         self.scene = scene
-        self._inputs = frozenset(inputs)
-        self._shapes = {name.partition(".")[0] for name in inputs}
+        self._changeable_inputs = frozenset(inputs)
+        self._changeable_shapes = {name.partition(".")[0] for name in inputs}
+        # by seed, samples and depth, the seed that was used last at the end
         self._stored = dict[tuple[Any, ...], StoredPaths]()
-        # the other inputs of what is stored
+        # values of all other inputs, for which the stored paths are valid
         self._fixed = dict[str, Tensor]()
 
     def render_images(
@@ -85,9 +93,9 @@ class SharedPaths:
         Returns:
             The radiance (H, W, 3), and for "guides" albedo and normal (H, W, 6).
         """
-        INTERRUPTS.look()
+        INTERRUPTS.look()  # stops here if the user has interrupted the run
         with mitsuba_lock:
-            self._check_fixed(inputs)
+            self._discard_if_stale(inputs)
             self.scene.set_inputs(inputs)
             if population.unused:
                 population.free_unused()
@@ -96,10 +104,12 @@ class SharedPaths:
             guides[..., :3].clamp_(0.0, 1.0)
             return [radiance, guides] if "guides" in seeds else [radiance]
 
-    def _check_fixed(self, inputs: Mapping[str, Tensor]) -> None:
-        """Forget everything if inputs have changed that should not."""
+    def _discard_if_stale(self, inputs: Mapping[str, Tensor]) -> None:
+        """Discard all stored paths if an input has changed that is not changeable."""
         fixed = {
-            name: value for name, value in inputs.items() if name not in self._inputs
+            name: value
+            for name, value in inputs.items()
+            if name not in self._changeable_inputs
         }
         is_same = fixed.keys() == self._fixed.keys() and all(
             torch.equal(value, self._fixed[name]) for name, value in fixed.items()
@@ -118,12 +128,14 @@ class SharedPaths:
         """
         key = (seed, spp, self.scene.depth)
         height, width = self.scene.resolution
+        # sums over samples of the light that depends on changed surfaces
         changing = np.zeros((height * width, N_CHANNELS))
         if key in self._stored:
+            # Taken out, and stored again below: so the seed used last is at the end.
             stored = self._stored.pop(key)
             for samples in stored.samples:
                 if dr.width(samples):
-                    _, values, _ = self._trace(seed, spp, samples)
+                    _unchanged, values, _has_met = self._trace(seed, spp, samples)
                     _add_samples(changing, samples, values, spp)
         else:
             stored = self._trace_all(seed, spp, changing)
@@ -133,22 +145,27 @@ class SharedPaths:
         return image[..., :3].contiguous(), image[..., 3:].contiguous()
 
     def _trace_all(self, seed: int, spp: int, changing: Float64Array) -> StoredPaths:
-        """Trace all samples, and return what is common to images of the seed.
+        """Trace all samples of a seed.
 
         Args:
             seed: seed of the image.
             spp: samples per pixel.
-            changing: (pixels, channels) to which the sums of all else are added.
+            changing: (pixels, channels) array, changed in place: the light that depends
+                on changed surfaces is added to it.
+
+        Returns:
+            The light that is common to images of the seed.
         """
         common = np.zeros_like(changing)
         met_samples = []
-        first = 0  # pixel
+        first_pixel = 0
         for samples in _divide_samples(len(changing), spp):
             unchanged, values, has_met = self._trace(seed, spp, samples)
             sums = [dr.block_sum(channel, spp).numpy() for channel in unchanged]
-            last = first + len(sums[0])
-            common[first:last] = np.stack(sums, axis=1)
-            first = last
+            end_pixel = first_pixel + len(sums[0])
+            common[first_pixel:end_pixel] = np.stack(sums, axis=1)
+            first_pixel = end_pixel
+            # of these samples, those that have met a changed surface
             index = dr.compress(has_met)
             met = dr.gather(mi.UInt32, samples, index)
             dr.eval(met)
@@ -187,10 +204,11 @@ class SharedPaths:
                 scene, ray, numbers, changed, depth, roulette_depth
             )
 
+        shape_ids = self._changeable_shapes
         changed = [
-            shape for shape in self.scene.mitsuba_shapes if shape.id() in self._shapes
+            shape for shape in self.scene.mitsuba_shapes if shape.id() in shape_ids
         ]
-        key = ("shared paths", *sorted(self._shapes), spp, depth, roulette_depth)
+        key = ("shared paths", *sorted(shape_ids), spp, depth, roulette_depth)
         traced: tuple[Any, Any, Any] = self.scene.run_recorded(
             key, trace, changed, dr.opaque(mi.UInt32, seed), samples
         )
@@ -198,18 +216,20 @@ class SharedPaths:
         return traced
 
     def _store(self, key: tuple[Any, ...], paths: StoredPaths) -> None:
-        """Store what images of a seed have in common; the oldest makes room."""
+        """Store the common light of a seed's images; drop the least recently used."""
         self._stored[key] = paths
         n_bytes = sum(stored.n_bytes for stored in self._stored.values())
         while n_bytes > MAX_STORED_BYTES and len(self._stored) > 1:
-            n_bytes -= self._stored.pop(next(iter(self._stored))).n_bytes
+            oldest_key = next(iter(self._stored))
+            n_bytes -= self._stored.pop(oldest_key).n_bytes
 
 
 def can_share_paths(scene: MitsubaScene) -> bool:
     """Return whether images of a scene can share light paths, and save time by it.
 
     They save time where light paths are long, as among trees and houses: elsewhere
-    light soon leaves the scene. The other conditions are what `trace_paths` covers.
+    light soon leaves the scene. `MitsubaScene` has chosen the integrator "path" for
+    such scenes. The other conditions exclude what `trace_paths` does not support.
     """
     description, filter_name = scene.definition
     has_long_paths = scene.integrator == "path"
@@ -226,7 +246,9 @@ def _divide_samples(n_pixels: int, spp: int) -> Iterator[Any]:
     step = max(1, MAX_SAMPLES // spp)
     for first in range(0, n_pixels, step):
         count = min(step, n_pixels - first) * spp
-        samples = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first * spp)
+        # `opaque`: a literal would be compiled into a kernel of its own for each launch.
+        first_sample = dr.opaque(mi.UInt32, first * spp)
+        samples = dr.arange(mi.UInt32, count) + first_sample
         dr.eval(samples)
         yield samples
 

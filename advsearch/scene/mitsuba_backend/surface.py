@@ -1,7 +1,7 @@
-"""Look light on surfaces up through many cameras, by rays in one recorded launch.
+"""Look up light on surfaces through many cameras, by rays in one recorded launch.
 
-A ray of a pixel meets a texel, or the environment; another one, in the mean direction
-of the surface's gloss, finds what is reflected. The rays go through a pixel at the same
+A ray of a pixel meets a texel, or the environment. From a glossy surface a second ray,
+in the mean direction of its gloss, finds what is reflected. The rays have the same
 positions in all pixels, so that nothing is random.
 """
 
@@ -23,36 +23,38 @@ from advsearch.scene.mitsuba_backend import texel_rays
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, mitsuba_lock
 
-# Spreads of gloss between which one ray to the ground gives way to what surrounds the
-# object.
+# Spreads of gloss, radians. Up to the first one a single ray finds the reflection of
+# the ground; from the second one on it is taken from the blurred map.
 MIN_BLENDED_SPREAD = 0.15
 MAX_BLENDED_SPREAD = 0.4
 CAMERA_SIZE = 16  # numbers of a camera in the kernel, see `_make_camera_numbers`
 RAY_PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
-"""Positions of the rays of a pixel in it.
+"""Positions (x, y) of the rays in their pixel, in pixels.
 
 It is a rotated grid, which samples upright and level edges at four positions.
 """
 RAYS_PER_PIXEL = len(RAY_PATTERN)
-# channels of the kernel's result before those of the layers: radiance and coverage
+# the kernel's channels for each pixel, which come before those of the layers: three of
+# radiance, and coverage
 N_IMAGE_CHANNELS = 4
-# fraction of a ray's light below which what is behind a cut-out does not count
+# A ray ends if less than this fraction of its light passes the cut-outs before it.
 MIN_TRANSMITTANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class LightMaps:
-    """The light of one moment, as `ViewTracer` looks it up.
+    """Light of one environment, in maps for `ViewTracer`.
 
-    The maps are flat Dr.Jit arrays, three numbers for each color.
+    The maps are flat Dr.Jit arrays with four numbers for each color, of which the last
+    is unused; see `_gather_color`.
     """
 
-    # radiance that leaves each texel of all grids, and last that of the ground far off;
-    # for a photographed ground, a fraction of the photograph instead
+    # for each cell of all grids the radiance of its texel, followed by that of the
+    # ground beyond all texels; for a photographed ground, a factor on the photograph
     texels: Any
     sky: Any  # the environment's map, with the copied columns at both ends
     sky_shape: tuple[int, int]
-    # what surrounds the object, the ground too, blurred by each of `widths`
+    # environment and ground around the object, blurred by each of `widths`
     blurred: Any
     blurred_shape: tuple[int, int]
 
@@ -71,9 +73,9 @@ def make_light_maps(texels: Tensor, padded: Tensor, blurred: Tensor) -> LightMap
         blurred: (widths, h, w, 3) its blurred maps.
     """
 
-    def flatten(values: Tensor) -> Any:
-        # one number more, since colors are gathered by four numbers
-        return mi.Float(functional.pad(values, (0, 1)).numpy().ravel())
+    def flatten(colors: Tensor) -> Any:
+        # Each color (the last axis) gets a fourth number, 0, see `_gather_color`.
+        return mi.Float(functional.pad(colors, (0, 1)).numpy().ravel())
 
     return LightMaps(
         texels=flatten(texels),
@@ -86,23 +88,24 @@ def make_light_maps(texels: Tensor, padded: Tensor, blurred: Tensor) -> LightMap
 
 @dataclass(frozen=True, eq=False)
 class ViewSamples:
-    """What cameras see, by `ViewTracer`."""
+    """Images of n cameras, and k samples of the searched texture in them."""
 
     # (n, H, W, 3) radiance without what the searched texture reflects diffusely
     radiance: Tensor
     coverage: Tensor  # (n, H, W, 1) fraction of each pixel that surfaces cover
-    # (k,) int64, the rays that see the searched texture, ascending; `RAYS_PER_PIXEL` a
-    # pixel, row by row. One that goes through cut-outs sees it several times
+    # (k,) int64 index of the ray of each sample, ascending. Each pixel has
+    # `RAYS_PER_PIXEL` rays; pixels are in the order of camera, row, column. A ray that
+    # goes through cut-outs may have several samples
     sample: Tensor
-    uv: Tensor  # (k, 2) texture coordinates there, as Mitsuba has them
-    weight: Tensor  # (k,) the diffuse fraction over pi, and over the rays of a pixel
-    is_back: Tensor  # (k,) bool, whether it is seen from behind
+    uv: Tensor  # (k, 2) texture coordinates, with v as in Mitsuba
+    weight: Tensor  # (k,) diffuse fraction over pi, and over the rays of a pixel
+    is_back: Tensor  # (k,) bool, whether the ray meets the surface from behind
 
 
 def _select_ray_offset(ray_index: Any) -> tuple[Any, Any]:
-    """Return where in its pixel each ray goes, in pixels to the right and down.
+    """Return the position of each ray in its pixel, in pixels to the right and down.
 
-    `ray_index` counts the rays of a pixel, see `RAY_PATTERN`.
+    `ray_index` is the index of the ray in `RAY_PATTERN`.
     """
     x_offset = mi.Float(RAY_PATTERN[0][0])
     y_offset = mi.Float(RAY_PATTERN[0][1])
@@ -117,14 +120,15 @@ class ViewTracer:
 
     Args:
         scene: the scene; the inputs of the arrangement have to be set at a call.
-        grids, lobes: those of all surfaces, the searched texture's first.
-        widths: root mean square angles, radians, of the blurred maps, each twice the
+        grids: grid of texels of each surface, those of the searched texture first.
+        lobes: reflection tables of each surface.
+        widths: root mean square angles of the blurred maps, radians; each is twice the
             one before. The maps are blurred as seen from `center`.
-        photograph_height: height from which a photographed ground was taken; None of
-            any other ground.
-        model: lens model of all cameras; None of pinholes, which have a field of view
+        photograph_height: height of the camera that photographed the ground; None for
+            a plain ground.
+        model: lens model of all cameras; None for pinholes, which have a field of view
             each.
-        center: (3,) center of the object.
+        center: (3,) center of the object, from which the blurred maps are seen.
     """
 
     def __init__(
@@ -142,30 +146,32 @@ class ViewTracer:
         Args:
             scene: the scene.
             grids, lobes: texel grid and reflection tables of each surface.
-            widths: root mean square angles, radians, of the blurred maps.
-            photograph_height: height from which a photographed ground was taken; None
-                for any other ground.
+            widths: root mean square angles of the blurred maps, radians.
+            photograph_height: height of the camera that photographed the ground; None
+                for a plain ground.
             model: lens model of all cameras; None for pinholes.
-            center: (3,) center of the object.
+            center: (3,) center of the object, from which the blurred maps are seen.
         """
         self._scene = scene
         self._grids = tuple(grids)
         self._widths = tuple(widths)
         self._photograph_height = photograph_height
         self._center = center.tolist()
-        tables = [
+        # the six tables of the first surface, then those of the next one
+        tables_of_surfaces = [
             np.concatenate([getattr(surface, name) for name in texel_rays.LOBE_TABLES])
             for surface in lobes
         ]
-        self._lobe_tables = np.concatenate(tables).astype(np.float32)
+        self._lobe_tables = np.concatenate(tables_of_surfaces).astype(np.float32)
         self._lens = None if model is None else self._make_lens_table(model)
         self._recordings = Recordings()
 
     def _make_lens_table(self, model: CameraModel) -> Float32Array:
         """Return the lens's rays through each pixel, flat, four numbers each.
 
-        They are the direction in the camera's axes, and whether the lens has a ray
-        there (above 0). Rays are in the order of lanes: row, column, ray of the pixel.
+        The first three are the direction in the camera's axes; the fourth is above 0
+        if the lens has a ray there. Rays are in the order of lanes: row, column, ray of
+        the pixel.
         """
         height, width = self._scene.resolution
         row, column, ray_index = np.meshgrid(
@@ -208,7 +214,7 @@ class ViewTracer:
                 mitsuba_scene: Any,
                 lane: Any,
                 tables: Any,
-                cameras: Any,
+                camera_numbers: Any,
                 lens: Any,
                 texels: Any,
                 sky: Any,
@@ -217,24 +223,27 @@ class ViewTracer:
                 """Trace all rays; arguments are Dr.Jit arrays, see `_trace`."""
                 light_maps = replace(lit, texels=texels, sky=sky, blurred=blurred)
                 return self._trace(
-                    mitsuba_scene, lane, tables, cameras, lens, light_maps
+                    mitsuba_scene, lane, tables, camera_numbers, lens, light_maps
                 )
 
             recording = self._recordings.get_or_record(
-                (count, lit.sky_shape, lit.blurred_shape), trace, []
+                (count, lit.sky_shape, lit.blurred_shape), trace, media=[]
             )
             # without a lens a single 0, since the kernel's argument cannot be empty
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
-            arrays = [
-                mi.Float(values)
-                for values in (self._lobe_tables, camera_rows.ravel(), lens)
-            ]
             lane = dr.arange(mi.UInt32, count * height * width * RAYS_PER_PIXEL)
-            # A recording takes its size from its evaluated arguments; without the lanes
-            # it would be that of the scene's map.
+            # A recording takes its size from its evaluated arguments. If the lanes were
+            # not evaluated, it would take that of the environment's map.
             dr.eval(lane)
             channels = recording(
-                self._scene._scene, lane, *arrays, lit.texels, lit.sky, lit.blurred
+                self._scene._scene,
+                lane,
+                mi.Float(self._lobe_tables),
+                mi.Float(camera_rows.ravel()),
+                mi.Float(lens),
+                lit.texels,
+                lit.sky,
+                lit.blurred,
             )
         return lambda: _fetch(channels, (count, height, width))
 
@@ -243,7 +252,7 @@ class ViewTracer:
         mitsuba_scene: Any,
         lane: Any,
         tables: Any,
-        cameras: Any,
+        camera_numbers: Any,
         lens: Any,
         lit: LightMaps,
     ) -> list[Any]:
@@ -257,30 +266,34 @@ class ViewTracer:
             lane: index of each ray; rays are in the order of camera, row, column, and
                 ray of the pixel.
             tables: tables of `Lobes` of all surfaces, flat.
-            cameras: `CAMERA_SIZE` numbers for each camera, flat.
-            lens: as from `_make_lens_table`.
+            camera_numbers: `CAMERA_SIZE` numbers for each camera, flat.
+            lens: flat table, as from `_make_lens_table`.
             lit: the light.
 
         Returns:
-            For each pixel the three channels of radiance without the searched texture,
-            and coverage; then for each layer of cut-outs and each ray u, v and weight
-            of the searched texture. The weight is negative where its back is seen.
+            For each pixel the three channels of radiance without what the searched
+            texture reflects diffusely, and coverage. Then for each layer and each ray
+            u, v and weight of the searched texture. The weight is 0 where the ray does
+            not meet the texture, and negative where it meets its back.
         """
-        ray, active = self._make_rays(lane, cameras, lens)
+        ray, active = self._make_rays(lane, camera_numbers, lens)
         direction = ray.d
-        to_local = texel_rays.world_to_map(self._scene)
+        to_local = texel_rays.get_world_to_map(self._scene)
         ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
+        # 0 layers of cut-outs if the scene has none, and one opaque layer.
         n_layers = texel_rays.count_cut_out_layers(self._scene)
         texture_channels = []
         radiance = mi.Color3f(0.0)
         coverage = mi.Float(0.0)
-        transmittance = mi.Float(1.0)
+        transmittance = mi.Float(1.0)  # fraction of a ray's light that is left
         for layer in range(n_layers + 1):
-            # camera rays are coherent: neighbours take similar paths
-            si = mitsuba_scene.ray_intersect(ray, ray_flags, layer == 0, active)
+            # Camera rays are coherent: neighbors take similar paths.
+            si = mitsuba_scene.ray_intersect(
+                ray, ray_flags, coherent=layer == 0, active=active
+            )
             is_hit = active & si.is_valid()
-            # fraction of the light of the whole ray; the last layer stops what is left
+            # The last layer stops all light that is left.
             stopped_fraction = transmittance
             if layer < n_layers:
                 opacity = 1.0 - texel_rays.eval_transmittance(si, is_hit)
@@ -293,11 +306,14 @@ class ViewTracer:
             sky_radiance = _look_up_sky(lit, direction, to_local)
             radiance += dr.select(escapes, transmittance * sky_radiance, 0.0)
             coverage += dr.select(is_hit, stopped_fraction / RAYS_PER_PIXEL, 0.0)
-            texture_channels += [
-                si.uv.x,
-                si.uv.y,
-                side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL),
-            ]
+            # The diffuse radiance of a base color c under an irradiance E is
+            # diffuse c E / pi. `side` is 0 where the texture is not hit, so that u and
+            # v there do not matter.
+            texture_weight = (
+                side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL)
+            )
+            texture_channels += [si.uv.x, si.uv.y, texture_weight]
+            # Rays that missed end here: their transmittance is not used again.
             transmittance = transmittance - stopped_fraction
             active = is_hit & (transmittance > MIN_TRANSMITTANCE)
             ray = si.spawn_ray(direction)
@@ -309,42 +325,33 @@ class ViewTracer:
         ]
         return [*pixel_sums, *texture_channels]
 
-    def _make_rays(self, lane: Any, cameras: Any, lens: Any) -> tuple[Any, Any]:
+    def _make_rays(self, lane: Any, camera_numbers: Any, lens: Any) -> tuple[Any, Any]:
         """Return the ray of each lane, and whether the lens has one there.
 
         Args:
             lane: index of each ray; rays are in the order of camera, row, column, and
                 ray of the pixel.
-            cameras: `CAMERA_SIZE` numbers for each camera, flat, as from
+            camera_numbers: `CAMERA_SIZE` numbers for each camera, flat, as from
                 `_make_camera_numbers`.
             lens: four numbers for each ray of an image, as from `_make_lens_table`.
         """
         height, width = self._scene.resolution
-        pixel = lane // RAYS_PER_PIXEL
-        ray_index = lane % RAYS_PER_PIXEL
-        view = pixel // (height * width)
-        pixel = pixel % (height * width)
-        x_offset, y_offset = _select_ray_offset(ray_index)
+        camera_index = lane // RAYS_PER_PIXEL // (height * width)
         camera = [
-            dr.gather(mi.Float, cameras, view * CAMERA_SIZE + index)
+            dr.gather(mi.Float, camera_numbers, camera_index * CAMERA_SIZE + index)
             for index in range(CAMERA_SIZE)
         ]
-        # three numbers for each axis: to the left, up and forward
-        left, up, forward = (camera[start : start + 3] for start in (0, 3, 6))
+        # three numbers for each axis of the camera
+        left = camera[0:3]
+        up = camera[3:6]
+        forward = camera[6:9]
         position = camera[9:12]
         if self._lens is None:
-            half_width, half_height, center_x, center_y = camera[12:]
-            # Columns count from the left and rows from the top. The camera's x points
-            # to the left and its y up, so both are subtracted.
-            column = mi.Float(pixel % width) + x_offset
-            row = mi.Float(pixel // width) + y_offset
-            x = (center_x - 2.0 * column / width) * half_width
-            y = (center_y - 2.0 * row / height) * half_height
-            z = mi.Float(1.0)
+            x, y, z = self._compute_pinhole_direction(lane, camera[12:])
             active = mi.Bool(True)
         else:
-            # the lens's table has four numbers for each ray
-            entry = 4 * (pixel * RAYS_PER_PIXEL + ray_index)
+            # The table, four numbers for each ray, is the same for all cameras.
+            entry = 4 * (lane % (height * width * RAYS_PER_PIXEL))
             x = dr.gather(mi.Float, lens, entry)
             y = dr.gather(mi.Float, lens, entry + 1)
             z = dr.gather(mi.Float, lens, entry + 2)
@@ -354,55 +361,93 @@ class ViewTracer:
         )
         return mi.Ray3f(mi.Point3f(*position), dr.normalize(direction)), active
 
+    def _compute_pinhole_direction(
+        self, lane: Any, film_numbers: Sequence[Any]
+    ) -> tuple[Any, Any, Any]:
+        """Return the direction of each ray of a pinhole in the camera's axes.
+
+        The axes are left, up and forward. The direction has the length 1 forward.
+
+        Args:
+            lane: index of each ray.
+            film_numbers: the last four numbers from `_make_camera_numbers`.
+        """
+        height, width = self._scene.resolution
+        pixel = lane // RAYS_PER_PIXEL % (height * width)
+        x_offset, y_offset = _select_ray_offset(lane % RAYS_PER_PIXEL)
+        half_width, half_height, center_x, center_y = film_numbers
+        # Columns count from the left and rows from the top. The camera's x points to
+        # the left and its y up, so both are subtracted. The center is at 1 of an image
+        # that is 2 wide.
+        column = mi.Float(pixel % width) + x_offset
+        row = mi.Float(pixel // width) + y_offset
+        x = (center_x - 2.0 * column / width) * half_width
+        y = (center_y - 2.0 * row / height) * half_height
+        return x, y, mi.Float(1.0)
+
     def _shade(
         self,
         mitsuba_scene: Any,
         si: Any,
-        valid: Any,
-        d: Any,
+        is_hit: Any,
+        direction: Any,
         tables: Any,
         lit: LightMaps,
     ) -> tuple[Any, Any, Any]:
-        """Shade what a ray in direction d hit.
+        """Shade the surface that each ray hits.
 
         Args:
             mitsuba_scene: the scene.
-            si: the hit.
-            valid: whether there is one.
-            d: unit direction of the ray.
+            si: surface interactions of the rays.
+            is_hit: lanes in which the ray hits a surface.
+            direction: unit directions of the rays.
             tables: tables of `Lobes` of all surfaces, flat.
             lit: the light.
 
         Returns:
-            Its radiance, without what the searched texture reflects diffusely; its
-            diffuse fraction; and 1 on the front of the searched texture, -1 on its
-            back, 0 elsewhere.
+            The radiance of the surface, without what the searched texture reflects
+            diffusely; the diffuse fraction of its reflection; and 1 on the front of the
+            searched texture, -1 on its back, 0 elsewhere.
         """
-        to_local = texel_rays.world_to_map(self._scene)
-        masks = [
-            mask & valid
-            for mask in texel_rays.find_hit_grids(mitsuba_scene, self._grids, si, d)
-        ]
-        # shading normal, turned towards the viewer
-        n = dr.select(dr.dot(si.sh_frame.n, d) > 0.0, -si.sh_frame.n, si.sh_frame.n)
-        cosine = -dr.dot(n, d)
+        to_local = texel_rays.get_world_to_map(self._scene)
+        grid_masks = texel_rays.find_hit_grids(
+            mitsuba_scene, self._grids, si, direction
+        )
+        masks = [mask & is_hit for mask in grid_masks]
+        normal = _turn_to_viewer(si.sh_frame.n, direction)
+        cosine = -dr.dot(normal, direction)
         diffuse, *lobe = self._look_up_lobes(masks, cosine, tables)
         gloss = lobe[0]
 
-        # Diffuse light; that of the searched texture is left to the matrix.
+        # Diffuse light. That of the searched texture is left to the matrix.
         diffuse_radiance = self._look_up_diffuse(si, masks, lit, to_local)
-        side = mi.Float(0.0)
-        for grid, mask in zip(self._grids, masks, strict=True):
-            if not grid.is_ground:  # it is one of the searched texture
-                side = dr.select(mask, -1.0 if grid.face_side < 0 else 1.0, side)
+        side = self._find_texture_side(masks)
         radiance = dr.select(
-            side != 0.0, 0.0, diffuse_radiance * dr.select(valid, diffuse, 1.0)
+            side != 0.0, 0.0, diffuse_radiance * dr.select(is_hit, diffuse, 1.0)
         )
 
-        is_glossy = valid & (gloss > 1e-4)  # less could not be seen
-        reflected = self._reflect(mitsuba_scene, si, d, n, cosine, lobe, is_glossy, lit)
+        is_glossy = is_hit & (gloss > 1e-4)  # less is not visible
+        reflected = self._reflect(
+            mitsuba_scene, si, direction, normal, lobe, is_glossy, lit
+        )
         radiance += dr.select(is_glossy, gloss * reflected, 0.0)
         return radiance, diffuse, side
+
+    def _find_texture_side(self, masks: Sequence[Any]) -> Any:
+        """Return 1 on the front of the searched texture, -1 on its back, else 0.
+
+        All grids but the ground's are on the object, which has the texture.
+
+        Args:
+            masks: for each grid whether a hit is on it.
+        """
+        side = mi.Float(0.0)
+        for grid, mask in zip(self._grids, masks, strict=True):
+            if not grid.is_ground:
+                # A single grid of both sides (0) counts as the front.
+                grid_side = -1.0 if grid.face_side < 0 else 1.0
+                side = dr.select(mask, grid_side, side)
+        return side
 
     def _look_up_lobes(
         self, masks: Sequence[Any], cosine: Any, tables: Any
@@ -412,7 +457,7 @@ class ViewTracer:
         Between its entries a table is interpolated linearly.
 
         Args:
-            masks: for each surface whether it was hit; where none was, the values are
+            masks: for each surface whether it was hit. If none was, the values are
                 those of the first surface.
             cosine: cosine of the angle between the normal and the viewer.
             tables: tables of all surfaces, one after the other, flat.
@@ -421,7 +466,7 @@ class ViewTracer:
             One value for each of `LOBE_TABLES`.
         """
         n_tables = len(texel_rays.LOBE_TABLES)
-        surface_start = mi.UInt32(0)  # where the tables of the surface begin
+        surface_start = mi.UInt32(0)  # first entry of the tables of the surface
         for index, mask in enumerate(masks):
             first_entry = mi.UInt32(index * n_tables * texel_rays.N_ANGLES)
             surface_start = dr.select(mask, first_entry, surface_start)
@@ -443,66 +488,103 @@ class ViewTracer:
         self,
         mitsuba_scene: Any,
         si: Any,
-        d: Any,
-        n: Any,
-        cosine: Any,
+        view_direction: Any,
+        normal: Any,
         lobe: Sequence[Any],
         active: Any,
         lit: LightMaps,
     ) -> Any:
-        """Return the radiance in the gloss of what a ray in direction d hit.
+        """Return the radiance that the gloss of a surface reflects.
 
-        A second ray, in the mean direction of the lobe, finds what is reflected. If it
-        meets the object, that is one texel. If it meets nothing, it is the environment,
-        blurred by the width of the lobe. If it meets the ground, it is a mixture of
-        both: the wider the lobe, the more the blurred environment counts.
+        A second ray, in the mean direction of the lobe, finds what is reflected. If the
+        ray meets the object, that is one texel. If it meets nothing, it is the
+        environment, blurred by the width of the lobe. If it meets the ground, it is a
+        mixture of both: the wider the lobe, the more the blurred environment counts.
 
         Args:
             mitsuba_scene: the scene.
-            si: the hit.
-            d: unit direction of the ray.
-            n: unit shading normal, towards the viewer.
-            cosine: cosine of the angle of view.
-            lobe: gloss, up, along, core and tail of `Lobes` at that cosine.
-            active: whether there is any gloss.
+            si: surface interactions of the rays that hit the surface.
+            view_direction: unit directions of these rays.
+            normal: unit shading normals, towards the viewer.
+            lobe: gloss, up, along, core and tail of `Lobes` at the angle of view.
+            active: lanes in which there is any gloss.
             lit: the light.
         """
-        _, up, along, core, tail = lobe
-        to_local = texel_rays.world_to_map(self._scene)
-        # The part of d along the surface. 1e-8: a ray along the normal has none, and
-        # normalising zeros would give NaN.
-        tangent = dr.normalize(d + n * cosine + 1e-8)
-        direction = dr.normalize(n * up + tangent * along)
+        _gloss, up, along, core, tail = lobe
+        cosine = -dr.dot(normal, view_direction)
+        # The part of the direction along the surface. A ray along the normal has none,
+        # and without the 1e-8 its zeros would be normalized to NaN.
+        tangent = dr.normalize(view_direction + normal * cosine + 1e-8)
+        direction = dr.normalize(normal * up + tangent * along)
         hit = texel_rays.find_opaque_hits(
             mitsuba_scene,
-            mi.Ray3f(si.p + n * texel_rays.RAY_OFFSET, direction),
+            mi.Ray3f(si.p + normal * texel_rays.RAY_OFFSET, direction),
             texel_rays.count_cut_out_layers(self._scene),
             active=active,
         )
         masks = texel_rays.find_hit_grids(mitsuba_scene, self._grids, hit, direction)
-        map_direction = self._correct_parallax(si, direction)
-        # half of the gloss is in the core of the lobe, half in its tail
-        blurred = 0.5 * sum(
-            _look_up_blurred(lit, map_direction, to_local, spread, self._widths)
-            for spread in (core, tail)
-        )
+        blurred = self._look_up_lobe(si, direction, core, tail, lit)
         texel = self._look_up_texel(hit, masks, lit)
-
         is_ground = mi.Bool(False)
         for grid, mask in zip(self._grids, masks, strict=True):
             is_ground |= mask & grid.is_ground
-        # A wide lobe reflects much of the ground, but one ray meets a single point of
-        # it. So the wider the lobe, the more the blurred map of the surroundings
-        # counts. It is scaled by how much darker the ground is at this point than far
-        # away.
-        far_ground = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
-        darkening = texel / _gather_color(lit.texels, far_ground)
-        ground = self._look_up_diffuse(hit, masks, lit, to_local)
-        wideness = _compute_wideness(core, tail)
-        blended_ground = ground + wideness * (blurred * darkening - ground)
-        return dr.select(
-            hit.is_valid(), dr.select(is_ground, blended_ground, texel), blurred
+        # The same texel, which is the ground's where the ray meets that.
+        ground = self._blend_ground(hit, masks, texel, blurred, (core, tail), lit)
+        surface = dr.select(is_ground, ground, texel)
+        return dr.select(hit.is_valid(), surface, blurred)
+
+    def _look_up_lobe(
+        self, si: Any, direction: Any, core: Any, tail: Any, lit: LightMaps
+    ) -> Any:
+        """Return the radiance of the blurred surroundings in a lobe.
+
+        Half of the gloss is in the core of the lobe, half in its tail.
+
+        Args:
+            si: surface interactions from which the lobes go out.
+            direction: mean directions of the lobes.
+            core, tail: angles by which both halves spread, radians.
+            lit: the light.
+        """
+        to_local = texel_rays.get_world_to_map(self._scene)
+        map_direction = self._correct_parallax(si, direction)
+        return 0.5 * sum(
+            _look_up_blurred(lit, map_direction, to_local, spread, self._widths)
+            for spread in (core, tail)
         )
+
+    def _blend_ground(
+        self,
+        hit: Any,
+        masks: Sequence[Any],
+        texel: Any,
+        blurred: Any,
+        spreads: tuple[Any, Any],
+        lit: LightMaps,
+    ) -> Any:
+        """Return the radiance that a lobe reflects of the ground.
+
+        A wide lobe reflects much of the ground, but one ray meets a single point of it.
+        So the wider the lobe, the more the blurred map of the surroundings counts. It
+        is multiplied by the brightness of the ground at this point, which the object
+        may shade, relative to that far away.
+
+        Args:
+            hit: surface interactions of the reflected rays.
+            masks: for each grid whether the hit is on it.
+            texel: value of the texel that is hit.
+            blurred: radiance of the blurred surroundings in the lobe.
+            spreads: angles by which core and tail of the lobe spread, radians.
+            lit: the light.
+        """
+        # The cell after those of all grids is the ground far away.
+        far_cell = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
+        far_texel = _gather_color(lit.texels, far_cell)
+        relative_brightness = texel / far_texel
+        to_local = texel_rays.get_world_to_map(self._scene)
+        ground = self._look_up_diffuse(hit, masks, lit, to_local)
+        wideness = _compute_wideness(*spreads)
+        return ground + wideness * (blurred * relative_brightness - ground)
 
     def _correct_parallax(self, si: Any, direction: Any) -> Any:
         """Return the direction in which to look up the blurred maps for a ray from a
@@ -531,7 +613,7 @@ class ViewTracer:
             si: the hit.
             masks: for each grid whether the hit is on it.
             lit: the light.
-            to_local: rotation from the world to the map, as from `world_to_map`.
+            to_local: rotation from the world to the map, as from `get_world_to_map`.
         """
         radiance = self._look_up_texel(si, masks, lit)
         if self._photograph_height is not None:
@@ -545,11 +627,15 @@ class ViewTracer:
     def _look_up_texel(self, si: Any, masks: Sequence[Any], lit: LightMaps) -> Any:
         """Look up the radiance of the texels around a hit, bilinearly; 0 on no grid.
 
+        `LightMaps.texels` holds a color for each cell of all grids.
+
         Args:
-            si: the hit.
+            si: surface interaction of the hit.
             masks: for each grid whether the hit is on it.
             lit: the light.
         """
+        # The grid of each lane. Without one, these are those of a single cell, whose
+        # color is replaced by 0 in the end.
         first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
         n_columns = mi.UInt32(1)
@@ -564,7 +650,8 @@ class ViewTracer:
             first_cell = dr.select(mask, mi.UInt32(grid.first_cell), first_cell)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
-        # integers at the centers of cells
+        # y and x are fractions of the grid's height and width. Rows and columns are
+        # integers at the centers of cells.
         row = y * mi.Float(n_rows) - 0.5
         column = x * mi.Float(n_columns) - 0.5
         radiance = _look_up_bilinear(
@@ -573,14 +660,21 @@ class ViewTracer:
         return dr.select(on_any_grid, radiance, 0.0)
 
 
+def _turn_to_viewer(normal: Any, direction: Any) -> Any:
+    """Return normals turned over where a ray in a direction comes from behind."""
+    is_from_behind = dr.dot(normal, direction) > 0.0
+    return dr.select(is_from_behind, -normal, normal)
+
+
 def _make_camera_numbers(
     inputs: Mapping[str, Tensor], height: int, width: int
 ) -> Float32Array:
     """Return the `CAMERA_SIZE` numbers of a camera as the kernel takes them.
 
     They are its axes to the left, up and forward (9 numbers), its position (3), half
-    its extent along x and y at distance 1 (2), and the image's center along x and y
-    (2). The last four are used only for a pinhole.
+    the width and half the height of the image at distance 1 (2), and the x and y of the
+    image's center (2), which are 1 without a shift. The last four are used only for a
+    pinhole.
 
     Args:
         inputs: the camera's inputs: `camera.to_world` (4, 4), and for a pinhole
@@ -591,12 +685,17 @@ def _make_camera_numbers(
     half_tangent = 0.0
     if "camera.fov" in inputs:
         half_tangent = math.tan(math.radians(float(inputs["camera.fov"])) / 2.0)
-    larger_side = max(height, width)
     # The field of view is along the larger side.
-    extent = [half_tangent * size / larger_side for size in (width, height)]
+    larger_side = max(height, width)
+    half_extent = [half_tangent * size / larger_side for size in (width, height)]
+    # The viewing axis meets the image at 0.5 - shift of its width and height. The image
+    # is 2 wide here.
     shifts = [float(inputs.get(f"camera.shift_{axis}", 0.0)) for axis in "xy"]
     center = [1.0 - 2.0 * shift for shift in shifts]
-    return np.concatenate([matrix[:3, :3].T.ravel(), matrix[:3, 3], extent, center])
+    # The columns of the matrix are the axes. Transposed, they follow one another.
+    axes = matrix[:3, :3].T.ravel()
+    position = matrix[:3, 3]
+    return np.concatenate([axes, position, half_extent, center])
 
 
 def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
@@ -611,18 +710,23 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
         size: number of cameras, rows and columns.
     """
     with mitsuba_lock:
+        # The first channels are three of radiance, and the coverage.
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
+        coverage = channels[3].numpy().copy()
+        # u, v and weight of the first layer, then those of the next one
         layer_channels = [channel.numpy() for channel in channels[N_IMAGE_CHANNELS:]]
         n_layers = len(layer_channels) // 3
         # each (rays x layers,), all layers of a ray side by side
         u, v, weight = (
             np.stack(layer_channels[index::3], axis=1).ravel() for index in range(3)
         )
-        (hits,) = np.nonzero(weight)  # index of the ray times layers, plus the layer
+        (hits,) = np.nonzero(weight)
+        # A hit is an index into these: ray * n_layers + layer.
+        ray = hits // n_layers
         return ViewSamples(
             radiance=torch.from_numpy(radiance).reshape(*size, 3),
-            coverage=torch.from_numpy(channels[3].numpy().copy()).reshape(*size, 1),
-            sample=torch.from_numpy(hits // n_layers),
+            coverage=torch.from_numpy(coverage).reshape(*size, 1),
+            sample=torch.from_numpy(ray),
             uv=torch.from_numpy(np.stack([u[hits], v[hits]], axis=1)),
             weight=torch.from_numpy(np.abs(weight[hits])),
             is_back=torch.from_numpy(weight[hits] < 0.0),
@@ -639,11 +743,11 @@ def _look_up_bilinear(
     *,
     wraps: bool = False,
 ) -> Any:
-    """Look a color up between the four nearest cells of a grid.
+    """Interpolate a color between the four nearest cells of a grid.
 
     Args:
-        values: flat array with three numbers for each cell.
-        first_cell: index of the grid's first cell in it.
+        values: flat array of colors, with four numbers for each cell.
+        first_cell: index of the grid's first cell in that array.
         n_rows, n_columns: number of rows and number of columns of the grid.
         y, x: row and column, integers at the centers of cells.
         wraps: whether the last column is next to the first; otherwise the grid ends at
@@ -691,27 +795,29 @@ def _compute_wideness(core: Any, tail: Any) -> Any:
 
 
 def _gather_color(values: Any, index: Any) -> Any:
-    """Return the color that begins at each index of a flat array.
+    """Return the colors with indices in a flat array, which has four numbers for each.
 
-    Four numbers are gathered, which is faster on the processor than three.
+    The last number is not used. To gather four is faster on the processor than three.
     """
     return mi.Color3f(*dr.gather(mi.Vector4f, values, index)[:3])
 
 
 def _look_up_sky(lit: LightMaps, direction: Any, to_local: Any) -> Any:
-    """Look the environment up in a direction, as Mitsuba does.
+    """Look up the environment in a direction, as Mitsuba does.
 
-    The first row is one pole and the last row the other. The map has a copy of the
-    opposite column at each end, so that a look-up there needs no wrapping.
+    The first row of the map is centered at one pole, the last row at the other. The map
+    has a copy of the opposite column at each end, so that a look-up there needs no
+    wrapping.
 
     Args:
         lit: the light.
         direction: unit directions in the world.
-        to_local: rotation from the world to the map, as from `world_to_map`.
+        to_local: rotation from the world to the map, as from `get_world_to_map`.
     """
     n_rows, n_columns = lit.sky_shape
     x, y = texel_rays.compute_map_position(direction, to_local)
-    # without the two copies, of which the one at the left is column 0
+    # n - 2 columns without the copies; + 1 for the copy at the left, and - 0.5 to the
+    # center of a column
     column = x * (n_columns - 2) + 0.5
     row = y * (n_rows - 1)
     return _look_up_bilinear(
@@ -731,7 +837,7 @@ def _look_up_blurred(
     Args:
         lit: the light, with the blurred maps.
         direction: unit directions in the world.
-        to_local: rotation from the world to the map, as from `world_to_map`.
+        to_local: rotation from the world to the map, as from `get_world_to_map`.
         spread: the angle, one in each lane.
         widths: root mean square angles of the maps, radians.
     """

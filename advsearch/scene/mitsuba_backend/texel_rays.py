@@ -1,8 +1,8 @@
 """Trace rays from texels, find positions in grids and maps, and measure surfaces.
 
 A grid of texels is laid over each surface (`TexelGrid`). What the texels see of each
-other and of the environment does not depend on the light. `Lobes` are tables of what a
-surface does to light over the angle of view.
+other and of the environment does not depend on the light. `Lobes` are tables of the
+reflection of a surface by the angle of view.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi, mitsuba_lock
 
 Ints = npt.NDArray[np.int32]
 Grids: TypeAlias = "Sequence[TexelGrid]"
-RAY_OFFSET = 1e-4  # how far from a surface rays begin, object sizes
+RAY_OFFSET = 1e-4  # distance from a surface at which rays begin, object sizes
 RAYS_PER_LAUNCH = 1 << 20  # rays of one launch of `trace_texel_rays`
 N_OUTSIDE_RAYS = 1 << 13  # rays of `is_visible_from_behind`: enough for a percent
-# cut-outs that a ray goes through; what comes after them is taken for opaque
+# largest number of cut-outs that a ray goes through; the next surface stops it
 MAX_CUT_OUT_LAYERS = 4
-# fraction of hits from outside on the backs of a shape's faces above which backs count
+# Backs of a shape's faces count as visible if more than this fraction of the hits from
+# outside is on backs.
 MIN_BACK_FRACTION = 0.02
 
 
 @dataclass(frozen=True)
 class TexelGrid:
-    """The texels over one surface, of a shape in Mitsuba's scene."""
+    """Grid of texels over one surface: a shape in Mitsuba's scene."""
 
-    name: str
+    name: str  # name of the shape
     first_cell: int  # index of its first cell among the cells of all grids
     shape: tuple[int, int]  # rows and columns
-    # None where it lies over texture coordinates; else (center x, center y, scale,
-    # rate) of a level plane whose cells are small about its center: coordinate = center
-    # + scale sinh(rate s), s in [-1, 1]
+    # None for a grid over texture coordinates. For a grid over a level ground, (center
+    # x, center y, scale, rate): its cells are small at the center, with coordinate =
+    # center + scale sinh(rate s), s in [-1, 1]
     warp: tuple[float, float, float, float] | None = None
-    face_side: int = (
-        0  # side of the faces that it lies on: 1 the front, -1 the back, 0 both
-    )
+    # side of the faces that the grid is on: 1 the front, -1 the back, 0 both
+    face_side: int = 0
 
     @property
     def is_ground(self) -> bool:
-        """Whether it lies over a ground, and not over texture coordinates."""
+        """Whether the grid is over a ground, and not over texture coordinates."""
         return self.warp is not None
 
     @property
@@ -69,8 +69,8 @@ def trace_texel_rays(
 ) -> Ints:
     """Trace cosine-weighted rays from texels and return what they meet.
 
-    All texels have the same well-spread points on the hemisphere, each shifted at
-    random.
+    All texels have the same well-spread points on the hemisphere, shifted at random for
+    each texel.
 
     Args:
         scene: the scene, with its inputs set.
@@ -134,7 +134,7 @@ def _find_sky_cell(
         sky_shape: rows and columns of the environment's cells, counted row by row.
     """
     n_rows, n_columns = sky_shape
-    column, row = compute_map_position(direction, world_to_map(scene))
+    column, row = compute_map_position(direction, get_world_to_map(scene))
     sky_column = mi.UInt32(column * n_columns) % n_columns
     sky_row = mi.UInt32(dr.minimum(row * n_rows, n_rows - 1))
     return sky_row * n_columns + sky_column
@@ -176,7 +176,7 @@ def _trace_batch(
     n_layers = count_cut_out_layers(scene)
     direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(square))
     ray = mi.Ray3f(position + normal * RAY_OFFSET, direction)
-    thresholds = _sample_chances(n_layers, dr.width(square), seed)
+    thresholds = _sample_thresholds(n_layers, dr.width(square), seed)
     si = find_opaque_hits(mitsuba_scene, ray, n_layers, thresholds)
 
     # Rays that leave the scene meet a cell of the environment. Its cells are counted
@@ -188,9 +188,10 @@ def _trace_batch(
     # Other rays meet a texel, or a shape without texels, which counts as dark (-1).
     masks = find_hit_grids(mitsuba_scene, grids, si, direction)
     for grid, is_hit in zip(grids, masks, strict=True):
-        if not grid.is_ground and grid.face_side == 0:
-            # A surface with a single grid has texels on its fronts only; hits on its
-            # backs stay -1.
+        has_single_grid = not grid.is_ground and grid.face_side == 0
+        if has_single_grid:
+            # `find_hit_grids` accepts both sides of a face. The texels of a single grid
+            # have the light of the front only, so that hits on the back stay -1.
             is_hit &= dr.dot(si.n, direction) < 0.0
         met = dr.select(is_hit, _find_nearest_cell(grid, si), met)
     return met
@@ -202,44 +203,48 @@ def compute_visible_cosines(
     normals: Float32Array,
     directions: Float32Array,
 ) -> Float32Array:
-    """Return how much light from given directions arrives at texels.
+    """Return how much light from several directions arrives at texels.
 
-    That is the cosine to the normal, times the fraction of light that passes cut-outs.
+    It is the cosine to the normal, times the fraction of light that passes cut-outs.
 
     Args:
         scene: the scene, with its inputs set.
-        positions, normals: (n, 3) of the texels, with unit shading normals.
+        positions, normals: (n, 3) positions and unit shading normals of the texels.
         directions: (k, 3) unit vectors in the axes of the environment's map.
 
     Returns:
-        (n, k) cosines; 0 where something is in between.
+        (n, k) cosines; 0 where something blocks the light.
     """
-    # a row times the rotation is turned by its inverse: from the map to the world
-    world_directions = (directions @ np.array(world_to_map(scene))).astype(np.float32)
-    lane = dr.arange(mi.UInt32, len(positions) * len(world_directions))
-    texel = lane // len(world_directions)
+    # A row vector times the rotation is turned from the map to the world.
+    world_to_map = np.array(get_world_to_map(scene))
+    world_directions = (directions @ world_to_map).astype(np.float32)
+    n_directions = len(world_directions)
+    lane = dr.arange(mi.UInt32, len(positions) * n_directions)
+    texel = lane // n_directions
     position = _to_drjit_points(mi.Point3f, positions, texel)
     normal = _to_drjit_points(mi.Normal3f, normals, texel)
-    direction = _to_drjit_points(
-        mi.Vector3f, world_directions, lane % len(world_directions)
-    )
+    direction = _to_drjit_points(mi.Vector3f, world_directions, lane % n_directions)
     cosine = dr.dot(normal, direction)
     is_above = cosine > 0.0
-    active = is_above
+    active = is_above  # light from below the surface does not count
     ray = mi.Ray3f(position + normal * RAY_OFFSET, direction)
     transmittance = mi.Float(1.0)
+    # A ray that meets nothing is free, and has its transmittance.
     for _ in range(count_cut_out_layers(scene)):
-        si = scene._scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
+        si = scene._scene.ray_intersect(
+            ray, mi.RayFlags.UV, coherent=False, active=active
+        )
         active = active & si.is_valid()
         transmittance = dr.select(
             active, transmittance * eval_transmittance(si, active), transmittance
         )
         active = active & (transmittance > 0.0)
         ray = si.spawn_ray(ray.d)
+    # What is left of a ray after all layers is stopped by any further surface.
     is_blocked = scene._scene.ray_test(ray, active)
     transmittance = dr.select(is_blocked, 0.0, transmittance)
     received = dr.select(is_above, cosine * transmittance, 0.0)
-    return np.asarray(received.numpy().reshape(len(positions), len(world_directions)))
+    return np.asarray(received.numpy().reshape(len(positions), n_directions))
 
 
 def is_visible_from_behind(
@@ -258,14 +263,16 @@ def is_visible_from_behind(
     """
     ray = _sample_outside_rays(positions)
     n_layers = count_cut_out_layers(scene)
-    chances = _sample_chances(n_layers, N_OUTSIDE_RAYS, (0,))
-    si = find_opaque_hits(scene._scene, ray, n_layers, chances)
-    # a grid of both sides, whose cells play no part
-    grid = TexelGrid(name, first_cell=0, shape=(1, 1))
+    thresholds = _sample_thresholds(n_layers, N_OUTSIDE_RAYS, seed=(0,))
+    si = find_opaque_hits(scene._scene, ray, n_layers, thresholds)
+    # `find_hit_grids` finds the hits on the shape by a grid; its cells do not matter.
+    grid = TexelGrid(name, first_cell=0, shape=(1, 1), face_side=0)
     (is_hit,) = find_hit_grids(scene._scene, [grid], si, ray.d)
+    # The normal `si.n` is that of the face, which is not turned towards the ray.
     is_back = is_hit & (dr.dot(si.n, ray.d) > 0.0)
     n_hits = np.asarray(is_hit.numpy()).sum()
-    return bool(np.asarray(is_back.numpy()).sum() > MIN_BACK_FRACTION * n_hits)
+    n_back_hits = np.asarray(is_back.numpy()).sum()
+    return bool(n_back_hits > MIN_BACK_FRACTION * n_hits)
 
 
 def _sample_outside_rays(positions: Float32Array) -> Any:
@@ -288,28 +295,32 @@ def count_cut_out_layers(scene: MitsubaScene) -> int:
 
 
 def find_opaque_hits(
-    mitsuba_scene: Any, ray: Any, n_layers: int, chance: Any = 0.5, active: Any = True
+    mitsuba_scene: Any,
+    ray: Any,
+    n_layers: int,
+    threshold: Any = 0.5,
+    active: Any = True,
 ) -> Any:
     """Return the first hits of rays that stop them; rays pass transparent cut-outs.
 
     A ray goes on while the fraction of light that passes everything it has met is
-    larger than `chance`. Random chances let rays pass as often as light does; 0.5 lets
-    a ray pass where most light does.
+    larger than `threshold`. Random thresholds let rays pass as often as light does; 0.5
+    lets a ray pass where most light does.
 
     Args:
         mitsuba_scene: the scene.
         ray: the rays.
-        n_layers: how many cut-outs a ray passes at most.
-        chance: one number in [0, 1], or one for each ray.
+        n_layers: largest number of cut-outs that a ray passes.
+        threshold: one number in [0, 1], or one for each ray.
         active: lanes that are traced.
     """
-    si = mitsuba_scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
+    si = mitsuba_scene.ray_intersect(ray, mi.RayFlags.UV, coherent=False, active=active)
     transmittance = mi.Float(1.0)
     for _ in range(n_layers):
         transmittance *= eval_transmittance(si, active)
-        active = active & si.is_valid() & (transmittance > chance)
+        active = active & si.is_valid() & (transmittance > threshold)
         next_hit = mitsuba_scene.ray_intersect(
-            si.spawn_ray(ray.d), mi.RayFlags.UV, False, active
+            si.spawn_ray(ray.d), mi.RayFlags.UV, coherent=False, active=active
         )
         si = dr.select(active, next_hit, si)
     return si
@@ -320,9 +331,9 @@ def eval_transmittance(si: Any, active: Any) -> Any:
     return dr.mean(si.bsdf().eval_null_transmission(si, active & si.is_valid()))
 
 
-def _sample_chances(n_layers: int, count: int, seed: tuple[int, ...]) -> Any:
-    """Return a random number in [0, 1) for each ray, if there are cut-outs."""
-    if not n_layers:
+def _sample_thresholds(n_layers: int, count: int, seed: tuple[int, ...]) -> Any:
+    """Return a random threshold in [0, 1) for each ray, see `find_opaque_hits`."""
+    if not n_layers:  # there are no cut-outs, and the threshold is not used
         return 0.5
     generator = np.random.default_rng([*seed, 1])
     return mi.Float(generator.random(count, dtype=np.float32))
@@ -338,11 +349,13 @@ def find_hit_grids(
     Args:
         mitsuba_scene: the scene.
         grids: the grids.
-        si: the hits.
-        direction: unit directions of the rays, which tell front from back.
+        si: surface interactions of the hits.
+        direction: unit directions of the rays. A ray against the normal hits the front
+            of a face.
     """
     is_front = dr.dot(si.n, direction) < 0.0
     shapes = {shape.id(): shape for shape in mitsuba_scene.shapes()}
+    # by `TexelGrid.face_side`; 0 accepts both sides
     side_masks = {0: True, 1: is_front, -1: ~is_front}
     return [
         si.is_valid()
@@ -352,21 +365,22 @@ def find_hit_grids(
     ]
 
 
-def world_to_map(scene: MitsubaScene) -> Any:
+def get_world_to_map(scene: MitsubaScene) -> Any:
     """Return the rotation from the world to the axes of the environment's map.
 
-    It is a list of three rows: the transpose, which is the inverse, of the rotation of
-    the scene's input `environment.to_world`.
+    It is a list of three rows of floats, which kernels read as constants: the transpose
+    of the rotation `environment.to_world`, which is its inverse.
     """
     matrix = scene.parameters["environment.to_world"].matrix
-    return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T.tolist()
+    map_to_world = np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    return map_to_world.T.tolist()
 
 
 def compute_map_position(direction: Any, to_local: Any) -> tuple[Any, Any]:
     """Return where a direction lies in the environment's map.
 
     The position is a fraction of the map's width and one of its height, from the left
-    and from the top, which is straight up; `to_local` is that of `world_to_map`.
+    and from the top, which is straight up; `to_local` is that of `get_world_to_map`.
     """
     x, y, z = (
         row[0] * direction.x + row[1] * direction.y + row[2] * direction.z
@@ -433,24 +447,26 @@ LOBE_TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")
 class Lobes:
     """Reflectance and gloss of a surface by the cosine of the angle of view.
 
-    Each table has `N_ANGLES` entries, the first at grazing angles.
+    Each table has `N_ANGLES` entries, the first at grazing angles. The gloss is a lobe
+    around a mean direction. Half of its light is in the core of the lobe, nearer to
+    that direction, and half in its tail: a lobe has longer tails than a normal
+    distribution.
     """
 
-    # (k,) fraction of even light that it reflects for a base color of one, without the
-    # gloss
+    # (k,) fraction of even light that is reflected diffusely for a base color of 1
     diffuse: Float32Array
-    gloss: Float32Array  # (k,) fraction of even light reflected whatever the base color
+    gloss: Float32Array  # (k,) fraction of even light reflected for any base color
     up: Float32Array  # (k,) component of the gloss's mean direction along the normal
-    along: Float32Array  # (k,) and its component away from the viewer
-    # (k,) root mean square angle about that direction, radians, of the nearer half of
-    # the gloss
-    core: Float32Array
-    # (k,) and of the other half: a lobe has longer tails than a normal distribution
-    tail: Float32Array
+    along: Float32Array  # (k,) its component along the surface, away from the viewer
+    core: Float32Array  # (k,) root mean square angle about it in the core, radians
+    tail: Float32Array  # (k,) root mean square angle about it in the tail, radians
 
     @classmethod
     def make_diffuse(cls) -> Lobes:
-        """Return the tables of a diffuse surface: no gloss, at any angle of view."""
+        """Return the tables of a diffuse surface: no gloss, at any angle of view.
+
+        Since there is no gloss, its direction has no effect. It is the normal.
+        """
         ones = np.ones(N_ANGLES, dtype=np.float32)
         zeros = np.zeros(N_ANGLES, dtype=np.float32)
         return cls(
@@ -460,18 +476,24 @@ class Lobes:
     @property
     def mean_reflectances(self) -> tuple[float, float]:
         """Diffuse and glossy fractions under even light, over all angles of view."""
+        # proportional to the cosine, with the sum 1
         weight = (np.arange(N_ANGLES) + 0.5) * 2.0 / N_ANGLES**2
         return float((weight * self.diffuse).sum()), float((weight * self.gloss).sum())
 
 
 class _BsdfSamples(NamedTuple):
-    """Samples of a BSDF, each (N_ANGLES, N_LOBE_SAMPLES) float64."""
+    """Samples of a BSDF, each (N_ANGLES, N_LOBE_SAMPLES) float64.
 
-    grey: Float64Array  # value over a cosine density, for a base color of 0.5
-    black: Float64Array  # the same for a base color of 0
-    weight: Float64Array  # weight of a sampled direction, for a base color of 0
-    x: Float64Array  # its component in the plane of view, towards the viewer
-    z: Float64Array  # its component along the normal
+    `grey` and `black` are values at directions sampled by the cosine, divided by the
+    density. `weight`, `x` and `z` belong to directions sampled by the BSDF of the black
+    surface, which only has gloss.
+    """
+
+    grey: Float64Array  # for a base color of 0.5
+    black: Float64Array  # for a base color of 0
+    weight: Float64Array  # value over density of the direction; its mean is the gloss
+    x: Float64Array  # component of the direction along the surface, towards the viewer
+    z: Float64Array  # component of the direction along the normal
 
 
 def measure_lobes(
@@ -502,23 +524,28 @@ def measure_lobes(
 
     # Without gloss the mirrored direction stands for the lobe's mean direction.
     no_gloss = gloss < 1e-6
-    along = np.where(
+    towards_viewer = np.where(
         no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
     )
     up = np.where(no_gloss, cosine, mean_z / np.maximum(length, 1e-12))
     # The squared angle from each sample to the mean direction, approximated by the
     # squared distance of unit vectors, 2 - 2 cos(angle).
     squared_angle = 2.0 * np.maximum(
-        0.0, 1.0 - samples.x * along[:, None] - samples.z * up[:, None]
+        0.0, 1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
     # The base colors were 0.5 and 0. What the grey surface reflects more than the black
     # one is the diffuse part; dividing by 0.5 gives it for a base color of 1.
     by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
     diffuse = np.maximum(by_color, 0.0) / 0.5
-    # the viewer is at positive x, and `Lobes.along` is away from the viewer
-    tables = (diffuse, gloss, up, -along, core, tail)
-    return Lobes(*(table.astype(np.float32) for table in tables))
+    return Lobes(
+        diffuse=diffuse.astype(np.float32),
+        gloss=gloss.astype(np.float32),
+        up=up.astype(np.float32),
+        along=(-towards_viewer).astype(np.float32),
+        core=core.astype(np.float32),
+        tail=tail.astype(np.float32),
+    )
 
 
 def _sample_bsdf(
@@ -531,8 +558,8 @@ def _sample_bsdf(
 ) -> _BsdfSamples:
     """Sample the BSDF at a point for each cosine (N_ANGLES,) of the angle of view.
 
-    Values are divided by the fraction of light that a cut-out stops, so that they are
-    those of an opaque surface. The same random numbers serve both base colors.
+    Values are divided by the opacity, so that they are those of a surface without
+    cut-outs. The same random numbers are used for both base colors, 0.5 and 0.
 
     Args:
         scene: the scene.
@@ -563,13 +590,14 @@ def _sample_bsdf(
     bsdf = si.bsdf()
     opacity = _eval_opacity(si)
     black = dr.mean(bsdf.eval(context, si, cosine_direction) / opacity)
-    # What is transmitted, below the surface, is no gloss.
+    # A direction below the surface (z < 0) is transmitted, and is no gloss.
     bsdf_sample, bsdf_weight = bsdf.sample(context, si, sample1, sample2)
     is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
     weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
     weight = dr.select(dr.isfinite(weight), weight, 0.0)
 
-    # with which the directions of `grey` and `black` were sampled
+    # density of `cosine_direction`, by which the values of `grey` and `black` are
+    # divided
     density = _to_table(cosine_direction.z.numpy() / math.pi)
     return _BsdfSamples(
         grey=_to_table(grey.numpy()) / density,
@@ -614,12 +642,12 @@ def _hit_point(
         position, normal: (3,) the point and its unit normal.
         to_viewer: unit vectors in the frame of the surface, one for each lane.
     """
-    # 1e-3: so near that nothing else is in between
+    # The ray starts so near to the point that nothing else is in between.
     start = mi.Point3f([float(x) for x in position + 1e-3 * normal])
     ray = mi.Ray3f(start, mi.Vector3f([float(-x) for x in normal]))
-    # the same ray in every lane
-    first_lane = dr.zeros(mi.UInt32, dr.width(to_viewer))
-    si = mitsuba_scene.ray_intersect(dr.gather(mi.Ray3f, ray, first_lane))
+    # The ray has one lane. To gather lane 0 in every lane copies it to all of them.
+    lane_zero = dr.zeros(mi.UInt32, dr.width(to_viewer))
+    si = mitsuba_scene.ray_intersect(dr.gather(mi.Ray3f, ray, lane_zero))
     si.wi = to_viewer
     return si
 
@@ -642,9 +670,11 @@ def _measure_spreads(
     weight = np.take_along_axis(weight, order, axis=1)
     squared_angle = np.take_along_axis(squared_angle, order, axis=1)
     total = weight.sum(axis=1, keepdims=True)
-    # Weight of all samples with smaller angles. The first half takes samples in this
-    # order until it has half of the total.
+    # weight of all samples with smaller angles
     weight_before = weight.cumsum(axis=1) - weight
+    # The first half takes samples in this order until it has half of the total. So a
+    # sample counts there by what is missing of that half before it: by its full weight,
+    # or by a part of it at the median, or by 0.
     inner_weight = np.clip(0.5 * total - weight_before, 0.0, weight)
     half_weight = np.maximum(0.5 * total[:, 0], 1e-12)
     core = np.sqrt((inner_weight * squared_angle).sum(axis=1) / half_weight)

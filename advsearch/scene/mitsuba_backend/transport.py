@@ -1,5 +1,5 @@
-"""Collect light transport: how each vertex of a light path changes its pixel when a
-base color changes.
+"""Collect light transport: the change of a pixel by the base color at each vertex of
+its light paths.
 
 One pass traces the paths of an image as the path integrator does (next-event
 estimation and BSDF sampling, weighted by the power heuristic; Veach 1997, section 9.2)
@@ -14,9 +14,9 @@ evaluated once more with all texels `COLOR_STEP` larger. For a base color in whi
 BSDF is affine (the diffuse and the metallic lobe of the principled BSDF) that is exact.
 Dr.Jit's forward mode finds the same, at the price of more kernels. For a projector's
 image, the weight is that of white projected light at the vertex. The whole path is one
-kernel, which also makes the image itself and what guides its denoiser.
+kernel, which also computes the image itself and the guides of its denoiser.
 
-`find_first_hits` finds what the camera sees first.
+`find_first_hits` finds the surface that the camera sees first in each pixel.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Vertices:
     # (n, 3) float32, divided by the samples per pixel, so that a pixel's sum is what
     # counts
     weight: Tensor
-    # (n,) bool: the camera sees it directly, or through mirrors and glass
+    # (n,) bool: the camera sees the vertex directly, or through mirrors and clear glass
     is_sharp: Tensor
 
     def select(self, mask: Tensor) -> Vertices:
@@ -101,7 +101,7 @@ def collect_paths(
     """Trace one pass of light paths and collect their vertices.
 
     It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel. The
-    parameter `key` is changed on the way, and has its value again at the end. Radiance
+    parameter `key` is changed in between, and has its value again at the end. Radiance
     that is not finite is replaced by zero.
 
     Args:
@@ -114,26 +114,31 @@ def collect_paths(
         depth: maximum length of a path in segments.
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
-        unseen: Mitsuba's shape that camera rays see nothing of, nor behind it.
-        roulette_depth: bounces from which on Russian roulette may end a path; None
-            where it never does.
+        unseen: Mitsuba's shape that is black to camera rays, with everything behind
+            it; None if there is none.
+        roulette_depth: bounces from which on Russian roulette may end a path; None if
+            it never does.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     if unseen is not None:
         weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
-    first_hit, emitted, bounces = _trace_paths(
+    first_hit_channels, emitted, bounces = _trace_paths(
         scene, ray, weight, noise, depth, roulette_depth or depth
     )
 
     if projector is None:
         slopes = _compute_slopes(parameters, key, bounces)
-        L, vertices = _accumulate_radiance(bounces, emitted, slopes)
+        reflected, vertices = _accumulate_radiance(bounces, emitted, slopes)
     else:
         vertices = _light_by_projector(scene, parameters, key, projector, bounces)
-        L, _ = _accumulate_radiance(bounces, emitted, [(0.0, 0.0)] * len(bounces))
-    L = dr.select(dr.isfinite(L), L, 0.0)
-    channels = [*(L + emitted[0]), *first_hit]
-    return _fetch_paths(channels, vertices, size, spp)
+        # Only the radiance is used here: the weights are those of projected light.
+        no_slopes = [(0.0, 0.0)] * len(bounces)
+        reflected, _ = _accumulate_radiance(bounces, emitted, no_slopes)
+    reflected = dr.select(dr.isfinite(reflected), reflected, 0.0)
+    # `emitted[0]` is what the camera sees directly: emission of the first hit, or the
+    # environment.
+    radiance = reflected + emitted[0]
+    return _fetch_paths([*radiance, *first_hit_channels], vertices, size, spp)
 
 
 def _compute_slopes(
@@ -158,9 +163,9 @@ def _light_by_projector(
 ) -> list[tuple[Any, Any, Any]]:
     """Return the vertices of paths as a projector with a white image lights them.
 
-    A vertex is its texture coordinates in the projector's image, its weight, and
-    whether it is seen sharply, as from `_accumulate_radiance`. Other light does not
-    count.
+    A vertex has its texture coordinates in the projector's image, its weight, and
+    whether the camera sees it sharply, as from `_accumulate_radiance`. Other light does
+    not count.
 
     Args:
         scene: Mitsuba's scene.
@@ -229,24 +234,27 @@ def _accumulate_radiance(
 
     Returns:
         The radiance that leaves the first vertex, without its emission; and for each
-        vertex its texture coordinates, its weight (see the module) and whether it is
-        seen sharply.
+        vertex its texture coordinates, its weight (the change of the pixel by the base
+        color there, see the top of the module), and whether the camera sees it sharply.
     """
-    L = mi.Spectrum(0.0)
+    reflected = mi.Spectrum(0.0)
     vertices = list[tuple[Any, Any, Any]]()
-    # From the last vertex to the first. The emission of the first vertex, `emitted[0]`,
-    # is left out: the caller adds it.
+    # From the last vertex to the first. Each bounce receives what the vertex after it
+    # emits, so that `emitted[0]` is left out: the caller adds it.
     for bounce, emitted_next, (slope_em, slope_bsdf) in zip(
-        bounces[::-1], emitted[:0:-1], slopes[::-1], strict=True
+        reversed(bounces), reversed(emitted[1:]), reversed(slopes), strict=True
     ):
-        incoming = (emitted_next + L) * bounce.next_weight
+        # `next_weight` makes up for paths that Russian roulette has ended here.
+        incoming = (emitted_next + reflected) * bounce.next_weight
         weight = bounce.throughput * (
             slope_em * bounce.em_weight + slope_bsdf * incoming
         )
         vertices.append((mi.Point2f(bounce.si.uv), weight, bounce.sharp))
-        L = bounce.bsdf_value_em * bounce.em_weight + bounce.bsdf_weight * incoming
+        reflected = (
+            bounce.bsdf_value_em * bounce.em_weight + bounce.bsdf_weight * incoming
+        )
     vertices.reverse()
-    return L, vertices
+    return reflected, vertices
 
 
 def _find_weighted_samples(
@@ -275,7 +283,8 @@ def _fetch_paths(
     Args:
         channels: channels of the radiance and of the other images of `Paths`, in their
             order, for each sample.
-        vertices: texture coordinates, weight and sharpness of each vertex.
+        vertices: for each vertex its texture coordinates, its weight, and whether the
+            camera sees it sharply.
         size: height and width of the image.
         spp: samples per pixel, which follow one another.
     """
@@ -301,52 +310,59 @@ def _fetch_paths(
     )
 
 
-def _fetch_vertices(uv: Any, weight: Any, sharp: Any, mask: Any, spp: int) -> Vertices:
+def _fetch_vertices(
+    uv: Any, weight: Any, is_sharp: Any, mask: Any, spp: int
+) -> Vertices:
     """Fetch one vertex of those paths that a mask selects.
 
     Args:
-        uv, weight, sharp: texture coordinates, weight and sharpness of all samples.
-        mask: which samples are fetched.
+        uv: texture coordinates of the vertex of each sample.
+        weight: its weight.
+        is_sharp: whether the camera sees it directly, or through mirrors and clear
+            glass only.
+        mask: samples that are fetched.
         spp: samples per pixel, by which weights are divided, so that they add up to the
             mean of a pixel.
     """
-    index: Any = dr.compress(mask)
-    if dr.width(index) == 0:
+    sample: Any = dr.compress(mask)
+    if dr.width(sample) == 0:
         empty = torch.zeros(0)
         return Vertices(
             empty.long(), empty.reshape(0, 2), empty.reshape(0, 3), empty.bool()
         )
-    uv = dr.gather(mi.Point2f, uv, index)
-    weight = dr.gather(mi.Color3f, weight, index) / spp
-    pixel = index // spp
-    sharp = dr.gather(mi.Bool, sharp, index)
-    dr.eval(uv, weight, pixel, sharp)
+    uv = dr.gather(mi.Point2f, uv, sample)
+    weight = dr.gather(mi.Color3f, weight, sample) / spp
+    pixel = sample // spp  # the samples of a pixel follow one another
+    is_sharp = dr.gather(mi.Bool, is_sharp, sample)
+    dr.eval(uv, weight, pixel, is_sharp)
     return Vertices(
         pixel.torch().long(),
         torch.stack([axis.torch() for axis in uv], dim=1),
         torch.stack([channel.torch() for channel in weight], dim=1),
-        sharp.torch().bool(),
+        is_sharp.torch().bool(),
     )
 
 
 @dataclass
 class Bounce:
-    """One vertex of all paths."""
+    """One vertex of all paths, at which they are reflected."""
 
     si: Any  # surface interaction
-    bsdf: Any  # its BSDF
-    throughput: Any  # throughput of the path before it
-    sharp: Any  # no vertex before it scatters light
+    bsdf: Any  # BSDF there
+    throughput: Any  # throughput of the path before the vertex
+    sharp: Any  # whether no vertex before it scatters light
     wo_em: Any  # direction to the light that was sampled
-    active_em: Any  # in which lanes there is one
-    # radiance from there over the density, with its MIS weight against BSDF sampling
+    active_em: Any  # lanes in which a light was sampled
+    # radiance of that light over the density, with its MIS weight against BSDF sampling
     em_weight: Any
     bsdf_value_em: Any  # the BSDF times the cosine for the direction to the light
-    bsdf_sample: Any  # the path's direction
-    active_bsdf: Any  # in which lanes it has a density
-    # the same for the path's direction over its density: the throughput of the vertex
+    bsdf_sample: Any  # direction in which the path goes on
+    active_bsdf: Any  # lanes in which that direction has a density
+    # the BSDF times the cosine for that direction, over its density
     bsdf_weight: Any
-    next_weight: Any = 1.0  # of what arrives from the next vertex, by Russian roulette
+    # factor on what arrives from the next vertex: 1 over the probability to survive
+    # Russian roulette, and 0 where the path has ended
+    next_weight: Any = 1.0
 
     def compute_slopes(self) -> tuple[Any, Any]:
         """Return the derivatives of both BSDF values by the base color.
@@ -400,7 +416,7 @@ class Bounce:
 
 
 class _FirstHit:
-    """What the camera sees first of each path: reflectance and shading normal."""
+    """Reflectance and shading normal of what the camera sees first on each path."""
 
     def __init__(self, count: int) -> None:
         """Start with black, and no normal, for `count` paths."""
@@ -415,7 +431,7 @@ class _FirstHit:
 
 
 def _has_cut_outs(scene: Any) -> bool:
-    """Return whether light passes some surface of the scene straight."""
+    """Return whether light goes straight through some surface, such as a cut-out."""
     return any(
         mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
         for shape in scene.shapes()
@@ -438,62 +454,64 @@ def _trace_paths(
             its throughput, but at most `MAX_SURVIVAL`.
 
     Returns:
-        What the camera sees, channel by channel in the order of the images of `Paths`
-        after the radiance; what each vertex emits; and how each vertex but the last
-        reflects light.
+        The images of `Paths` after the radiance, in their order, channel by channel;
+        what each vertex emits; and the bounces at all vertices but the last.
     """
     count = dr.width(ray.o)
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
-    sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
+    is_sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
     throughput = mi.Spectrum(1.0)
     has_cut_outs = _has_cut_outs(scene)
-    passed_straight = mi.Bool(has_cut_outs)  # the path has gone through cut-outs alone
+    # lanes whose path has gone through cut-outs only; not used without cut-outs
+    passed_straight = mi.Bool(has_cut_outs)
     first_hit = _FirstHit(count)
 
-    # Of the vertex before: the camera counts as one that reflects in one direction
-    # alone.
+    # The vertex before. The camera counts as a vertex with a single direction, so that
+    # the emission of the first hit has all the weight.
     prev_si = dr.zeros(mi.SurfaceInteraction3f)
     prev_pdf = mi.Float(1.0)
     prev_delta = mi.Bool(True)
     emitted = list[Any]()
     bounces = list[Bounce]()
     for segment in range(depth):
+        # ---- the vertex at which the segment ends
         si = scene.ray_intersect(ray, active)
-
         emitted.append(_eval_emission(scene, si, prev_si, prev_pdf, prev_delta, active))
-
-        # What the camera sees first; through cut-outs it sees what is behind them.
         bsdf = si.bsdf(ray)
         if segment == 0:
-            covered = si.is_valid()
-            coverage = dr.select(covered, mi.Float(1.0), 0.0)
-            background = dr.select(covered, 0.0, emitted[0])
+            is_covered = si.is_valid()
+            coverage = dr.select(is_covered, mi.Float(1.0), 0.0)
+            background = dr.select(is_covered, 0.0, emitted[0])
             if not has_cut_outs:
-                first_hit.put(si, bsdf, covered)
-        active &= si.is_valid() & mi.Bool(segment + 1 < depth)
-        if segment + 1 == depth:  # the last vertex emits light, and reflects none
+                first_hit.put(si, bsdf, is_covered)
+        is_last = segment + 1 == depth
+        active &= si.is_valid() & mi.Bool(not is_last)
+        if is_last:  # the last vertex emits light, and reflects none
             break
 
-        bounce = _sample_bounce(scene, si, bsdf, throughput, sharp, noise, active)
+        # ---- its light, and the direction in which the path goes on
+        bounce = _sample_bounce(scene, si, bsdf, throughput, is_sharp, noise, active)
+        bounces.append(bounce)
         active_next = active & (bounce.bsdf_sample.pdf > 0.0)
         sampled_type = bounce.bsdf_sample.sampled_type
         if has_cut_outs:
+            # Through cut-outs the camera sees what is behind them.
             passes_through = active_next & mi.has_flag(sampled_type, mi.BSDFFlags.Null)
             first_hit.put(si, bsdf, passed_straight & active & ~passes_through)
             passed_straight &= passes_through
-        bounces.append(bounce)
 
-        # On to the next vertex.
+        # ---- on to the next vertex
         is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
-        # The last bounce is left out: a path ends after it in any case.
+        # Russian roulette, which leaves out the last bounce: a path ends after it in
+        # any case.
         if roulette_depth <= segment + 1 < depth - 1:
             survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
             active &= noise.next_1d(active) < survival
             bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
             throughput = throughput * bounce.next_weight
-        sharp = sharp & is_delta
+        is_sharp = is_sharp & is_delta
         prev_si = si
         prev_pdf = bounce.bsdf_sample.pdf
         prev_delta = is_delta
@@ -548,10 +566,10 @@ def _sample_bounce(
     context = mi.BSDFContext()
     mis_weight = mi.ad.integrators.common.mis_weight
 
-    # Towards a light. One that a BSDF sample can't meet, a point, has all of the
-    # weight.
+    # Towards a light. A BSDF sample cannot meet a point light, whose sample has all of
+    # the weight.
     ds, em_weight = scene.sample_emitter_direction(
-        si, noise.next_2d(active), True, active
+        si, noise.next_2d(active), test_visibility=True, active=active
     )
     active_em = active & (ds.pdf > 0.0)
     wo_em = si.to_local(ds.d)
@@ -585,12 +603,12 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
     """Find the surface that the camera sees first through the center of each pixel.
 
     There is no noise: rays go through the center of a thin lens. A surface that lets
-    more than half of the light pass and does not emit light towards the camera is not
-    seen, such as a hole in a leaf or the glass of a lamp that is off. Haze is no shape,
-    and is not seen either.
+    more than half of the light pass and does not emit light towards the camera is
+    skipped, such as a hole in a leaf or the glass of a lamp that is off. Haze is no
+    shape, and is skipped too.
 
     Args:
-        scene, sensor: Mitsuba's.
+        scene, sensor: Mitsuba's scene and its camera.
         resolution: height and width, which need not be those of the sensor.
     """
     height, width = resolution
@@ -612,15 +630,15 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
 
 
 class _SurfaceLayers:
-    """What the camera sees first in each pixel, layer by layer of `Surfaces`.
+    """Images of the surface that the camera sees first, the layers of `Surfaces`.
 
     Args:
         shapes: Mitsuba's shapes of the scene.
-        count: number of pixels, in which nothing is seen yet.
+        count: number of pixels.
     """
 
     def __init__(self, shapes: Sequence[Any], count: int) -> None:
-        """Start with pixels in which nothing is seen, infinitely far away."""
+        """Start with pixels without a surface, infinitely far away."""
         self._shapes = shapes
         self._shape_id = dr.zeros(mi.UInt32, count)  # 0: no shape
         self._face = dr.zeros(mi.UInt32, count)

@@ -95,15 +95,16 @@ def record_on_first_use(
 ) -> Callable[..., Any]:
     """Return a function that Dr.Jit records on first use and replays later.
 
-    Nothing may be freed while it records. When a scene is freed, or memory that torch
-    shares, a function of Python is called; Dr.Jit 1.5.0 cannot record that, and the
-    process ends. So Python's garbage collector waits until after.
+    Nothing may be freed while it records. If a scene or memory that torch shares is
+    freed, a function of Python is called. Dr.Jit 1.5.0 cannot record such a call, and
+    the process ends. So Python's garbage collector is disabled while the function runs.
 
     Args:
         render: the function.
         media: Mitsuba's media that it uses besides its arguments.
     """
-    # `state_fn` names what a recording uses besides its arguments
+    # Dr.Jit calls `state_fn` with the arguments of the recorded function; it returns
+    # what else the recording depends on.
     frozen = dr.freeze(render, state_fn=(lambda *_, **__: media) if media else None)
 
     def call(*arguments: Any) -> Any:
@@ -160,8 +161,9 @@ class Population:
     garbage collector may start in the middle of one.
 
     Attributes:
-        changes: how often the population has changed.
-        unused: the ids of what has lost its owner, which are values of `changes`.
+        changes: number of changes of the population so far. A recording is valid only
+            as long as it stays the same.
+        unused: keys, in `_held`, of the objects whose owner has been freed.
     """
 
     def __init__(self) -> None:
@@ -170,16 +172,24 @@ class Population:
         self.unused: list[int] = []
 
     def add(self, owner: object, *objects: Any, media: tuple[Any, ...] = ()) -> None:
-        """Hold Mitsuba's objects for as long as their owner lives, and a little longer.
+        """Hold Mitsuba's objects until `free_unused` after their owner is freed.
 
-        `media` are those among them.
+        Args:
+            owner: object that uses them, such as a `MitsubaScene`.
+            *objects: objects of Mitsuba.
+            media: further objects, which are Mitsuba's media; see `list_media`.
         """
         self.changes += 1
-        self._held[self.changes] = objects, media
-        weakref.finalize(owner, self.unused.append, self.changes)
+        # The count of changes is also a unique key.
+        key = self.changes
+        self._held[key] = (objects, media)
+        weakref.finalize(owner, self.unused.append, key)
 
     def free_unused(self) -> None:
-        """Free what has lost its owner, if anything has; only between renders."""
+        """Free the objects whose owner has been freed; call it only between renders.
+
+        It counts as a change of the population: callers test `unused` before.
+        """
         while self.unused:
             self._held.pop(self.unused.pop(), None)
         # Mitsuba's Python objects form cycles; they have to be freed now, not during a

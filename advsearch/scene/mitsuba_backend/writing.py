@@ -179,7 +179,7 @@ def _put_all_inputs(
     if unset_names:
         raise InputError(
             f"out: stock Mitsuba has nothing for {', '.join(unset_names)}; "
-            "export another run"
+            "export a run without it"
         )
 
 
@@ -283,8 +283,9 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
         if radiance.ndim == 1:  # one color (3,), and no texture (h, w, 3)
             radiance = radiance.reshape(1, 1, 3)
         part = replace(part, emission=radiance)
+    # This also removes the numbers of the surface from `part_inputs`.
     surface = _make_surface(part, part_inputs)
-    # they are in the file of the mesh
+    # Vertices and normals are in the file of the mesh.
     part_inputs.pop("vertices", None)
     part_inputs.pop("normals", None)
     remaining_inputs |= {
@@ -305,6 +306,7 @@ def _make_surface(part: parts.MeshPart, part_inputs: Plugin) -> Plugin:
         part_inputs: its inputs by names such as "roughness"; those that are set here
             are removed.
     """
+    # The caller has put the base color into `part` already.
     if part.surface is not None:
         base_color = part.base_color
         return fill_base_color(
@@ -348,7 +350,8 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
         )
     except (RuntimeError, TypeError) as error:
         raise InputError(
-            f"out: XML of Mitsuba cannot say the scene: {error}; export another run"
+            f"out: the scene cannot be written as XML of Mitsuba: {error}; export "
+            "another run"
         ) from error
     root = ElementTree.fromstring(text)
     # Mitsuba names parameters by the ids of plugins, but its writer gives an id only to

@@ -88,7 +88,7 @@ def read_scene(path: Path) -> Plugin:
         name = _make_plain_name(plugin_id)
         if name not in scene and plugin_id in state.id_to_index:
             index = state.id_to_index[plugin_id]
-            # ids that it refers to in turn are not followed
+            # The set is discarded: plugins that this one refers to are not copied.
             scene[name] = _convert_plugin(path, state, index, referred_ids=set())
     return scene
 
@@ -277,7 +277,7 @@ class _SceneText:
         try:
             root = self.parse(self.references.get(name))
         except FileNotFoundError:
-            # why the file that was requested last was refused
+            # `get` has added the reason at the end.
             reason = next(reversed(self.references.refused.values()))
             raise FileFormatError(
                 f"{self.path}: includes {format_name(name)}, which {reason}"
@@ -308,8 +308,9 @@ class _SceneText:
             filled += self.values[piece] if is_name else piece
             # The length is limited because values may grow exponentially: a <default>
             # may name another one twice, which names others twice, and so on. A text
-            # that is long without any names (only a first piece) is no error.
-            if index > 0 and len(filled) > MAX_TEXT_LENGTH:
+            # that is long without names has only a first piece, and is accepted.
+            has_names = index > 0
+            if has_names and len(filled) > MAX_TEXT_LENGTH:
                 limit = f"expected at most {MAX_TEXT_LENGTH:,} letters, got more"
                 raise FileFormatError(
                     f"{self.path}: {format_name(text)}: {limit}; write the value out"
@@ -331,7 +332,8 @@ def _convert_plugin(
     types = mi.Properties.Type
     props = state.nodes[index].props
     entries: Plugin = {"type": props.plugin_name()}
-    last_number: dict[str, int] = {}  # the last number behind each name
+    # last number after each name; 1 stands for a name without a number
+    last_number: dict[str, int] = {}
 
     def put(plain_name: str, entry: object) -> None:
         """Add an entry, with a number behind its name if there is one already."""
@@ -413,8 +415,9 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
 
 def _check_finite(where: str, numbers: Any) -> None:
     """Raise FileFormatError for a number that is not finite or near float32's limit."""
-    # float32 ends at 3.4e38; 1e30 leaves room for products. NaN is not below it either.
-    if not (np.abs(np.asarray(numbers, np.float64)) < 1e30).all():
+    # float32 ends at 3.4e38; 1e30 leaves room for products. NaN fails the comparison.
+    is_usable = np.abs(np.asarray(numbers, np.float64)) < 1e30
+    if not is_usable.all():
         raise FileFormatError(
             f"{where}: expected a finite number, got "
             f"{format_name(str(np.asarray(numbers)))}; correct it"

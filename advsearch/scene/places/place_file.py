@@ -127,7 +127,7 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for name in stated_names:
             if name not in names:
                 raise UnknownNameError(
-                    f"mesh of {file.mesh}:", name, names, f"It stands in {path}."
+                    f"mesh of {file.mesh}:", name, names, f"It is named in {path}."
                 )
     solids = tuple(
         Solid(entry.name, outline)
@@ -135,8 +135,8 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for outline in entry.list_footprints()
     )
     parts = [replace(part, is_ground=part.name in file.ground) for part in parts]
-    # Solids belong to the place and not to a mesh. Each has to be listed once: so the
-    # first mesh has them all.
+    # Solids belong to the place and not to a mesh, but a scene has only meshes. Each
+    # solid has to be in the scene once, so the first mesh gets all of them.
     parts[0] = replace(parts[0], solids=solids)
     directory = Path(os.path.abspath(path)).parent
     return Place(make_safe_name(directory), file, tuple(parts), tuple(notes))
@@ -166,8 +166,9 @@ def make_place_parts(
     Args:
         place: the place, whose lengths are in metres and whose emission is in cd/m2.
         metres: one object size in metres.
-        candelas: luminance of a radiance of 1, cd/m2; None if the light has no unit:
-            then the lamps stay off.
+        candelas: luminance of a radiance of 1, cd/m2. None if the light has no unit:
+            then the lamps stay off, and other emission is divided by
+            `DEFAULT_LUMINANCE`.
         is_dark: whether the lamps are on.
     """
     radiance_unit = np.float32(candelas or DEFAULT_LUMINANCE)

@@ -154,9 +154,9 @@ def _get_extension(entry: Entry, name: str) -> object:
 class PosedPrimitive(NamedTuple):
     """A primitive at one of its positions in the file."""
 
-    material: int | None  # its own
-    variant_material: int | None  # the one that it has in the variant
-    part: ImportedPart  # without surface
+    material: int | None  # index of its original material
+    variant_material: int | None  # index of its material in the variant
+    part: ImportedPart  # its geometry, without a surface
 
 
 NameAndMaterial = tuple[str, int | None]
@@ -186,7 +186,7 @@ def read_place_meshes(
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
     note_left_out(_drop_supported_extensions(header), notes)
-    _note_left_out(header, primitives, notes)
+    _note_omissions(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
     groups = _group_by_material(header, primitives)
     if not groups:
@@ -198,6 +198,7 @@ def read_place_meshes(
     parts = list[MeshPart]()
     for (name, material), members in groups.items():
         part = _make_part(path, names.make_unique(name), members, surfaces[material])
+        # adds specular and clear coat, which `surfaces` do not have
         parts.append(_with_finish(path, header, material, part))
     return parts, list(notes)
 
@@ -213,10 +214,10 @@ def _drop_supported_extensions(header: Header) -> Header:
     )
 
 
-def _note_left_out(
+def _note_omissions(
     header: Header, primitives: Sequence[PosedPrimitive], notes: Notes
 ) -> None:
-    """Note what the file has and a place ignores: vertex colors, skins and lights.
+    """Note what only a place leaves out: vertex colors, skins and lights.
 
     Args:
         header: header of the file.
@@ -282,10 +283,10 @@ def _list_posed_meshes(header: Header) -> list[tuple[int, Float64Array]]:
 def _read_primitives(
     file: GltfFile, variant: int | None, notes: Notes
 ) -> tuple[list[PosedPrimitive], dict[int | None, ImportedSurface]]:
-    """Read the primitives that the file's nodes show, and the surfaces they use.
+    """Read the primitives of the meshes at the file's nodes, and their surfaces.
 
-    Several nodes may show one mesh. It is read once, and the result has it in the pose
-    of each node.
+    Several nodes may have the same mesh. It is read once, and the result has it in the
+    pose of each node.
 
     Args:
         file: the glTF file.
@@ -306,9 +307,15 @@ def _read_primitives(
             piece = pieces.get((mesh, index))
             if piece is None:  # it is made of points or lines
                 continue
-            _, uv_scale, uv_shift = fitted[piece.material]
+            _surface, uv_scale, uv_shift = fitted[piece.material]
             part = transform_part(_fit_uvs(piece.part, uv_scale, uv_shift), pose)
-            primitives.append(PosedPrimitive(primitive.material, piece.material, part))
+            # `piece` has the material of the variant, and names the surface. The
+            # original material names the mesh, see `_group_by_material`.
+            primitives.append(
+                PosedPrimitive(
+                    primitive.material, variant_material=piece.material, part=part
+                )
+            )
     surfaces = {material: surface for material, (surface, _, _) in fitted.items()}
     return primitives, surfaces
 
@@ -316,12 +323,18 @@ def _read_primitives(
 def _fit_uvs(
     part: ImportedPart, scale: Float64Array, shift: Float64Array
 ) -> ImportedPart:
-    """Return a part with its UVs in the texture of its surface, v = 0 at the bottom."""
+    """Return a part with its UVs in the texture of its surface, v = 0 at the bottom.
+
+    Args:
+        part: part with the UVs of the file, where v = 0 is at the top.
+        scale, shift: (2,) scale and shift from the file's UVs to the texture.
+    """
     uvs = part.uvs
     if uvs is None:
         return part
-    uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
-    return replace(part, uvs=uvs)
+    texture_uvs = uvs * scale + shift
+    flipped_uvs = texture_uvs * [1.0, -1.0] + [0.0, 1.0]  # v becomes 1 - v
+    return replace(part, uvs=flipped_uvs)
 
 
 def _read_pieces(
@@ -349,7 +362,7 @@ def _read_pieces(
                 file,
                 variant_primitive,
                 mesh_extras=header.meshes[mesh].extras,
-                is_skinned=False,
+                is_skinned=False,  # a place leaves skins out
             )
             if piece is not None and len(piece.part.faces):
                 pieces[mesh, index] = piece
@@ -415,10 +428,10 @@ def _group_by_material(
 ) -> dict[NameAndMaterial, list[ImportedPart]]:
     """Group primitives to meshes of one material each, in the order of materials.
 
-    A variant replaces materials by others. A mesh is named by its original material, so
-    that its name is the same in all variants. But if the variant replaces the material
-    of some primitives only, these become a mesh of their own, with the name of the
-    material that they get.
+    A variant may replace the material of each primitive. If all primitives of an
+    original material get the same one, they are a mesh with the name of the original,
+    so that it has the same name in all variants. If they get different ones, there is a
+    mesh for each of these, with its name.
 
     Args:
         header: header of the file, with the names of materials.
@@ -482,12 +495,13 @@ def _make_part(
         opacity = np.ascontiguousarray(texture[..., 3])
     try:
         mesh = _join(members)
-    except InputError as error:  # which knows of no file
+    except InputError as error:  # its message does not name the file
         raise InputError(f"{path}: {name}: {error}") from None
     return MeshPart(
         name=name,
         mesh=mesh,
         base_color=np.ascontiguousarray(texture[..., :3]),
+        # The fields of `surface` have the names of those of a material, without prefix.
         material=Material().with_values(vars(surface), ""),
         opacity=opacity,
         normal_map=surface.normal_map,
@@ -500,9 +514,9 @@ def _with_finish(
 ) -> MeshPart:
     """Return a mesh with the specular and the clear coat of its material.
 
-    The gloss of a coat needs a surface in Mitsuba's own description, which a mesh with
-    an opacity or a normal map cannot have. The coat of such a mesh has Mitsuba's
-    default gloss.
+    In the file these are extensions of the material. The gloss of a coat needs a
+    surface in Mitsuba's own description, which a mesh with an opacity or a normal map
+    cannot have. The coat of such a mesh has Mitsuba's default gloss.
 
     Args:
         path: the file, for messages.
@@ -519,6 +533,7 @@ def _with_finish(
     facing_reflectance = (
         finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
     )
+    # Rounded, so that glTF's default of 1.5 gives exactly the value of our default.
     specular = min(round(facing_reflectance / REFLECTANCE, 9), 1.0)
     coat = finish.KHR_materials_clearcoat
     material = replace(part.material, specular=specular, clearcoat=coat.clearcoatFactor)

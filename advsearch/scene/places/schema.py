@@ -82,7 +82,9 @@ class SolidEntry(_Entry):
         has_positions = self.at is not None
         has_radius = self.radius is not None
         has_outline = self.outline is not None
-        if has_positions != has_radius or has_radius == has_outline:
+        is_round = has_radius and has_positions and not has_outline
+        is_outlined = has_outline and not has_radius and not has_positions
+        if not (is_round or is_outlined):
             raise ValueError(
                 "expected either an outline, or a radius and the positions that it is "
                 "at"

@@ -1,7 +1,7 @@
-"""Object and surroundings in fixed positions, with the light that arrives on them.
+"""Compute the light on an object and its surroundings that stand still.
 
-Where object, surroundings and lights stand still, the irradiance E of a point is the
-same for every camera, so that
+If object, surroundings and lights do not move, the irradiance E of a point is the same
+for every camera, so that
 
     radiance(pixel) = mean over its rays of
                           diffuse(angle) base color E / pi
@@ -40,12 +40,14 @@ from advsearch.scene.mitsuba_backend.texel_rays import (
     Ints,
     Lobes,
     compute_visible_cosines,
+    get_world_to_map,
     is_visible_from_behind,
     measure_lobes,
     trace_texel_rays,
-    world_to_map,
 )
-from advsearch.scene.photographed_ground import compute_irradiance as unshadowed
+from advsearch.scene.photographed_ground import (
+    compute_irradiance as compute_open_sky_irradiance,
+)
 from advsearch.scene.predictor import LinearMap
 from advsearch.scene.raster import Charts, rasterize_charts
 from advsearch.scene.renderer import Renderer
@@ -54,19 +56,19 @@ from advsearch.scene.transport.matrix import find_bilinear_weights
 
 
 class SurfaceView:
-    """What one of several cameras sees.
+    """View of one camera: a matrix from light on the object to pixels.
 
     Attributes:
-        base_radiance: (H, W, 3) radiance that does not come from the matrix.
+        base_radiance: (H, W, 3) radiance of everything but the object's base color.
         coverage: (H, W, 1) fraction of each pixel that surfaces cover.
-        matrix: sparse, from the fine grid to the pixels; from its front and then, if
-            there are 2 sides with light of their own, from its back.
+        matrix: sparse (pixels, sides x cells of the fine grid). If the object's back
+            stores light of its own, the second half of the columns is the back.
 
     Args:
         samples: samples of all cameras.
         camera_index: index of the camera.
         shape: rows and columns of the fine grid.
-        sides: sides of the object that have light of their own.
+        sides: number of sides of the object that store light of their own.
     """
 
     def __init__(
@@ -80,7 +82,7 @@ class SurfaceView:
 
         Its rows are the pixels, its columns the cells of the fine grid. Each ray that
         hits the surface adds four entries to its pixel's row: the weights of a bilinear
-        look-up times the ray's own.
+        look-up, each times the weight of the ray.
 
         Args:
             samples: rays of all cameras of one launch that hit the object.
@@ -92,22 +94,22 @@ class SurfaceView:
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
-        # Rays are numbered through from one camera to the next, and `samples.sample`
-        # is the ascending number of each sample's ray. So the samples of this camera
-        # are those between its own first ray and that of the next camera.
+        # The rays of all cameras have ascending indices, camera after camera.
+        # `samples.sample` holds the ray index of each sample, in ascending order. So
+        # this camera's samples lie between its first ray and the next camera's.
         n_rays = height * width * RAYS_PER_PIXEL
         first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
         start, end = torch.searchsorted(samples.sample, first_rays).tolist()
         ray = samples.sample[start:end] - camera_index * n_rays
         pixel = ray // RAYS_PER_PIXEL
-        # Cells and weights (n, 4) of the bilinear look-ups. If the surface has two
-        # sides, the second half of the columns is its back.
+        # Each look-up reads four cells: `columns` and `fractions` are (n, 4).
         columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
+        # The columns of the back follow the `n_cells` columns of the front.
         is_back = samples.is_back[start:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
         weights = fractions * samples.weight[start:end].numpy()[:, None]
-        # The samples are in the order of pixels, and each has four entries: so row
-        # pointers of the compressed matrix need no sorting.
+        # The samples are sorted by pixel, and each has four entries. So the entries of
+        # row p begin at 4 times the number of samples in the pixels before p.
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         self.matrix = scipy.sparse.csr_matrix(
             (weights.ravel(), columns.ravel(), row_starts.astype(np.int32)),
@@ -116,13 +118,15 @@ class SurfaceView:
         )
 
     def compute_radiance(self, reflected: Tensor) -> Tensor:
-        """Return the radiance (H, W, 3) for what the fine grid reflects.
+        """Return the radiance (H, W, 3) of the view, differentiable in `reflected`.
 
-        That is (sides x cells, 3); the result is differentiable in it.
+        Args:
+            reflected: (sides x cells, 3) radiance that the base color reflects in each
+                cell of the object's texture grid, from
+                `ArrangementLight.compute_reflected`.
         """
-        return self.base_radiance + multiply_sparse(self.matrix, reflected).reshape(
-            self.base_radiance.shape
-        )
+        from_object = multiply_sparse(self.matrix, reflected)
+        return self.base_radiance + from_object.reshape(self.base_radiance.shape)
 
 
 def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
@@ -142,19 +146,18 @@ def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
 
 
 OBJECT_TEXELS = 160  # texels along each side of the searched object's texture
-RAYS_PER_TEXEL = 256  # rays from each texel by which it is known what it sees
-# fraction of a texel's rays that meet the back of a surface above which it lies inside
-# something
+RAYS_PER_TEXEL = 256  # rays from each texel that sample what it sees
+# A texel lies inside something if more than this fraction of its rays meet the back of
+# a surface.
 BURIED_FRACTION = 0.3
 BOUNCES = 4
 """How often light goes from texel to texel.
 
 With the camera's and the sky's segments that makes a path of `MAX_DEPTH`.
 """
-MIN_FINE_SIZE = (
-    192  # smallest width of the grid on which base color and light are multiplied
-)
-# largest reflectance of a photographed ground, where light goes from surface to surface
+# smallest width of the fine grid, on which base color and light are multiplied
+MIN_FINE_SIZE = 192
+# largest reflectance of a photographed ground for light between surfaces
 MAX_GROUND_REFLECTANCE = 0.95
 COLOR_INPUT = f"{OBJECT}.base_color"
 ENVIRONMENT_INPUT = "environment.padded"
@@ -167,21 +170,24 @@ FREE_INPUTS = (
     | IMAGE_INPUTS
     | {ENVIRONMENT_INPUT, COLOR_INPUT, "ground.reflectance"}
 )
-"""Inputs that may change: at most the light has to be computed again."""
+"""Scene inputs that may change without tracing the rays of texels again.
+
+A change of the environment or of a color only needs the light computed again.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class ArrangementLight:
-    """Light on the surfaces."""
+    """Light on the surfaces of an arrangement under one environment."""
 
-    # (sides x cells of the fine grid, 3) irradiance of the object's front, and then of
-    # its back where that has its own
+    # (sides x cells of the fine grid, 3) irradiance of the object's front, followed by
+    # that of its back if the back stores its own
     on_object: Tensor
     maps: LightMaps  # all other light, for look-ups
 
     @property
     def bytes(self) -> int:
-        """Memory that it takes."""
+        """Memory of the light, bytes."""
         return 4 * (self.on_object.numel() + self.maps.size)
 
     def compute_reflected(self, fine: Tensor) -> Tensor:
@@ -189,7 +195,8 @@ class ArrangementLight:
 
         The result is differentiable.
         """
-        return fine.repeat(len(self.on_object) // len(fine), 1) * self.on_object
+        n_sides = len(self.on_object) // len(fine)
+        return fine.repeat(n_sides, 1) * self.on_object
 
 
 class Arrangement:
@@ -197,15 +204,15 @@ class Arrangement:
 
     Args:
         renderer: renderer of the scene.
-        inputs: the scene's own, assembled, without those that may change.
+        inputs: assembled inputs of the scene, without `FREE_INPUTS`.
         texture: rows and columns of the base color.
         seed: seed of the rays.
 
     Attributes:
-        inputs: scene inputs that stay.
-        texels: those of all surfaces: the object's front, its back if it has light of
-            its own, and the ground.
-        n_sides: sides of the object that have light of their own, 1 or 2.
+        inputs: scene inputs that do not change.
+        texels: texels of all surfaces, in this order: the object's front, its back if
+            it stores light of its own, and the ground.
+        n_sides: number of sides of the object that store light of their own, 1 or 2.
         fine_shape: rows and columns of the fine grid.
         lobes: lobes of each surface.
         world_to_map: (3, 3) rotation to the axes of the environment's map.
@@ -218,7 +225,7 @@ class Arrangement:
         texture: tuple[int, int],
         seed: int,
     ) -> None:
-        """Lay texels over all surfaces, trace what they see, and measure how they look.
+        """Lay texels over all surfaces, trace their views, and measure reflection.
 
         Args:
             renderer: renderer of the scene.
@@ -241,39 +248,45 @@ class Arrangement:
         surfaces = self._make_object_texels(charts, vertices, normals)
         self.n_sides = len(surfaces)
         self._has_ground = description.get_number("ground.size") > 0.0
-        # height of the camera that photographed the ground; None for another ground
+        # height of the camera that photographed the ground; None for a plain ground
         self._capture_height = (
             None if description.photograph is None else description.capture_height
         )
+        # The ground comes after the sides of the object, so that its index among the
+        # grids is `n_sides`.
         if self._has_ground:
             surfaces.append(self._make_ground_texels(object_center))
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
-        self._refine(texture)
+        refinement = max(1, math.ceil(MIN_FINE_SIZE / min(texture)))
+        self.fine_shape = (texture[0] * refinement, texture[1] * refinement)
+        self._upsampling = None
+        if refinement > 1:
+            self._upsampling = _make_upsampling_matrix(texture, self.fine_shape)
 
         # what texels see of the sky and of each other
         met_cells = self._trace_texels(seed)
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
         )
-        # for each side of the object: the matrix that takes the light on its texels to
+        # For each side of the object: the matrix that takes the light on its texels to
         # the fine grid. The back has the same texels, but the opposite normals.
         self._to_fine = [
             texels.make_lookup_matrix(
                 surfaces[side],
                 charts,
-                self.fine_shape,
-                vertices,
-                normals if side == 0 else -normals,
-                self._find_buried(met_cells, side),
+                shape=self.fine_shape,
+                vertices=vertices,
+                normals=normals if side == 0 else -normals,
+                buried=self._find_buried(met_cells, side),
             )
             for side in range(self.n_sides)
         ]
         if self._has_ground:
             self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
         # both sides of the object have the same gloss, and the ground has none
-        self.lobes = [self._measure_object()] * self.n_sides
+        self.lobes = [self._measure_object_lobes()] * self.n_sides
         self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
-        self.world_to_map = torch.tensor(world_to_map(scene), dtype=torch.float32)
+        self.world_to_map = torch.tensor(get_world_to_map(scene), dtype=torch.float32)
         self._ground_below = self._find_ground_below(object_center)
         self._views = self._make_view_tracer(object_center)
 
@@ -315,27 +328,27 @@ class Arrangement:
             center=object_center,
         )
 
-    def _refine(self, texture: tuple[int, int]) -> None:
-        """Set the shape of the fine grid, and the matrix that upsamples a texture to
-        it.
+    def _select_ground(self) -> slice:
+        """Return the texels of the ground; it follows the sides of the object."""
+        return self.texels.select_grid(self.n_sides)
 
-        A texture smaller than `MIN_FINE_SIZE` is enlarged by a whole factor.
+    def _is_sky(self, cells: Ints) -> BoolArray:
+        """Return which of the cells that rays met are the sky's.
+
+        The cells of the sky are numbered after those of all surfaces.
         """
-        factor = max(1, math.ceil(MIN_FINE_SIZE / min(texture)))
-        self.fine_shape = texture[0] * factor, texture[1] * factor
-        self._upsampling = None
-        if factor > 1:
-            self._upsampling = _make_upsampling_matrix(texture, self.fine_shape)
+        return np.asarray(cells >= len(self.texels.texel_of_cell))
 
     def _make_ground_smoothing(
         self, ground: texels.LitTexels, met_cells: Ints
     ) -> Tensor:
         """Return the matrix that smooths the light of the ground.
 
-        `met_cells` are the cells (texels, rays) that rays from texels met.
+        Args:
+            ground: texels of the ground.
+            met_cells: (texels, rays) cells that rays from all texels met.
         """
-        ground_cells = met_cells[self.texels.select_grid(self.n_sides)]
-        sees_sky = (ground_cells >= len(self.texels.texel_of_cell)).any(axis=1)
+        sees_sky = self._is_sky(met_cells[self._select_ground()]).any(axis=1)
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
     def _get_object_buffer(self, buffer: str) -> Float32Array:
@@ -365,13 +378,12 @@ class Arrangement:
             vertices: (V, 3) in world space.
             normals: (V, 3) in world space.
         """
-        single = texels.make_mesh_texels(OBJECT, charts, vertices, normals)
-        if not is_visible_from_behind(self._scene, OBJECT, single.positions):
-            return [single]
-        return [
-            texels.make_mesh_texels(OBJECT, charts, vertices, side * normals, side)
-            for side in (1, -1)
-        ]
+        shared = texels.make_mesh_texels(OBJECT, charts, vertices, normals, side=0)
+        if not is_visible_from_behind(self._scene, OBJECT, shared.positions):
+            return [shared]
+        front = texels.make_mesh_texels(OBJECT, charts, vertices, normals, side=1)
+        back = texels.make_mesh_texels(OBJECT, charts, vertices, -normals, side=-1)
+        return [front, back]
 
     def _compute_ground_reach(self, is_photographed: bool) -> float:
         """Return half the width of the ground; a photographed one has no end."""
@@ -382,9 +394,10 @@ class Arrangement:
     def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.
 
-        Inside of something, rays meet the backs of faces. A texel is buried if more
-        than `BURIED_FRACTION` of its rays do. If backs have texels too (two sides), the
-        object may be an open shell: then the texel also has to see no sky.
+        A ray inside of something meets the back of a face. A texel is buried if more
+        than `BURIED_FRACTION` of its rays meet backs. If backs have texels too (two
+        sides), the object may be an open shell: then a texel that sees the sky is not
+        buried.
 
         Args:
             met_cells: (n, rays) cell that each ray of a texel met; a negative number is
@@ -395,20 +408,22 @@ class Arrangement:
         if self.n_sides == 1:
             is_back = cells < 0
             return np.asarray(is_back.mean(axis=1) > BURIED_FRACTION)
+        # the grids are the object's front, its back, and the ground's
         back_grid = self.texels.grids[1]
         is_back = (cells >= back_grid.first_cell) & (
             cells < back_grid.first_cell + back_grid.n_cells
         )
-        # cells of the sky follow those of texels
-        sees_sky = (cells >= len(self.texels.texel_of_cell)).any(axis=1)
+        sees_sky = self._is_sky(cells).any(axis=1)
         return np.asarray((is_back.mean(axis=1) > BURIED_FRACTION) & ~sees_sky)
 
-    def _measure_object(self) -> Lobes:
-        """Measure how the object reflects, at one texel that stands for all.
+    def _measure_object_lobes(self) -> Lobes:
+        """Measure the reflection of the object at one texel that represents all.
 
         If the object has an opacity map, one of its most opaque texels is measured:
         where the surface is cut out there is nothing to measure.
         """
+        # The object's front is the first grid, so that its texels and cells are
+        # numbered from 0.
         front = self.texels.select_grid(0)
         opacity = self._scene.definition[0].meshes[OBJECT].opacity
         candidates = np.arange(front.start, front.stop)
@@ -419,7 +434,7 @@ class Arrangement:
             opacity_column = column * opacity.shape[1] // n_columns
             texel_opacity = opacity[opacity_row, opacity_column]
             candidates = candidates[texel_opacity >= texel_opacity.max()]
-        # any of them would do: the gloss is the same all over the object
+        # Any candidate would do: the gloss is the same all over the object.
         texel = candidates[len(candidates) // 2]
         return measure_lobes(
             self._scene,
@@ -430,7 +445,7 @@ class Arrangement:
         )
 
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
-        """Find where the ground is in the blurred maps, seen from the object's center.
+        """Find where the blurred maps show the ground, as seen from the object's center.
 
         A photographed ground takes its color from the environment's map. The color of a
         point is that in its direction from the camera that took the photograph, which
@@ -440,27 +455,31 @@ class Arrangement:
             center: (3,) center of the object in world space.
 
         Returns:
-            (h, w) whether the ground is seen in each direction; and (h, w, 3) that
-            direction from the camera, in the map's axes. Without a ground it is seen
-            nowhere, and the directions mean nothing.
+            (h, w) whether the ground is visible in each direction of a map; and
+            (h, w, 3) the direction from the photograph's camera to that point of the
+            ground, in the map's axes. Without a ground the first is False everywhere,
+            and the directions mean nothing.
         """
-        directions = texels.compute_directions(texels.BLURRED_SHAPE)
-        world_directions = directions @ self.world_to_map
+        # Vectors are rows: `v @ world_to_map.T` turns v from the world's axes to the
+        # map's, and `v @ world_to_map` turns it back.
+        map_directions = texels.compute_directions(texels.BLURRED_SHAPE)
+        world_directions = map_directions @ self.world_to_map
         if not self._has_ground:
-            return torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool), directions
-        # The ray from the center meets the ground at this distance. For a direction
-        # that does not go down the point means nothing, and the last line leaves it
-        # out.
+            is_ground = torch.zeros(texels.BLURRED_SHAPE, dtype=torch.bool)
+            return is_ground, map_directions
+        goes_down = world_directions[..., 2] < -1e-3
+        # The ray from the center meets the ground, z = 0, at this distance. Where a
+        # direction does not go down, the point means nothing.
         distance = float(center[2]) / (-world_directions[..., 2]).clamp_min(1e-6)
         points = (
             torch.from_numpy(center).float() + world_directions * distance[..., None]
         )
-        reach = self._compute_ground_reach(self._capture_height is not None)
+        is_photographed = self._capture_height is not None
+        reach = self._compute_ground_reach(is_photographed)
         is_in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
         capture_position = torch.tensor([0.0, 0.0, self._capture_height or 0.0])
-        from_camera = (points - capture_position) @ self.world_to_map.T
-        # only directions that go down meet the ground
-        return (world_directions[..., 2] < -1e-3) & is_in_reach, from_camera
+        photograph_directions = (points - capture_position) @ self.world_to_map.T
+        return goes_down & is_in_reach, photograph_directions
 
     @property
     def entries(self) -> int:
@@ -470,7 +489,7 @@ class Arrangement:
 
     @property
     def bytes(self) -> int:
-        """Memory of the matrices."""
+        """Memory of the matrices, bytes: a column index and a value for each entry."""
         return 8 * self.entries
 
     def start_tracing(
@@ -481,15 +500,16 @@ class Arrangement:
         return self._views(cameras, light.maps)
 
     def make_view(self, samples: ViewSamples, camera_index: int) -> SurfaceView:
-        """Return what the camera with an index sees."""
+        """Return the view of the camera with an index."""
         return SurfaceView(samples, camera_index, self.fine_shape, self.n_sides)
 
     def upsample(self, color: Tensor) -> Tensor:
-        """Return a base color (h, w, 3) on the fine grid, (cells, 3);
-        differentiable.
+        """Return a base color (h, w, 3) on the fine grid, (cells, 3).
+
+        The result is differentiable.
         """
         flat_color = color.reshape(-1, 3)
-        if self._upsampling is None:  # the texture is as fine
+        if self._upsampling is None:  # the fine grid has the shape of the texture
             return flat_color
         return multiply_sparse(self._upsampling, flat_color)
 
@@ -510,44 +530,47 @@ class Arrangement:
             irradiance = texels.compute_irradiance(
                 self._view_matrices,
                 sky,
-                self._find_hot_cosines(sky),
+                self._compute_hot_cosines(sky),
                 reflectance,
                 BOUNCES,
             )
-            # radiance of a diffuse surface
-            leaving = reflectance * irradiance / math.pi
-            surroundings = sky.map
+            # What a camera sees of each texel: the radiance of a diffuse surface. The
+            # texels of a photographed ground get a factor on the photograph instead.
+            visible_light = reflectance * irradiance / math.pi
+            gloss_map = sky.map  # what gloss on the object reflects
             # Without a ground this is only a filler: no ray looks it up.
             far_ground = torch.ones(1, 3)
             if self._has_ground:
-                ground = self.texels.select_grid(self.n_sides)
-                leaving[ground] = self._compute_ground_radiance(
-                    irradiance, leaving, padded
+                ground = self._select_ground()
+                visible_light[ground] = self._compute_visible_ground(
+                    irradiance, visible_light, padded
                 )
-                far_ground = self._compute_far_ground(leaving[ground])
-                surroundings = self._put_ground(surroundings, far_ground, padded)
+                far_ground = self._compute_far_ground(visible_light[ground])
+                gloss_map = self._put_ground(gloss_map, far_ground, padded)
+            # The first grids are the sides of the object.
             side_irradiances = [
                 to_fine @ irradiance[self.texels.select_grid(side)]
                 for side, to_fine in enumerate(self._to_fine)
             ]
             texel_of_cell = torch.from_numpy(self.texels.texel_of_cell)
-            cells = torch.cat([leaving[texel_of_cell], far_ground])
-            light_maps = make_light_maps(cells, padded, texels.blur_map(surroundings))
+            # One more cell, the last, is the ground beyond all texels.
+            cells = torch.cat([visible_light[texel_of_cell], far_ground])
+            light_maps = make_light_maps(cells, padded, texels.blur_map(gloss_map))
             return ArrangementLight(torch.cat(side_irradiances), light_maps)
 
-    def _find_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
+    def _compute_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
         """Return the cosines (n, k) of n texels towards k directions of hot light.
 
-        Hot is the light far above the map's mean, such as that of the sun. A cosine is
-        0 if something hides the direction from the texel.
+        Hot light is far brighter than the map's mean, such as that of the sun. A cosine
+        is 0 if something hides the direction from the texel.
 
         Args:
             sky: the environment, with the directions of its hot light.
 
         Returns:
-            None if nothing is hot.
+            The cosines, or None if nothing is hot.
         """
-        hot_directions = sky.hot[0]
+        hot_directions = sky.hot_directions
         if not len(hot_directions):
             return None
         self._scene.set_geometry(self.inputs)
@@ -559,8 +582,8 @@ class Arrangement:
         )
         return torch.from_numpy(cosines)
 
-    def _compute_ground_radiance(
-        self, irradiance: Tensor, leaving: Tensor, padded: Tensor
+    def _compute_visible_ground(
+        self, irradiance: Tensor, leaving_radiance: Tensor, padded: Tensor
     ) -> Tensor:
         """Return what the camera sees of the ground's texels (n, 3), smoothed.
 
@@ -569,23 +592,31 @@ class Arrangement:
         the irradiance divided by that under the open sky.
 
         Args:
-            irradiance: (N, 3) of all texels; the ground's are the last.
-            leaving: (N, 3) radiance that leaves all texels.
+            irradiance: (N, 3) irradiance of all texels; the ground's are the last.
+            leaving_radiance: (N, 3) radiance that leaves all texels.
             padded: (H, W + 2, 3) map of the environment.
         """
-        ground = self.texels.select_grid(self.n_sides)
-        if self._capture_height is None:
-            return self._smooth @ leaving[ground]
-        open_irradiance = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+        ground = self._select_ground()
+        is_plain = self._capture_height is None
+        if is_plain:
+            return self._smooth @ leaving_radiance[ground]
+        open_irradiance = compute_open_sky_irradiance(padded[:, 1:-1]).clamp_min(1e-12)
         return self._smooth @ (irradiance[ground] / open_irradiance)
 
-    def _compute_far_ground(self, leaving: Tensor) -> Tensor:
-        """Return what leaves the ground far off (1, 3): the object hides little there.
+    def _compute_far_ground(self, visible_ground: Tensor) -> Tensor:
+        """Return what the camera sees of the ground beyond all texels, (1, 3).
 
-        It is the mean of the texels (n, 3) at the border.
+        It is the mean of the texels at the border, where the object hides little. Those
+        at the four corners count twice.
+
+        Args:
+            visible_ground: (n, 3) what the camera sees of the ground's texels; every
+                cell of the ground's grid is a texel.
         """
-        cells = leaving.reshape(*self.texels.grids[-1].shape, 3)
+        ground_grid = self.texels.grids[-1]
+        cells = visible_ground.reshape(*ground_grid.shape, 3)
         border = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
+        # Positive, since the view tracer divides by it (`ViewTracer._reflect`).
         return border.mean(dim=0, keepdim=True).clamp_min(1e-9)
 
     def _put_ground(
@@ -601,14 +632,14 @@ class Arrangement:
                 photographed ground the factor on the photograph.
             padded: (H, W + 2, 3) map of the environment.
         """
-        is_hidden, photograph_directions = self._ground_below
+        is_ground, photograph_directions = self._ground_below
         ground = far_ground
         if self._capture_height is not None:
             photograph = texels.look_up_environment(
                 padded, photograph_directions.reshape(-1, 3)
             )
             ground = far_ground * photograph.reshape(*texels.BLURRED_SHAPE, 3)
-        return torch.where(is_hidden[..., None], ground, surroundings)
+        return torch.where(is_ground[..., None], ground, surroundings)
 
     def _compute_reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
         """Return which fraction (n, 3) of even light each texel reflects.
@@ -630,12 +661,15 @@ class Arrangement:
 
     def _compute_object_color(self, color: Tensor) -> Tensor:
         """Return the mean of a base color (h, w, 3) in each texel (n, 3) of a side."""
+        # A small texture has fewer texels than the grid. So the interpolated color is
+        # pooled, as it is on the fine grid.
         fine = self.upsample(color).reshape(*self.fine_shape, 3).permute(2, 0, 1)[None]
-        pooled = functional.adaptive_avg_pool2d(fine, self.texels.grids[0].shape)[0]
+        front_grid = self.texels.grids[0]
+        pooled = functional.adaptive_avg_pool2d(fine, front_grid.shape)[0]
         cell_colors = pooled.permute(1, 2, 0).reshape(-1, 3)
-        return cell_colors[
-            torch.from_numpy(self.texels.cells[self.texels.select_grid(0)])
-        ]
+        # The cells of the first grid are numbered from 0.
+        front_cells = self.texels.cells[self.texels.select_grid(0)]
+        return cell_colors[torch.from_numpy(front_cells)]
 
     def _compute_ground_color(self, padded: Tensor) -> Tensor:
         """Return the base color (n, 3) of the ground's texels.
@@ -646,14 +680,15 @@ class Arrangement:
         Args:
             padded: (H, W + 2, 3) map of the environment.
         """
-        ground = self.texels.positions[self.texels.select_grid(self.n_sides)]
-        if self._capture_height is None:
+        ground_points = self.texels.positions[self._select_ground()]
+        if self._capture_height is None:  # a plain ground
             srgb = torch.tensor(self._scene.definition[0].ground_color)
-            return srgb_to_linear(srgb).expand(len(ground), 3)
+            return srgb_to_linear(srgb).expand(len(ground_points), 3)
         capture_position = torch.tensor([0.0, 0.0, self._capture_height])
-        directions = (torch.from_numpy(ground) - capture_position) @ self.world_to_map.T
-        photograph = texels.look_up_environment(padded, directions)
-        open_irradiance = unshadowed(padded[:, 1:-1]).clamp_min(1e-12)
+        world_directions = torch.from_numpy(ground_points) - capture_position
+        map_directions = world_directions @ self.world_to_map.T
+        photograph = texels.look_up_environment(padded, map_directions)
+        open_irradiance = compute_open_sky_irradiance(padded[:, 1:-1]).clamp_min(1e-12)
         return (photograph * math.pi / open_irradiance).clamp_max(
             MAX_GROUND_REFLECTANCE
         )

@@ -1,6 +1,6 @@
 """Predict images from many cameras and under many environments by light on surfaces.
 
-`find_refusal` returns why a scene's or a space's images cannot be predicted.
+`find_refusal` returns why the images of a scene or a space cannot be predicted.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from advsearch.scene.surface.arrangement import (
 from advsearch.trust.stored_files import scale_limit
 
 MAX_RAYS = 1 << 21  # rays of cameras of one launch
-N_COMPARED_TEXELS = (
-    333  # of an environment's map that are compared with those of others
-)
+N_COMPARED_TEXELS = 333  # texels of a map that are compared with those of other maps
 
 
 class LitCameraView(NamedTuple):
-    """What one of several cameras sees, and under which light."""
+    """View of one camera, and the light that it is seen under."""
 
     camera_index: int  # index of the camera
     view: SurfaceView
-    light: ArrangementLight
-    factor: Tensor | float  # (3,) how many times as bright the light is
+    light: ArrangementLight  # light of a stored environment
+    # (3,) factor on that light, by channel, for the environment of this view
+    light_factor: Tensor | float
 
 
 @dataclass(frozen=True, eq=False)
 class MapFingerprint:
-    """A fingerprint of an environment's map, for comparison with other maps."""
+    """Fingerprint of an environment's map, for comparison with other maps."""
 
-    mean: Tensor  # (3,) of the map
-    texels: Tensor  # (n, 3) some of its texels over the means
+    mean: Tensor  # (3,) mean of the map
+    # (n, 3) some of its texels divided by the mean: equal for all multiples of the map
+    relative_texels: Tensor
 
     @classmethod
     def compute(cls, padded: Tensor) -> MapFingerprint:
@@ -69,35 +69,36 @@ class MapFingerprint:
     def find_factor(self, other: MapFingerprint) -> Tensor | None:
         """Return the factor (3,), by channel, with which this map becomes another one.
 
-        None if the other map is no multiple of it.
+        None if the other map is not a multiple of this one.
         """
-        if self.texels.shape != other.texels.shape or not torch.allclose(
-            self.texels, other.texels, rtol=1e-5, atol=1e-6
+        if self.relative_texels.shape != other.relative_texels.shape:
+            return None
+        if not torch.allclose(
+            self.relative_texels, other.relative_texels, rtol=1e-5, atol=1e-6
         ):
             return None
         return torch.where(self.mean > 0.0, other.mean / self.mean, 1.0)
 
 
 class SurfaceRenderer(Predictor):
-    """Predict images by light on surfaces, in spaces that `find_refusal` does not
-    refuse.
+    """Predict images by light on surfaces, in spaces that `find_refusal` accepts.
 
-    An image is linear in the base color of the object. Light that goes from the object
-    to itself, or to the ground and back, is that of the base color `base_color`; see
-    `update_base_color`.
+    An image is linear in the base color of the object. Light between the object and
+    itself, or from the object to the ground and back, is computed for the base color
+    `base_color`; see `update_base_color`.
 
     Args:
         traced: renderer of the scene.
-        u: (d,) configuration; all but cameras, environment and base color stays as it
-            is there.
+        u: (d,) configuration; everything but cameras, environment and base color keeps
+            its value there.
         seed: seed of the rays from texels.
 
     Attributes:
-        base_color: (h, w, 3) base color.
-        stored_lights: the lights of maps, the oldest first.
-        n_dropped: how many lights were removed for others.
-        fixed_light: the light of all images, see `with_fixed_light`; None for that of
-            the image's own environment.
+        base_color: (h, w, 3) base color for which light between surfaces is computed.
+        stored_lights: lights by the fingerprints of their maps, oldest first.
+        n_dropped: number of lights that were removed to store others.
+        fixed_light: light of all images, see `with_fixed_light`. None if every image
+            has the light of its own environment.
     """
 
     fixed_light: ArrangementLight | None = None
@@ -116,7 +117,8 @@ class SurfaceRenderer(Predictor):
         super().__init__(traced)
         self.n_dropped = 0
         self.stored_lights: dict[MapFingerprint, ArrangementLight] = {}
-        self._base = {
+        # values for inputs that a configuration leaves at those of the scene
+        self._scene_values = {
             name: traced.scene.get_base_value(name)
             for name in (*CAMERA_INPUTS, ENVIRONMENT_INPUT, COLOR_INPUT)
             if name in traced.scene.input_names
@@ -137,7 +139,7 @@ class SurfaceRenderer(Predictor):
 
     def get_color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """Return the base color (h, w, 3) of scene inputs."""
-        return inputs.get(COLOR_INPUT, self._base[COLOR_INPUT])
+        return inputs.get(COLOR_INPUT, self._scene_values[COLOR_INPUT])
 
     def is_applicable(self, inputs: Mapping[str, Tensor]) -> bool:
         """Return whether `predict_images` holds for some scene inputs.
@@ -191,7 +193,9 @@ class SurfaceRenderer(Predictor):
 
     def compute_light(self, inputs: Mapping[str, Tensor]) -> ArrangementLight:
         """Compute the light under the environment of scene inputs."""
-        padded = inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()
+        padded = inputs.get(
+            ENVIRONMENT_INPUT, self._scene_values[ENVIRONMENT_INPUT]
+        ).detach()
         return self.arrangement.compute_light(padded, self.base_color)
 
     def get_light(
@@ -205,7 +209,9 @@ class SurfaceRenderer(Predictor):
         stored; the oldest are dropped first.
         """
         fingerprint = MapFingerprint.compute(
-            inputs.get(ENVIRONMENT_INPUT, self._base[ENVIRONMENT_INPUT]).detach()
+            inputs.get(
+                ENVIRONMENT_INPUT, self._scene_values[ENVIRONMENT_INPUT]
+            ).detach()
         )
         for stored_fingerprint, light in self.stored_lights.items():
             factor = stored_fingerprint.find_factor(fingerprint)
@@ -213,6 +219,7 @@ class SurfaceRenderer(Predictor):
                 return light, factor
         light = self.compute_light(inputs)
         self.stored_lights[fingerprint] = light
+        # `n_bytes` counts the stored lights.
         while len(self.stored_lights) > 1 and self.n_bytes > scale_limit(MAX_BYTES):
             oldest = next(iter(self.stored_lights))
             self.stored_lights.pop(oldest)
@@ -229,13 +236,13 @@ class SurfaceRenderer(Predictor):
 
     def _select_camera_inputs(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs that are the camera's, completed by those of the scene."""
-        names = CAMERA_INPUTS & self._base.keys()
-        return {name: inputs.get(name, self._base[name]) for name in names}
+        names = CAMERA_INPUTS & self._scene_values.keys()
+        return {name: inputs.get(name, self._scene_values[name]) for name in names}
 
     def trace_views(
         self, inputs: Sequence[Mapping[str, Tensor]]
     ) -> Iterator[LitCameraView]:
-        """Yield what each camera sees, in groups of cameras under the same environment.
+        """Yield the view of each camera, in groups of cameras under the same light.
 
         A group is traced in one launch. The next launch is started before the results
         of this one are used, so that the rays are traced while the caller works.
@@ -244,14 +251,17 @@ class SurfaceRenderer(Predictor):
             inputs: scene inputs of each camera. Views come in the order of groups;
                 `LitCameraView.camera_index` is the index in `inputs`.
         """
-        lights = [self._choose_light(camera_inputs) for camera_inputs in inputs]
         cameras_of_light: dict[ArrangementLight, list[int]] = {}
-        for camera_index, (light, _) in enumerate(lights):
+        light_factors = []
+        for camera_index, camera_inputs in enumerate(inputs):
+            light, light_factor = self._choose_light(camera_inputs)
             cameras_of_light.setdefault(light, []).append(camera_index)
+            light_factors.append(light_factor)
         cameras = [
             self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
         ]
-        # A generator, not a list: each `next` starts one launch.
+        # A generator, not a list: each `next` starts one launch, and returns the
+        # function that waits for its samples.
         launches = (
             self.arrangement.start_tracing(
                 [cameras[camera_index] for camera_index in camera_indices], light
@@ -262,11 +272,13 @@ class SurfaceRenderer(Predictor):
         for light, camera_indices in cameras_of_light.items():
             samples = finish_launch()
             # The next launch runs while these samples are used. After the last group
-            # there is none to start.
+            # there is none to start, and `finish_launch` is not called again.
             finish_launch = next(launches, finish_launch)
-            for index, camera_index in enumerate(camera_indices):
-                view = self.arrangement.make_view(samples, index)
-                yield LitCameraView(camera_index, view, light, lights[camera_index][1])
+            for index_in_launch, camera_index in enumerate(camera_indices):
+                view = self.arrangement.make_view(samples, index_in_launch)
+                yield LitCameraView(
+                    camera_index, view, light, light_factors[camera_index]
+                )
 
     def compose_images(
         self,
@@ -278,24 +290,24 @@ class SurfaceRenderer(Predictor):
         """Return the images (n, H, W, 3), sRGB, of an object with a base color.
 
         Args:
-            views: what the n cameras see, in any order.
-            inputs: scene inputs of each camera, whose base color is ignored.
+            views: views of the n cameras, in any order.
+            inputs: scene inputs of each camera, such as its exposure; their base color
+                is ignored.
             color: (h, w, 3) base color; the images are differentiable in it.
             full_configurations: for each camera the values (d,) of all coordinates.
                 Controls that change the finished image, such as blur, read them.
         """
-        fine = self.arrangement.upsample(color)
+        fine_color = self.arrangement.upsample(color)
         # What the surface reflects is the same for all cameras under one light, and is
         # computed once.
-        reflected = dict[ArrangementLight, Tensor]()
+        reflected_by_light = dict[ArrangementLight, Tensor]()
         images = dict[int, Tensor]()
         for lit_view in views:
-            if lit_view.light not in reflected:
-                reflected[lit_view.light] = lit_view.light.compute_reflected(fine)
-            radiance = (
-                lit_view.view.compute_radiance(reflected[lit_view.light])
-                * lit_view.factor
-            )
+            light = lit_view.light
+            if light not in reflected_by_light:
+                reflected_by_light[light] = light.compute_reflected(fine_color)
+            radiance = lit_view.view.compute_radiance(reflected_by_light[light])
+            radiance = radiance * lit_view.light_factor
             images[lit_view.camera_index] = self.path_renderer.finish_image(
                 radiance,
                 inputs[lit_view.camera_index],
@@ -306,9 +318,10 @@ class SurfaceRenderer(Predictor):
         )
 
     def predict_images(self, us: Sequence[Tensor]) -> list[Tensor]:
-        """Return images of configurations that differ in camera and environment alone.
+        """Return images of configurations that differ in camera and environment only.
 
-        `batch_size` of them are made in one launch.
+        Args:
+            us: configurations (d,). `batch_size` of them are traced in one launch.
         """
         images = list[Tensor]()
         with torch.no_grad():
@@ -316,29 +329,31 @@ class SurfaceRenderer(Predictor):
                 batch = us[start : start + self.batch_size]
                 inputs = [self.compute_inputs(u) for u in batch]
                 images += self.compose_images(
-                    self.trace_views(inputs), inputs, self.base_color, batch
+                    self.trace_views(inputs),
+                    inputs,
+                    color=self.base_color,
+                    full_configurations=batch,
                 )
         return images
 
     def predict_radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """Return the radiance (H, W, 3) of scene inputs, with their own base color."""
         (lit_view,) = self.trace_views([inputs])
-        fine = self.arrangement.upsample(self.get_color(inputs))
-        return (
-            lit_view.view.compute_radiance(lit_view.light.compute_reflected(fine))
-            * lit_view.factor
-        )
+        fine_color = self.arrangement.upsample(self.get_color(inputs))
+        reflected = lit_view.light.compute_reflected(fine_color)
+        return lit_view.view.compute_radiance(reflected) * lit_view.light_factor
 
 
 def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
-    """Return why light on surfaces cannot predict a space's images; None if it may.
+    """Return why light on surfaces cannot predict a space's images; None if it can.
 
     None does not mean that the prediction is good: that is measured afterwards.
 
     Args:
         renderer: renderer of the space.
-        varying: names of the controls that vary, which may change cameras and the
-            environment. The others are searched, and may change base colors alone.
+        varying: names of the controls that vary, which may change `FREE_INPUTS`, such
+            as cameras and the environment. The others are searched, and may change
+            only the base color.
     """
     refusal = find_scene_refusal(renderer)
     if refusal is not None:
@@ -347,12 +362,14 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
         if group.control in varying or group.estimator == "image":
             continue
         if renderer.routes.get(group.name, frozenset()) != {COLOR_INPUT}:
-            return Refusal(f"{group.name} changes more than the object's base colour")
+            return Refusal(f"{group.name} changes more than the object's base color")
     changed = find_changed_inputs(renderer, varying)
+    # A change of anything else moves or repaints surfaces, so that the stored light
+    # would no longer hold.
     if not changed <= FREE_INPUTS:
         return Refusal(
             f"{', '.join(sorted(changed - FREE_INPUTS))} varies, and light on "
-            "surfaces is kept for one arrangement"
+            "surfaces is stored for one arrangement"
         )
     if not changed & CAMERA_INPUTS:
         return Refusal("no camera varies", RefusalCause.NO_CAMERA)
@@ -371,8 +388,8 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
         return Refusal(
             "the object's surface repeats its texture, or is one of Mitsuba's own"
         )
-    has_more = len(description.parts) > 0 or description.has_emission
-    if description.environment is None or has_more:
+    has_more_light_or_parts = len(description.parts) > 0 or description.has_emission
+    if description.environment is None or has_more_light_or_parts:
         return Refusal(
             "there is more in the scene than the object, its ground and an environment"
         )
@@ -380,7 +397,9 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
         return Refusal("there is haze, a lens with an aperture, or a plain background")
     if description.get_number("camera.drops") > 0.0:
         return Refusal("there are raindrops before the camera")
-    return None if renderer.formation.denoiser == "oidn" else NOISE
+    if renderer.formation.denoiser != "oidn":
+        return NOISE
+    return None
 
 
 def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozenset[str]:

@@ -32,18 +32,18 @@ from advsearch.scene.raster import BORDER_TEXELS, Charts, rasterize_charts
 from advsearch.scene.transport.matrix import to_torch_csr
 
 GROUND_TEXELS = 112  # texels along each side of the ground
-# half the width of the ground that has texels, object sizes; further out there is the
-# light of its border
+# Half the width of the ground that has texels, in object sizes. The ground beyond has
+# the light of its border.
 MAX_GROUND_REACH = 12.0
-# width of the ground's texels under the center of the object, object sizes: contact
-# shadows are that sharp
+# Width of the ground's texels under the center of the object, in object sizes. It
+# limits how sharp contact shadows are.
 MIN_TEXEL_WIDTH = 0.01
 FILTER_REACH = 2  # texels in each direction whose light counts at a point
-GRID_SIGMA = 0.8  # standard deviation of the weight of their distance, texels
+GRID_SIGMA = 0.8  # standard deviation of the weight by distance in the grid, texels
 SPACE_SIGMA = 1.5
-"""Standard deviation of the weight of their distance in space, widths of a texel.
+"""Standard deviation of the weight by distance in space, in widths of a texel.
 
-Texels of another chart do not count, nor those of the other wall of a cup.
+This weight excludes texels of another chart and those of the other wall of a cup.
 """
 
 BINOMIAL = (1, 4, 6, 4, 1)
@@ -51,15 +51,17 @@ BINOMIAL = (1, 4, 6, 4, 1)
 
 @dataclass(frozen=True, eq=False)
 class LitTexels:
-    """The texels that store light: those cells of all grids that lie on a surface."""
+    """Texels that store light: the cells of all grids that lie on a surface.
 
-    grids: tuple[TexelGrid, ...]  # grids of each surface, the searched one first
+    A cell that lies on no surface is no texel; it takes the light of the nearest one.
+    """
+
+    grids: tuple[TexelGrid, ...]  # grid of each surface, the searched one first
     positions: Float32Array  # (n, 3) positions in world space
     normals: Float32Array  # (n, 3)
-    cells: IntArray  # (n,) index of the cell of all grids that each lies in
-    # (cells of all grids,) index of the texel whose light each cell has, the nearest
-    texel_of_cell: IntArray
-    # index of the first texel of each grid, and last the number of all texels
+    cells: IntArray  # (n,) index of each texel's cell, among the cells of all grids
+    texel_of_cell: IntArray  # (cells of all grids,) index of each cell's nearest texel
+    # index of the first texel of each grid, followed by the number of all texels
     first_texels: tuple[int, ...]
 
     def select_grid(self, grid_index: int) -> slice:
@@ -73,8 +75,8 @@ def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
     The cells and texels of a surface get the numbers that follow those of the surface
     before it.
     """
-    # Indices of the first texel and the first cell of each surface. The last entry is
-    # the total number.
+    # Indices of the first texel and the first cell of each surface. The last entries
+    # are the total numbers, as in `LitTexels.first_texels`.
     texel_bounds = np.cumsum([0] + [len(texels.positions) for texels in surfaces])
     cell_bounds = np.cumsum([0] + [texels.grids[0].n_cells for texels in surfaces])
     grids = []
@@ -92,7 +94,7 @@ def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
         normals=np.concatenate([texels.normals for texels in surfaces]),
         cells=np.concatenate(cells),
         texel_of_cell=np.concatenate(texel_of_cell),
-        first_texels=tuple(int(texel_offset) for texel_offset in texel_bounds),
+        first_texels=tuple(texel_bounds.tolist()),
     )
 
 
@@ -107,23 +109,31 @@ def make_mesh_texels(
 
     Args:
         name: name of the mesh.
-        charts: rasterised texture coordinates of the mesh.
+        charts: rasterized texture coordinates of the mesh.
         vertices: (V, 3) in world space.
         normals: (V, 3) in world space.
         side: side of the faces that the texels are on: 1 the front, -1 the back, 0
             both.
     """
     position, normal = _interpolate(charts, vertices, normals)
-    # Texels are the covered cells, numbered row by row: the index of each. In cells
-    # that are not covered the number means nothing.
+    # Texels are the covered cells, numbered row by row. This is the texel index of each
+    # covered cell; for other cells the number means nothing.
     texel_of_covered = np.cumsum(charts.is_covered.ravel()) - 1
+    nearest_covered = _find_nearest(charts.is_covered)
     rows, columns = np.nonzero(charts.is_covered)
+    grid = TexelGrid(
+        name,
+        first_cell=0,
+        shape=charts.is_covered.shape,
+        warp=None,
+        face_side=side,
+    )
     return LitTexels(
-        grids=(TexelGrid(name, 0, charts.is_covered.shape, warp=None, face_side=side),),
+        grids=(grid,),
         positions=position[rows, columns],
         normals=normal[rows, columns],
         cells=np.flatnonzero(charts.is_covered),
-        texel_of_cell=texel_of_covered[_find_nearest(charts.is_covered)],
+        texel_of_cell=texel_of_covered[nearest_covered],
         first_texels=(0, len(rows)),
     )
 
@@ -131,7 +141,7 @@ def make_mesh_texels(
 def make_ground_texels(
     name: str, height: float, reach: float, center: tuple[float, float]
 ) -> LitTexels:
-    """Return the texels over a level plane, small under the object and large far off.
+    """Return the texels over a level plane, small under the object and larger outwards.
 
     Along each axis of the grid, the position p from -1 to 1 lies at the distance
     `scale * sinh(rate * p)` from the center: texels are narrowest at the center, and
@@ -144,9 +154,11 @@ def make_ground_texels(
         center: x and y of the object's center.
     """
     reach = min(reach, MAX_GROUND_REACH)
-    # The ratio is that of the width of equal texels to `MIN_TEXEL_WIDTH`, the width
-    # that the texel at the center shall have.
-    rate = _find_warp_rate(reach / (MIN_TEXEL_WIDTH * GROUND_TEXELS / 2.0))
+    # At the center the slope of scale * sinh(rate * p) is scale * rate; with equal
+    # texels it would be the reach. Their ratio is sinh(rate) / rate, and the texel at
+    # the center gets the width `MIN_TEXEL_WIDTH`.
+    equal_width = 2.0 * reach / GROUND_TEXELS
+    rate = _find_warp_rate(equal_width / MIN_TEXEL_WIDTH)
     scale = reach / math.sinh(rate)
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
     axis_offset = scale * np.sinh(rate * axis_position)
@@ -156,7 +168,10 @@ def make_ground_texels(
     up = np.array([0.0, 0.0, 1.0], dtype=np.float32)
     normals = np.broadcast_to(up, positions.shape).copy()
     grid = TexelGrid(
-        name, 0, (GROUND_TEXELS, GROUND_TEXELS), (center[0], center[1], scale, rate)
+        name,
+        first_cell=0,
+        shape=(GROUND_TEXELS, GROUND_TEXELS),
+        warp=(center[0], center[1], scale, rate),
     )
     cells = np.arange(GROUND_TEXELS * GROUND_TEXELS)
     return LitTexels(
@@ -220,7 +235,10 @@ def _weigh_neighbours(
     texel_at = np.where(charts.is_covered, texel_at, -1)
 
     def weigh(row: IntArray, column: IntArray, texel: IntArray) -> Float64Array:
-        """Return the weights (N,) of the neighbours at rows and columns."""
+        """Return the weights (N,) of the neighbours at rows and columns.
+
+        An index of -1 reads the last texel, and `is_used` sets its weight to 0.
+        """
         grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * GRID_SIGMA**2)
         offset = texels.positions[texel] - points
         distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
@@ -235,9 +253,10 @@ def _weigh_neighbours(
     neighbours = []
     weights = []
     for row, column in _iter_neighbourhood(y, x):
-        inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
-        clipped = row.clip(0, n_rows - 1), column.clip(0, n_columns - 1)
-        texel = np.where(inside, texel_at[clipped], -1)
+        is_inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
+        clipped_row = row.clip(0, n_rows - 1)
+        clipped_column = column.clip(0, n_columns - 1)
+        texel = np.where(is_inside, texel_at[clipped_row, clipped_column], -1)
         neighbours.append(texel)
         weights.append(weigh(row, column, texel))
     return np.stack(neighbours, axis=1), np.stack(weights, axis=1)
@@ -251,6 +270,8 @@ def _use_nearest_texel(
     weights: Float64Array,
 ) -> None:
     """Give all the weight to the nearest texel if no neighbour of a point has any.
+
+    Both `texel_index` and `weights` are changed in place.
 
     Args:
         texels: texels of the mesh.
@@ -300,6 +321,8 @@ def make_lookup_matrix(
         buried = np.zeros_like(buried)
     fine_charts = rasterize_charts(charts.mesh, shape)
     position, normal = _interpolate(fine_charts, vertices, normals)
+    # Cells up to `BORDER_TEXELS` outside of a chart count too: interpolation at the
+    # chart's border reads them.
     rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
     points = position[rows, columns]
     point_normals = normal[rows, columns]
@@ -323,8 +346,10 @@ def make_lookup_matrix(
     _use_nearest_texel(texels, charts, grid_position, texel_index, weights)
     weights /= weights.sum(axis=1, keepdims=True)
 
-    size = (shape[0] * shape[1], texels.first_texels[1])
-    return _make_sparse(rows * shape[1] + columns, texel_index, weights, size)
+    n_fine_cells = shape[0] * shape[1]
+    n_texels = texels.first_texels[1]  # number of texels of the first surface
+    fine_cell = rows * shape[1] + columns
+    return _make_sparse(fine_cell, texel_index, weights, (n_fine_cells, n_texels))
 
 
 def _make_sparse(
@@ -366,29 +391,33 @@ def _iter_neighbourhood(
 ) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield rows and columns (N,) of the neighbours of positions in a grid.
 
-    A position's neighbours are the texels up to `FILTER_REACH` from the nearest one;
-    each step yields one neighbour of all positions.
+    A position's neighbours are the texels up to `FILTER_REACH` from the texel nearest
+    to it. Each step yields one neighbour of all positions.
+
+    Args:
+        y: (N,) rows of the positions; the center of a texel has an integer.
+        x: (N,) columns of the positions, likewise.
     """
+    nearest_row = np.round(y).astype(int)
+    nearest_column = np.round(x).astype(int)
     for row_offset in range(-FILTER_REACH, FILTER_REACH + 1):
         for column_offset in range(-FILTER_REACH, FILTER_REACH + 1):
-            row = np.round(y).astype(int) + row_offset
-            column = np.round(x).astype(int) + column_offset
-            yield row, column
+            yield nearest_row + row_offset, nearest_column + column_offset
 
 
 def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     """Return the matrix that smooths the light of a ground, by 5 x 5 binomial weights.
 
-    Texels that see nothing of the sky lie under something. What is next to it is not
-    mixed with their darkness: they have the smoothed light of the nearest texel that
-    sees some.
+    A texel that sees nothing of the sky lies under something, and is dark. It does not
+    darken its neighbours: it gets the smoothed light of the nearest texel that sees the
+    sky.
 
     Args:
-        ground: the texels of a ground.
+        ground: texels of a ground, of whose grid every cell is a texel.
         sees_sky: (n,) whether each sees something of the sky; if none does, all count.
 
     Returns:
-        Sparse, (cells, texels).
+        Sparse, (texels, texels).
     """
     width = ground.grids[0].shape[0]
     if not sees_sky.any():
@@ -405,8 +434,9 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
         scipy.sparse.kron(axis_weights, axis_weights)
         @ scipy.sparse.diags_array(is_used.ravel().astype(float))
     )
-    row_sums = np.repeat(weights.sum(axis=1), np.diff(weights.indptr))
-    weights.data /= np.maximum(row_sums, 1e-12)
+    entries_per_row = np.diff(weights.indptr)
+    row_sum_of_entry = np.repeat(weights.sum(axis=1), entries_per_row)
+    weights.data /= np.maximum(row_sum_of_entry, 1e-12)
     return to_torch_csr(weights.astype(np.float32)[nearest_used])
 
 
@@ -453,18 +483,17 @@ BLUR_WIDTHS = (
 )
 """Angles by which the environment is blurred for gloss, radians."""
 BLURRED_SHAPE = (64, 128)  # rows and columns of the blurred maps
-# multiples of the mean luminance above which light of the environment is hot: it has
-# rays of its own
+# Light of the environment above this multiple of the mean luminance is hot: texels
+# send rays towards it.
 HOT_FACTOR = 8.0
-HOT_RAYS = 48  # rays from each texel towards such light
+HOT_RAYS = 48  # rays from each texel towards hot light
 HOT_LATTICE = (7, 11)
 """Steps along rows and columns of a lattice of `HOT_RAYS` points.
 
 11 / 7 is 29 modulo 48, next to the golden ratio, and both coordinates are even.
 """
-MIN_HOT_FRACTION = (
-    0.02  # fraction of the light up to which what is hot is left to the cells
-)
+# If no more than this fraction of all light is hot, it is left to the cells.
+MIN_HOT_FRACTION = 0.02
 LUMINANCE_WEIGHTS = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
@@ -472,13 +501,12 @@ LUMINANCE_WEIGHTS = torch.tensor([0.2126, 0.7152, 0.0722])
 class SkyLight:
     """An environment's light, prepared for look-ups."""
 
-    padded: Tensor  # (H, W + 2, 3)
-    # (rows x columns, 3) mean radiance of each of `SKY_SHAPE`, without what is hot
+    padded: Tensor  # (H, W + 2, 3) map, with a copied column at each end
+    # (rows x columns, 3) mean radiance of each cell of `SKY_SHAPE`, without hot light
     cells: Tensor
-    map: Tensor  # `BLURRED_SHAPE`, (h, w, 3)
-    # (k, 3) unit directions in the map's own axes towards what is hot, and (k, 3)
-    # radiance times solid angle
-    hot: tuple[Tensor, Tensor]
+    map: Tensor  # (h, w, 3) all light, in the shape `BLURRED_SHAPE`
+    hot_directions: Tensor  # (k, 3) unit directions of hot light, in the map's axes
+    hot_light: Tensor  # (k, 3) radiance times solid angle from each of them
 
 
 def prepare_sky(padded: Tensor) -> SkyLight:
@@ -491,10 +519,11 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     """
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
+    # The texels of the first and last row are centered at the poles.
     polar = torch.linspace(0.0, math.pi, n_rows)
-    # The solid angle of a texel is proportional to the sine, which is 1 at the horizon.
-    # At a pole the sine is 0, but the texel there reaches half a texel from the pole:
-    # it takes the sine at a quarter of a texel, the middle of that.
+    # The solid angle of a texel is proportional to the sine of its polar angle. At a
+    # pole the sine is 0, but the texel there reaches half a texel from the pole. So it
+    # gets the sine at a quarter of a texel, in the middle of that half.
     sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
     sine = sine[:, None].expand(n_rows, n_columns)
     luminance = radiance @ LUMINANCE_WEIGHTS
@@ -505,16 +534,20 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     ).clamp_min(0.0)
     hot_power = hot_fraction * luminance * sine
     if float(hot_power.sum()) > MIN_HOT_FRACTION * mean_luminance * float(sine.sum()):
-        hot = _sample_hot(radiance * hot_fraction[..., None], hot_power)
+        hot_directions, hot_light = _sample_hot(
+            radiance * hot_fraction[..., None], hot_power
+        )
         remaining = radiance * (1.0 - hot_fraction[..., None])
     else:
-        hot = (torch.zeros(0, 3), torch.zeros(0, 3))
+        hot_directions = torch.zeros(0, 3)
+        hot_light = torch.zeros(0, 3)
         remaining = radiance
     return SkyLight(
         padded=padded,
         cells=_average_cells(remaining, sine, SKY_SHAPE).reshape(-1, 3),
         map=_average_cells(radiance, sine, BLURRED_SHAPE),
-        hot=hot,
+        hot_directions=hot_directions,
+        hot_light=hot_light,
     )
 
 
@@ -527,13 +560,14 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     lattice (`HOT_LATTICE`); so even a sun of one texel has a soft shadow.
 
     Args:
-        radiance: (H, W, 3) of what is hot.
-        power: (H, W) luminance times solid angle, in the solid angle of a texel at the
-            horizon.
+        radiance: (H, W, 3) radiance of the hot light.
+        power: (H, W) luminance times solid angle; a texel at the horizon has the solid
+            angle 1.
 
     Returns:
         (k, 3) unit directions in the map's axes, and (k, 3) radiance times solid angle;
-        k is `HOT_RAYS`, and all have the same luminance.
+        k is `HOT_RAYS`. All rays carry the same luminance, since brighter texels get
+        more of them.
     """
     n_rows, n_columns = power.shape
     cumulative = torch.cumsum(power.double().reshape(-1), 0)
@@ -544,15 +578,18 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     ).clamp_max(power.numel() - 1)
     row = texel // n_columns
     column = texel % n_columns
+    # The steps of the lattice are taken modulo its size, and scaled to [0, 1].
     row_offset = _to_tent((index * HOT_LATTICE[0] % HOT_RAYS + 0.5) / HOT_RAYS)
     column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
+    # The first and last row are centered at the poles. A row begins at azimuth 0 with
+    # the left edge of its first texel.
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
     # solid angle of a texel at the horizon, in steradians
     solid_angle = math.pi / (n_rows - 1) * 2.0 * math.pi / n_columns
     power_per_ray = float(power.sum()) * solid_angle / HOT_RAYS
-    color = _normalize_luminance(radiance[row, column])
-    return _to_direction(polar, azimuth, dim=1).float(), color * power_per_ray
+    unit_color = _normalize_luminance(radiance[row, column])
+    return _to_direction(polar, azimuth, dim=1).float(), unit_color * power_per_ray
 
 
 def _normalize_luminance(color: Tensor) -> Tensor:
@@ -579,13 +616,19 @@ def _to_direction(polar: Tensor, azimuth: Tensor, dim: int) -> Tensor:
     return torch.stack([x, polar.cos(), z], dim=dim)
 
 
-def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
+def _average_cells(
+    radiance: Tensor, solid_angle: Tensor, size: tuple[int, int]
+) -> Tensor:
     """Return the mean radiance in each cell of a coarser map, weighted by solid angle.
 
-    Radiance is (H, W, 3), `sine` the solid angles (H, W); the result is (*size, 3).
+    Args:
+        radiance: (H, W, 3) map.
+        solid_angle: (H, W) solid angles of its texels, in any unit.
+        size: rows and columns of the result (*size, 3).
     """
     # The solid angles are pooled as a fourth channel.
-    weighted = torch.cat([radiance * sine[..., None], sine[..., None]], dim=-1)
+    weight = solid_angle[..., None]
+    weighted = torch.cat([radiance * weight, weight], dim=-1)
     pooled = functional.adaptive_avg_pool2d(weighted.permute(2, 0, 1)[None], size)
     pooled = pooled[0].permute(1, 2, 0)
     return pooled[..., :3] / pooled[..., 3:].clamp_min(1e-12)
@@ -594,9 +637,10 @@ def _average_cells(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Ten
 def blur_map(radiance: Tensor) -> Tensor:
     """Blur a map (h, w, 3) by each of `BLUR_WIDTHS`.
 
-    A width is the root mean square angle over both directions, in radians: so the
-    Gaussian of each direction has a sigma of the width / sqrt(2). Columns are blurred
-    first, over the polar angle; then rows, over the angle along them.
+    A width is the root mean square of the angle by which light is spread, in radians.
+    Its square is the sum of the variances over two directions, so that the Gaussian of
+    each has a sigma of the width / sqrt(2). Columns are blurred first, over the polar
+    angle; then rows, over the angle along them.
 
     Returns:
         (n_widths, h, w, 3) one blurred map for each width.
@@ -612,8 +656,8 @@ def blur_map(radiance: Tensor) -> Tensor:
         column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
         column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
         # A row is periodic, and so is blurred in the frequency domain, where a Gaussian
-        # is a Gaussian too. Towards the poles a row spans a shorter angle, and the same
-        # blur takes more columns.
+        # is a Gaussian too. A row spans an angle proportional to the sine of its polar
+        # angle: an angle sigma along the row is an azimuth of sigma / sine.
         row_filter = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )
@@ -637,7 +681,7 @@ def compute_directions(size: tuple[int, int]) -> Tensor:
 def compute_irradiance(
     view_matrices: tuple[Tensor, Tensor],
     sky: SkyLight,
-    direct: Tensor | None,
+    hot_cosines: Tensor | None,
     reflectance: Tensor,
     bounces: int,
 ) -> Tensor:
@@ -650,15 +694,16 @@ def compute_irradiance(
         view_matrices: two sparse matrices from radiance to irradiance: one from the
             sky's cells (n, cells), one from the texels to each other (n, n).
         sky: the environment.
-        direct: (n, k) cosines towards hot light where it is visible; None if nothing is
-            hot.
-        reflectance: (n, 3) of the texels.
+        hot_cosines: (n, k) cosines towards hot light, 0 where it is hidden; None if
+            nothing is hot.
+        reflectance: (n, 3) reflectance of the texels.
         bounces: how often light goes from texel to texel.
     """
     sky_view, texel_view = view_matrices
     from_sky = sky_view @ sky.cells
-    if direct is not None:
-        from_sky = from_sky + direct @ sky.hot[1]
+    if hot_cosines is not None:
+        # Radiance times solid angle times cosine is an irradiance.
+        from_sky = from_sky + hot_cosines @ sky.hot_light
     irradiance = from_sky
     for _ in range(bounces):
         irradiance = from_sky + texel_view @ (reflectance * irradiance / math.pi)
@@ -704,8 +749,9 @@ def make_view_matrices(
 def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:
     """Return the radiance (n, 3) of an environment in n directions.
 
-    The nearest texel counts, without interpolation. In the map's axes y is up, and the
-    texels of row 0 are straight up.
+    The nearest texel counts, without interpolation. In the map's axes y is up. The
+    texels of the first row are centered straight up, those of the last straight down;
+    the first column begins at azimuth 0 with its left edge.
 
     Args:
         padded: (H, W + 2, 3) map, with a copied column at each end.
@@ -714,7 +760,7 @@ def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:
     n_rows = padded.shape[0]
     n_columns = padded.shape[1] - 2
     x, y, z = (directions / directions.norm(dim=1, keepdim=True)).unbind(dim=1)
-    azimuth = torch.remainder(torch.atan2(x, -z) / (2.0 * math.pi), 1.0)
+    turn = torch.remainder(torch.atan2(x, -z) / (2.0 * math.pi), 1.0)  # 0 to 1
     row = (torch.acos(y.clamp(-1.0, 1.0)) * ((n_rows - 1) / math.pi)).round().long()
-    column = (azimuth * n_columns).long().clamp_max(n_columns - 1)
-    return padded[row, 1 + column]
+    column = (turn * n_columns).long().clamp_max(n_columns - 1)
+    return padded[row, 1 + column]  # column 0 is a copy of the last

@@ -7,10 +7,11 @@ Light of different lamps adds up, channel by channel, so that
     weight: three color channels, from the configuration
 
 where a basis image is rendered once with one light alone, and denoised once. An
-environment whose power, exposure and tint change is one light. Where spherical
-harmonics are added to it, each of them is another one, next to the map itself: the
-weights are those with which the basis maps come nearest to the map, by least squares
-over solid angle. They need not meet it, since it is cut off at zero.
+environment whose power, exposure and tint change is one light. If spherical harmonics
+are added to it, each harmonic is a further light, next to the map itself. Then the
+weights are those with which the sum of these basis maps comes nearest to the map, by
+least squares over solid angle. The sum may differ from the map, in which negative
+values are replaced by zero.
 """
 
 from __future__ import annotations
@@ -49,13 +50,13 @@ from advsearch.scene.transport.matrix import (
 )
 
 ENVIRONMENT_INPUT = "environment.padded"
-# ends of names of inputs that are the light of a lamp, (3,)
+# suffixes of the names of inputs that are the light of a lamp, (3,)
 LAMP_SUFFIXES = (".intensity", ".radiance")
-# largest relative difference between a map and a multiple of another one: float32
-# through a tone curve and back
+# Largest relative difference at which a map counts as a multiple of another one. It
+# allows for float32 numbers that go through a tone curve and back.
 MAX_RELATIVE_DIFFERENCE = 1e-3
 MAX_OPTIONS = 64  # largest number of options of a discrete choice that are compared
-TINY = 1e-30
+TINY = 1e-30  # smallest brightness to divide by
 COARSE_STEP = 4  # step in rows and columns of a map for a first comparison
 
 
@@ -69,7 +70,10 @@ def find_light_inputs(renderer: Renderer) -> frozenset[str]:
 
 
 def has_fixed_lights(renderer: Renderer) -> bool:
-    """Return whether a light of the scene is no input: one of a Mitsuba scene."""
+    """Return whether the scene has lights that are no inputs.
+
+    Such lights come from a Mitsuba scene, and cannot be switched off.
+    """
     return any(
         isinstance(part, PluginPart) and part.emits_light
         for part in renderer.scene.definition[0].parts
@@ -81,16 +85,18 @@ def has_fixed_lights(renderer: Renderer) -> bool:
 
 @dataclass(frozen=True)
 class Lighting:
-    """Which groups of a space change only light, exposure or the finished image."""
+    """The groups of coordinates that change only light, exposure or the finished image.
 
-    # The inputs that each group changes, by its name `control.parameter`; none if it
-    # changes the finished image.
+    A group is one parameter of a control, such as "environment.exposure".
+    """
+
+    # inputs that each group changes, by its name `control.parameter`; none if it only
+    # changes the finished image
     groups: Mapping[str, frozenset[str]]
-    harmonic_groups: frozenset[
-        str
-    ]  # groups that add spherical harmonics to the environment
-    # Brightest values of the others that change a map, their coordinates and the values
-    # where it is brightest: a basis map must not be black in a channel.
+    # names of groups that add spherical harmonics to the environment
+    harmonic_groups: frozenset[str]
+    # For each other group that changes the environment, its coordinates and the values
+    # at which the environment is brightest. A basis map must not be black in a channel.
     brightest_values: Sequence[tuple[slice, Tensor]] = ()
 
     @property
@@ -105,13 +111,14 @@ def find_lighting(renderer: Renderer) -> Lighting:
     Each group is varied alone, and the scene inputs are compared. So the result does
     not depend on which kind of control sets them.
 
-    Some lights of a Mitsuba scene are no inputs. They cannot be switched off, and would
-    be counted again in the image of every light that is traced by itself. In a scene
-    with such lights, only groups that change nothing but the finished image are
-    returned.
+    Some lights of a Mitsuba scene cannot be switched off. If the image of each light
+    were traced alone, it would contain these lights too, and their sum would contain
+    them several times. So in such a scene, only groups that change nothing but the
+    finished image are returned.
     """
-    # Other groups stay half way between the start and the center of the unit cube:
-    # there a value is rarely at a border, where a change may have no effect.
+    # While one group is varied, all others stay half way between the start and the
+    # center of the unit cube, (start + 0.5) / 2. There a value is rarely at a border,
+    # where a change may have no effect.
     reference = 0.5 * renderer.start + 0.25
     groups = {}
     harmonic_groups = set()
@@ -127,6 +134,8 @@ def find_lighting(renderer: Renderer) -> Lighting:
                 continue
             groups[group.name] = effect.changed
             if effect.is_harmonic:
+                # Basis maps of its own represent what it adds: the map of the
+                # environment itself need not be bright.
                 harmonic_groups.add(group.name)
             elif ENVIRONMENT_INPUT in effect.changed:
                 brightest = effect.brightest[group.coordinates]
@@ -135,22 +144,21 @@ def find_lighting(renderer: Renderer) -> Lighting:
 
 
 class _Effect(NamedTuple):
-    """What a group of coordinates changes, if that is light or the finished image."""
+    """Effect of a group of coordinates that changes only light or the finished image."""
 
-    changed: frozenset[str]  # inputs
-    is_harmonic: bool  # it adds spherical harmonics to the environment
-    brightest: Tensor  # (d,) configuration with the brightest environment
+    changed: frozenset[str]  # names of the inputs that it changes
+    is_harmonic: bool  # whether it adds spherical harmonics to the environment
+    # (d,) configuration with the brightest environment, among those that were compared
+    brightest: Tensor
 
 
 def _measure_effect(
     renderer: Renderer, group: Group, reference: Tensor, base_inputs: Inputs
 ) -> _Effect | None:
-    """Return what a group of coordinates changes; None if that is more than light.
+    """Return the effect of a group of coordinates; None if it changes more than light.
 
-    Several configurations, which differ from `reference` in this group alone, are
-    compared with `base_inputs`, the scene inputs at `reference`. The effect names the
-    inputs that change; its brightest configuration is that whose environment has most
-    light.
+    Several configurations, which differ from `reference` in this group only, are
+    compared with `base_inputs`, the scene inputs at `reference`.
     """
     changed: set[str] = set()
     is_harmonic = False
@@ -160,7 +168,10 @@ def _measure_effect(
         inputs = renderer.scene.assembly(renderer.space.inputs(configuration))
         for name in base_inputs.keys() | inputs.keys():
             change = _find_change(
-                name, base_inputs.get(name), inputs.get(name), group.size
+                name,
+                before=base_inputs.get(name),
+                after=inputs.get(name),
+                n_coordinates=group.size,
             )
             if change is _Change.OTHER:
                 return None
@@ -211,7 +222,7 @@ class _Change(Enum):
 def _find_change(
     name: str, before: Tensor | None, after: Tensor | None, n_coordinates: int
 ) -> _Change:
-    """Return in which way a group of coordinates changes one input.
+    """Return how a group of coordinates changes one input.
 
     Args:
         name: name of the input.
@@ -232,33 +243,38 @@ def _find_change(
         return _Change.POWER
     if name != ENVIRONMENT_INPUT or before.shape != after.shape:
         return _Change.OTHER
-    if _is_explained(before[None], after):
+    # a multiple of the map before, by one factor for each color channel
+    if _is_weighted_sum(after, before[None]):
         return _Change.POWER
-    # A control that adds harmonics has a coordinate for each coefficient.
+    # A control that adds harmonics has a coordinate for each coefficient. So a group
+    # with a single coordinate adds none, and the expensive test below is saved.
     if n_coordinates == 1:
         return _Change.OTHER
     harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
     # The fit to every `COARSE_STEP`th pixel rejects most other changes in a tenth of
     # the time.
-    if not _is_explained(
-        harmonic_basis[:, ::COARSE_STEP, ::COARSE_STEP],
+    if not _is_weighted_sum(
         after[::COARSE_STEP, ::COARSE_STEP],
+        harmonic_basis[:, ::COARSE_STEP, ::COARSE_STEP],
     ):
         return _Change.OTHER
-    return _Change.HARMONICS if _is_explained(harmonic_basis, after) else _Change.OTHER
+    if _is_weighted_sum(after, harmonic_basis):
+        return _Change.HARMONICS
+    return _Change.OTHER
 
 
-def _is_explained(basis: Tensor, target: Tensor) -> bool:
+def _is_weighted_sum(target: Tensor, basis: Tensor) -> bool:
     """Return whether a map (H, W, 3) is a weighted sum of basis maps (k, H, W, 3).
 
-    Only texels count in which the map and the first basis map are both positive: where
-    harmonics made a sum negative, it was cut off at zero.
+    Where a sum with harmonics is negative, the map is 0 instead. So only texels count
+    in which the map is positive, and the first basis map too: that is the environment
+    before harmonics were added, which may have been cut off in the same manner.
     """
     is_lit = ((basis[0] > 0.0) & (target > 0.0)).to(torch.float32)
     basis_maps = BasisMaps(basis * is_lit)
-    residual = target * is_lit - basis_maps.compose(
-        basis_maps.fit_weights(target * is_lit)
-    )
+    lit_target = target * is_lit
+    weights = basis_maps.fit_weights(lit_target)
+    residual = lit_target - basis_maps.compose(weights)
     return float(residual.norm()) <= MAX_RELATIVE_DIFFERENCE * float(target.norm())
 
 
@@ -266,7 +282,8 @@ def _make_harmonic_maps(like: Tensor) -> Tensor:
     """Return spherical harmonics of degrees 0 to 2 as maps (9, H, W, 3).
 
     Light cannot be negative. So each harmonic is raised to at least zero by adding a
-    multiple of the first one, which is constant: sums of the maps stay the same.
+    multiple of the first one, which is constant. The weighted sums of the raised maps
+    are all weighted sums of the harmonics, with other weights.
 
     Args:
         like: (H, W, 3) map whose size and mean the results have. Its first and last
@@ -275,7 +292,7 @@ def _make_harmonic_maps(like: Tensor) -> Tensor:
     basis = compute_real_harmonics(like.shape[0], like.shape[1] - 2)
     # (9, H, W): the last column before the first, and the first after the last
     padded = torch.cat([basis[:, -1:], basis, basis[:, :1]], dim=1).permute(2, 0, 1)
-    # the first is 1 everywhere: to subtract the minimum is to add a multiple of it
+    # The minimum is a negative multiple of the first harmonic, which is 1 everywhere.
     lifted = padded - padded.amin(dim=(1, 2), keepdim=True).clamp_max(0.0)
     scaled = lifted * float(like.mean().clamp_min(1e-12))
     return scaled[..., None].expand(-1, -1, -1, 3).contiguous()
@@ -294,14 +311,15 @@ class BasisMaps:
         squares fit, weighted by solid angle. A single map is assumed to be proportional
         to the target. The weights are differentiable.
         """
-        flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)
+        flat_target = target.permute(2, 0, 1).reshape(3, -1, 1)  # (3, H W, 1)
         if len(self.maps) == 1:
             # A proportional target is the map times one factor in each channel: the
             # quotient at any texel, of which the brightest has the least rounding.
             texel, brightness = self._brightest
-            target_value = flat_target[..., 0].gather(1, texel)
+            target_value = flat_target[..., 0].gather(1, texel)  # (3, 1)
             return (target_value / brightness.clamp_min(TINY)).T
-        weights: Tensor = (self._inverse @ flat_target)[..., 0].T
+        channel_weights = self._weighted_inverse @ flat_target  # (3, k, 1)
+        weights: Tensor = channel_weights[..., 0].T
         return weights
 
     def compose(self, weights: Tensor) -> Tensor:
@@ -310,17 +328,18 @@ class BasisMaps:
 
     @cached_property
     def _brightest(self) -> tuple[Tensor, Tensor]:
-        """The brightest texel of the first map in each channel (3, 1), and its
-        value.
+        """Index of the first map's brightest texel in each channel, and its value.
+
+        Both are (3, 1).
         """
         texels = self.maps[0].reshape(-1, 3)
         return texels.argmax(dim=0)[:, None], texels.amax(dim=0)[:, None]
 
     @cached_property
-    def _inverse(self) -> Tensor:
+    def _weighted_inverse(self) -> Tensor:
         """(3, k, H W) matrices from a map to the weights of the basis maps.
 
-        Of each channel it is the pseudo-inverse of the basis maps, weighted by solid
+        For each channel it is the pseudo-inverse of the basis maps, weighted by solid
         angle: the least squares fit.
         """
         count, height, width, _ = self.maps.shape
@@ -339,18 +358,19 @@ class BasisMaps:
 
 
 class LightBasis:
-    """The lights of a scene of which some change, each separately.
+    """The light of a scene, split into lights that are rendered one by one.
 
     Args:
         renderer: renderer of the scene.
-        lighting: what changes.
+        lighting: groups of coordinates that change light.
         inputs: scene inputs whose map is the environment's first basis map.
 
     Attributes:
-        inputs_of_light: the inputs of each light, in which all others are dark: first
-            that of all light that does not change, if there is any, and of projectors;
-            then each lamp that changes, at a radiance or intensity of one; then each
-            basis map of the environment. There is at least one, if a dark one.
+        inputs_of_light: scene inputs of each light, in which all other lights are dark.
+            The first light is everything that does not change, together with
+            projectors, if there is any. Then come the lamps that change, each with a
+            radiance or intensity of 1, and then the basis maps of the environment. A
+            scene without light has one dark light.
     """
 
     def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
@@ -367,40 +387,41 @@ class LightBasis:
         patterns = {
             name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
         }
-        names = find_light_inputs(renderer) | patterns
-        values = {
-            name: inputs[name]
-            if name in inputs
-            else renderer.scene.get_base_value(name)
-            for name in sorted(names)
-        }
-        # The inputs of one light are this, with its own value put in: all others dark.
-        dark = {name: torch.zeros_like(value) for name, value in values.items()}
+        values = _get_values(renderer, find_light_inputs(renderer) | patterns, inputs)
+        dark_values = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
-        # The patterns of projectors are in the first light, whether they change or not.
+
+        # The first light: all that does not change, and the patterns of projectors,
+        # which have matrices of their own if they change.
         fixed_values = {
             name: value
             for name, value in values.items()
             if name in patterns
             or (name not in changed_names and bool((value > 0.0).any()))
         }
-        self._lamps = sorted(changed_names & names - {ENVIRONMENT_INPUT})
-        changes_environment = ENVIRONMENT_INPUT in changed_names
-        is_unlit = not (fixed_values or self._lamps or changes_environment)
-        # A scene without any light still gets one, which is dark: so that there is an
+        changed_lights = changed_names & values.keys()
+        # A scene without any light still gets one, which is dark, so that there is an
         # image.
-        self._has_fixed_light = bool(fixed_values) or is_unlit
+        self._has_fixed_light = bool(fixed_values) or not changed_lights
         self.inputs_of_light = list[Inputs]()
         if self._has_fixed_light:
-            self.inputs_of_light.append({**dark, **fixed_values})
-        self.inputs_of_light += [{**dark, name: torch.ones(3)} for name in self._lamps]
+            self.inputs_of_light.append({**dark_values, **fixed_values})
+
+        # Lamps. Their weight is their light itself, so that their image is that of a
+        # radiance or intensity of 1.
+        self._lamps = sorted(changed_lights - {ENVIRONMENT_INPUT})
+        for name in self._lamps:
+            self.inputs_of_light.append({**dark_values, name: torch.ones(3)})
+
+        # The environment. Its weights are fitted to its basis maps.
         self._basis_maps: BasisMaps | None = None
-        if changes_environment:
+        if ENVIRONMENT_INPUT in changed_lights:
             maps = _make_basis_maps(renderer, lighting, values[ENVIRONMENT_INPUT])
             self._basis_maps = BasisMaps(maps)
-            self.inputs_of_light += [
-                {**dark, ENVIRONMENT_INPUT: basis} for basis in maps
-            ]
+            for basis_map in maps:
+                self.inputs_of_light.append(
+                    {**dark_values, ENVIRONMENT_INPUT: basis_map}
+                )
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
         """Return the factor (lights, 3) of each light, differentiable in the inputs."""
@@ -411,43 +432,60 @@ class LightBasis:
         return torch.cat(weights)
 
 
+def _get_values(
+    renderer: Renderer, names: Collection[str], inputs: Inputs
+) -> dict[str, Tensor]:
+    """Return the values of scene inputs by name, in alphabetical order.
+
+    Inputs that are not in `inputs` have the value of the scene itself.
+    """
+    values = {}
+    for name in sorted(names):
+        if name in inputs:
+            values[name] = inputs[name]
+        else:
+            values[name] = renderer.scene.get_base_value(name)
+    return values
+
+
 def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
     """Return the environment's basis maps (k, H, W, 3).
 
-    The first is `first`. If a group adds spherical harmonics to the environment, they
-    are the others. They are zero in texels in which no harmonics are added.
+    The first is `first`. If a group adds spherical harmonics to the environment, the
+    harmonics are the others, with zeros in texels to which none are added.
 
     Args:
         renderer: renderer of the scene.
         lighting: groups that change light.
-        first: (H, W, 3) the environment's map.
+        first: (H, W, 3) map of the environment.
     """
     if not lighting.harmonic_groups:
         return first[None]
     start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
     start_map = start_inputs[ENVIRONMENT_INPUT]
-    # Harmonics are added where the environment is not cut off at zero. A texel that is
-    # black at the start too counts as one that is not.
+    # A texel in which the sum with harmonics was negative is cut off at zero: it is
+    # black in `first`, but not at the start. Harmonics are added to all others.
     is_added = first > 0.0
     if start_map.shape == first.shape:
-        is_added = is_added | (start_map <= 0.0)
+        is_always_black = start_map <= 0.0
+        is_added = is_added | is_always_black
     harmonics = _make_harmonic_maps(first) * is_added.to(torch.float32)
     return torch.cat([first[None], harmonics])
 
 
 class BasisRenderer(Predictor):
-    """Compose images of one basis image for each light.
+    """Compose images from one basis image for each light.
 
-    Where base colors are searched too, each light has matrices of its own, so that
-    radiance is bilinear in both: to first order in the base colors, under any light.
+    If base colors are searched too, each light has matrices of its own. So radiance is
+    bilinear in lights and base colors: first-order in the base colors, under any light.
 
     Args:
         traced, seed, tick: as for `LinearRenderer`.
-        u: (d,) configuration; what does not change is as it is there.
-        changing: what changes; None finds it.
+        u: (d,) configuration; everything that does not change has its value there.
+        changing: result of `find_lighting`, which is called if this is None.
 
     Attributes:
-        non_finite: numbers that were not finite, and were replaced by 0.
+        non_finite: how many numbers were not finite, and were replaced by 0.
     """
 
     def __init__(
@@ -471,13 +509,15 @@ class BasisRenderer(Predictor):
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_lighting(traced)
-            # The environment is traced at its brightest: other environments are
+            # The basis map of the environment is its brightest: other environments are
             # predicted by scaling its image, which fails if a channel of it is black.
             brightest = u.detach().clone()
             for coordinates, values in changing.brightest_values:
                 brightest[coordinates] = values
             inputs = traced.scene.assembly(traced.space.inputs(brightest))
             self._lights = LightBasis(traced, changing, inputs)
+            # Everything but light is traced at u: each light's inputs are replaced by
+            # those of `self._lights`.
             self._renderers = self._trace_lights(traced, u, seed, tick)
         self.non_finite = sum(renderer.non_finite for renderer in self._renderers)
 
@@ -499,19 +539,20 @@ class BasisRenderer(Predictor):
         """
         set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
         linear_names = set_inputs & find_linear_inputs(traced)
-        # patterns of projectors shine in the first light alone
         base_colors = {
             name for name in linear_names if not name.endswith(PATTERN_SUFFIX)
         }
         renderers = []
         for index, light_inputs in enumerate(self._lights.inputs_of_light):
+            # `LightBasis` has put all projectors into the first light.
+            has_projectors = index == 0
             renderers.append(
                 LinearRenderer(
                     traced,
                     u,
                     seeds.stream(seed, "light", index),
                     tick,
-                    names=linear_names if index == 0 else base_colors,
+                    names=linear_names if has_projectors else base_colors,
                     light=light_inputs,
                 )
             )
@@ -528,8 +569,7 @@ class BasisRenderer(Predictor):
         return sum(renderer.n_bytes for renderer in self._renderers)
 
     def predict_radiance(self, inputs: Inputs) -> Tensor:
-        """Return radiance (H, W, 3), and coverage as a fourth channel if there is a
-        backdrop.
+        """Return radiance (H, W, 3); with a backdrop, coverage is a fourth channel.
 
         Coverage is the same under any light.
         """
@@ -547,51 +587,80 @@ HAZE = Refusal("there is haze", RefusalCause.HAZE)
 def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None:
     """Return why images of a space cannot be predicted; None if they can.
 
-    A group that is searched may change the finished image, haze, light (if nothing
-    varies), or inputs to which radiance is linear, such as base colors. The last need
-    the adjoint estimator. At least one group has to need a render, as otherwise a
-    prediction would save nothing. Haze and a missing denoiser are named only if there
-    is no other reason.
+    A searched group of coordinates may change
+
+    - the finished image,
+    - light, if no control varies,
+    - haze; `_find_general_refusal` decides about it, so that haze and a missing
+      denoiser are reported only if there is no other reason,
+    - inputs to which radiance is linear, such as base colors, if their derivatives are
+      computed by the adjoint estimator.
 
     Args:
         renderer: renderer of the space.
-        varying: names of controls that vary. They are fixed for each matrix, whatever
-            they change; if there are any, light may not change.
+        varying: names of controls that vary. Each matrix is traced at fixed values of
+            theirs, so that they may change anything. If there are any, light may not
+            change.
     """
     if renderer.scene.definition[0].get_number("ground.gloss") > 0.0:
         return Refusal("the ground reflects the object")
-    linear_inputs = find_linear_inputs(renderer)
     searched_groups = [
         group for group in renderer.plan.groups if group.control not in varying
     ]
-    light_groups = {} if varying else find_lighting(renderer).groups
+    light_groups: Mapping[str, frozenset[str]] = {}
+    if not varying:
+        light_groups = find_lighting(renderer).groups
+    # With a photographed ground, a lamp also changes the photograph around the object,
+    # which no basis image contains.
     if light_groups and renderer.scene.plane_radiance is not None:
         return Refusal("light that changes falls on the ground of the photograph too")
+    for group in searched_groups:
+        is_light = group.name in light_groups
+        refusal = _find_group_refusal(renderer, group, is_light, bool(varying))
+        if refusal is not None:
+            return refusal
+    return _find_general_refusal(renderer, searched_groups, light_groups)
+
+
+def _find_group_refusal(
+    renderer: Renderer, group: Group, is_light: bool, has_varying: bool
+) -> Refusal | None:
+    """Return why what a searched group changes cannot be predicted; None if it can.
+
+    Args:
+        renderer: renderer of the space.
+        group: the group of coordinates.
+        is_light: whether the group changes only light or the finished image.
+        has_varying: whether some control varies, so that light may not change.
+    """
+    # A prediction has derivatives of its own. A user who has chosen an estimator for
+    # renders would not get it.
+    if group.is_forced and group.estimator not in ("none", "image"):
+        return Refusal(f"the estimator of {group.name} is forced")
+    changed_inputs = renderer.routes.get(group.name, frozenset())
     parts = renderer.scene.definition[0].parts
     haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
-    for group in searched_groups:
-        if group.is_forced and group.estimator not in ("none", "image"):
-            return Refusal(f"the estimator of {group.name} is forced")
-        changed_inputs = renderer.routes.get(group.name, frozenset())
-        is_haze = bool(changed_inputs) and all(
-            name.startswith(haze_prefixes) for name in changed_inputs
+    is_haze = bool(changed_inputs) and all(
+        name.startswith(haze_prefixes) for name in changed_inputs
+    )
+    needs_matrix = not (group.estimator == "image" or is_light or is_haze)
+    if not needs_matrix:
+        return None
+    if changed_inputs & find_light_inputs(renderer) and has_fixed_lights(renderer):
+        return Refusal(
+            f"{group.name} changes light, and the scene has other lights of its own"
         )
-        if group.estimator == "image" or group.name in light_groups or is_haze:
-            continue  # needs no matrix of base colors
-        if changed_inputs & find_light_inputs(renderer) and has_fixed_lights(renderer):
-            return Refusal(
-                f"{group.name} changes light, and the scene has other lights of its own"
-            )
-        if group.estimator != "adjoint" or not changed_inputs <= linear_inputs:
-            allowed = "base colours" if varying else "base colours and light"
-            return Refusal(f"{group.name} changes more than {allowed}")
-    return _find_general_refusal(renderer, searched_groups, light_groups)
+    is_linear = changed_inputs <= find_linear_inputs(renderer)
+    if group.estimator != "adjoint" or not is_linear:
+        allowed = "base colors" if has_varying else "base colors and light"
+        return Refusal(f"{group.name} changes more than {allowed}")
+    return None
 
 
 def _find_general_refusal(
     renderer: Renderer,
     searched_groups: Sequence[Group],
-    light_groups: Mapping[str, object],
+    light_groups: Mapping[str, frozenset[str]],
 ) -> Refusal | None:
     """Return a reason against predictions that is not about a single group.
 
@@ -600,27 +669,32 @@ def _find_general_refusal(
     Args:
         renderer: renderer of the space.
         searched_groups: groups that are searched.
-        light_groups: inputs that are changed by the groups that change only light, by
-            the group's name.
+        light_groups: for each group that changes only light or the finished image, by
+            its name, the inputs that it changes.
     """
-    if not any(
+    # If only the finished image changed, one render would serve for all images anyway.
+    needs_render = any(
         renderer.routes.get(group.name) or light_groups.get(group.name)
         for group in searched_groups
-    ):
+    )
+    if not needs_render:
         return Refusal("nothing that is searched needs a render to be differentiated")
-    if renderer.scene.is_volumetric and not all(
-        group.name in light_groups for group in searched_groups
-    ):
+    # With haze, images of lights still add up, but base colors have no matrix.
+    changes_only_light = all(group.name in light_groups for group in searched_groups)
+    if renderer.scene.is_volumetric and not changes_only_light:
         return HAZE
-    return None if renderer.formation.denoiser == "oidn" else NOISE
+    if renderer.formation.denoiser != "oidn":
+        return NOISE
+    return None
 
 
 def make_predictor(
     renderer: Renderer, u: Tensor, seed: int, tick: ProgressCallback = ignore_progress
 ) -> Predictor:
-    """Make what predicts the images of a renderer's space, at u.
+    """Make the predictor of images of a renderer's space, at a configuration.
 
-    Arguments as for `LinearRenderer`.
+    It is a `BasisRenderer` if light changes, and else a `LinearRenderer`, whose
+    arguments it takes.
     """
     lighting = find_lighting(renderer)
     if lighting.changed_inputs:
@@ -629,7 +703,7 @@ def make_predictor(
 
 
 def count_lights(renderer: Renderer) -> int:
-    """Return the number of lights that have a basis image; 1 where no light changes."""
+    """Return the number of lights that have a basis image; 1 if no light changes."""
     lighting = find_lighting(renderer)
     if not lighting.changed_inputs:
         return 1
@@ -640,8 +714,9 @@ def count_lights(renderer: Renderer) -> int:
 def count_samples(renderer: Renderer) -> int:
     """Return the samples per pixel that are traced before anything can be predicted.
 
-    Each light needs the samples of all its matrices, or without a matrix those of one
-    image.
+    Under each light, there is a matrix for each base color that is searched. Each
+    matrix needs the samples of all its passes. Without a matrix, the light needs those
+    of one image.
     """
     changed_inputs: set[str] = set()
     for group in renderer.plan.groups:
@@ -649,6 +724,6 @@ def count_samples(renderer: Renderer) -> int:
     n_matrices = len(changed_inputs & find_linear_inputs(renderer))
     samples_per_light = COLLECTED_SPP
     if n_matrices:
-        samples, n_passes = plan_passes(renderer, COLLECTED_SPP)
-        samples_per_light = samples * n_passes * n_matrices
+        samples_per_pass, n_passes = plan_passes(renderer, COLLECTED_SPP)
+        samples_per_light = samples_per_pass * n_passes * n_matrices
     return count_lights(renderer) * samples_per_light

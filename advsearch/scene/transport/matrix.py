@@ -8,13 +8,13 @@ in the base color,
 
     J: pixels x texels, one weight for each color channel
 
-and J is sparse: a pixel sees few texels directly, in a mirror or through glass
-(bilinear look-ups), and many a little (light from the object to the object), for which
-coarse cells of `CELL_SIZE` x `CELL_SIZE` texels are enough. What a pixel sees of the
-texels hardly depends on the color of the light, so that a row of J is stored as
-fractions of texels, which add up to one, times a color. A matrix that is one of many
-stores its fractions in 16 bits; one that serves a full search stores them in 32, by
-rows and by columns, so that a product with it is one call.
+and J is sparse. A pixel sees few texels sharply: directly, in a mirror or through
+glass. These are bilinear look-ups. It sees many more by scattered light, such as light
+from the object to itself, for which coarse cells of `CELL_SIZE` x `CELL_SIZE` texels
+are enough. Which texels a pixel sees hardly depends on the color of the light. So a row
+of J is stored as fractions of texels, which add up to one, times a color. If there are
+many matrices, fractions are stored in 16 bits. A matrix for a full search stores them
+in 32 bits, by rows and by columns, so that a product with it is one call.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from advsearch.trust.stored_files import scale_limit
 
 # from a noisy image (H, W, 3) to one without noise
 Smooth = Callable[[Tensor], Tensor]
-# multiples of its mean at which an image is clipped; any exposure has clipped them long
-# before
+# largest value of an image that is stored, in multiples of its mean; any exposure clips
+# such values anyway
 MAX_MEANS = 6e4
-CELL_SIZE = 8  # width of the cells of later vertices, in texels
+CELL_SIZE = 8  # width in texels of the cells for scattered light
 
 
 class PackedImage:
@@ -58,8 +58,8 @@ class PackedImage:
 
     Args:
         image: the image.
-        is_small: unpack it at each call; otherwise it is unpacked once, for a search
-            that needs it in every step.
+        is_small: whether to unpack it at each call. Otherwise it is unpacked once, for
+            a search that needs it in every step.
     """
 
     def __init__(self, image: Tensor, is_small: bool = True) -> None:
@@ -86,16 +86,20 @@ class _PackedRows(NamedTuple):
 class ColoredRows:
     """A sparse matrix (rows, columns) for three color channels.
 
-    Its rows are fractions that add up to one, times a color. It is filled by `add`, and
-    then `finish` is called once.
+    Instead of one matrix for each channel, it has one matrix of fractions, whose rows
+    add up to one, and a color for each row. An entry of a channel's matrix is the
+    fraction times that channel of the color. It is filled by `add`, and then `finish`
+    is called once.
 
     Args:
-        rows, columns: its size.
-        small: store it in 16 bits per fraction, and as many per column where there are
-            no more than 65,536, and unpack it for each product.
+        rows: number of rows.
+        columns: number of columns.
+        small: whether to store it in little memory, and to unpack it for each product:
+            16 bits for a fraction, and 16 for its column if there are no more than
+            65,536.
 
     Attributes:
-        entries: how many fractions are stored.
+        entries: number of fractions.
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
@@ -109,63 +113,68 @@ class ColoredRows:
         self._shape = (rows, columns)
         self._small = small
         self.entries = 0
-        # the matrix of fractions and its transpose, after `finish`, if not small
-        self._csr_pair: tuple[Tensor, Tensor] | None = None
-        # the sum of all that was added, before `finish`
-        self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
-        self._packed: _PackedRows | None = None
         has_small_columns = small and columns <= 1 << 16
         self._column_type = np.dtype(np.uint16 if has_small_columns else np.int32)
+        # Until `finish`: the sums of what was added. They are released then.
+        self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         self._colors: Float32Array = np.zeros((rows, 3), dtype=np.float32)
+        # After `finish`: the fractions, packed if small, and else a matrix with its
+        # transpose; and the colors.
+        self._packed: _PackedRows | None = None
+        self._csr_pair: tuple[Tensor, Tensor] | None = None
         self._stored_colors = PackedImage(torch.zeros(0))
 
     @property
     def bytes(self) -> int:
-        """Memory after `finish`.
+        """Memory after `finish`, bytes.
 
-        Packed, an entry has a fraction (2 bytes) and its column, a row its start (4)
-        and color (6). If it is not small, the unpacked matrix and its transpose are
-        stored as well: 10 bytes more for each entry, float32 colors (12), and the
-        starts of the transpose's rows (4).
+        A start of a row takes 4 bytes, and its color in 16 bits 6. If the matrix is
+        small, an entry is a fraction in 16 bits and its column. Otherwise an entry is
+        stored twice, in the matrix and its transpose, each time as a fraction of 4
+        bytes and an index of 4; and the colors are also stored in float32.
         """
         n_rows, n_columns = self._shape
-        packed = (2 + self._column_type.itemsize) * self.entries + (4 + 6) * n_rows
         if self._small:
-            return packed
-        return packed + 10 * self.entries + 12 * n_rows + 4 * n_columns
+            return (2 + self._column_type.itemsize) * self.entries + (4 + 6) * n_rows
+        row_bytes = 4 + 6 + 12
+        transposed_row_bytes = 4
+        return (
+            2 * (4 + 4) * self.entries
+            + row_bytes * n_rows
+            + transposed_row_bytes * n_columns
+        )
 
     def add(
         self,
         rows: IntArray,
         columns: IntArray,
         fractions: Float32Array,
-        weights: Float32Array,
+        colors: Float32Array,
     ) -> None:
         """Add samples to rows of the matrix.
 
-        A sample distributes its color over k columns by fractions. A row stores the sum
-        of its samples' colors, and one set of fractions for all three channels: the
-        mean of the samples' fractions, each weighted by the mean of its color's
-        channels.
+        A sample distributes its color over k columns by fractions. A row adds up the
+        colors of its samples. It has one set of fractions for all three channels: the
+        mean of its samples' fractions. In that mean a sample counts by the brightness
+        of its color, the mean of the channels' magnitudes.
 
         Args:
             rows: (n,) row of each sample, ascending.
-            columns: (n, k) columns of each sample; several may be the same.
+            columns: (n, k) columns of each sample; some may be equal.
             fractions: (n, k) fractions of the columns.
-            weights: (n, 3) color of each sample.
+            colors: (n, 3) color of each sample.
         """
         if not len(rows):
             return
         # Rows are ascending, so that the entries are in the order of compressed rows
-        # already. The matrix is made of where the entries of each row begin.
+        # already. Only the first entry of each row has to be found.
         first_samples = np.searchsorted(rows, np.arange(self._shape[0] + 1))
         first_entries = first_samples * columns.shape[1]
-        entry_weights = (
-            fractions * np.abs(weights).mean(axis=1, keepdims=True)
-        ).ravel()
+        # A color may be negative, as a derivative; its magnitude counts.
+        brightness = np.abs(colors).mean(axis=1, keepdims=True)
         added_matrix = scipy.sparse.csr_matrix(
             (
-                entry_weights,
+                (fractions * brightness).ravel(),
                 columns.ravel().astype(np.int32),
                 first_entries.astype(np.int32),
             ),
@@ -176,35 +185,21 @@ class ColoredRows:
         self.entries = int(self._sum.nnz)
         for channel in range(3):
             self._colors[:, channel] += np.bincount(
-                rows, weights[:, channel], minlength=self._shape[0]
+                rows, colors[:, channel], minlength=self._shape[0]
             )
 
     def finish(self, image_shape: tuple[int, int], smooth: Smooth | None) -> None:
-        """Get ready to multiply: scale rows to add up to one, and store them.
+        """Store the matrix in the form in which it is multiplied.
 
-        What `add` has collected is released; nothing may be added afterwards.
+        The rows of fractions are scaled to add up to one. The sums that `add` has
+        collected are released; nothing may be added afterwards.
 
         Args:
             image_shape: height and width of the image whose pixels are the rows.
-            smooth: removes the noise from the image (H, W, 3) of all rows' colors;
-                None leaves it as it is.
+            smooth: function that removes the noise from the image (H, W, 3) of all
+                rows' colors; None leaves it as it is.
         """
-        row_sums = np.asarray(self._sum.sum(axis=1)).ravel()
-        # a row without entries stays empty
-        row_scales = np.where(row_sums > 0.0, 1.0 / np.maximum(row_sums, 1e-30), 0.0)
-        entries_per_row = np.diff(self._sum.indptr)
-        fractions = self._sum.data * np.repeat(row_scales, entries_per_row)
-        if self._small:  # in 16 bits, unpacked for each product
-            self._packed = _PackedRows(
-                fractions.astype(np.float16),
-                self._sum.indices.astype(self._column_type),
-                self._sum.indptr,
-            )
-        else:  # ready, with its transpose
-            matrix = scipy.sparse.csr_matrix(
-                (fractions, self._sum.indices, self._sum.indptr), self._shape
-            )
-            self._csr_pair = to_torch_csr(matrix), to_torch_csr(matrix.T.tocsr())
+        self._store_fractions(self._compute_fractions(), self._sum)
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         colors = torch.from_numpy(self._colors).reshape(*image_shape, 3)
         if smooth is not None:
@@ -212,19 +207,54 @@ class ColoredRows:
         self._stored_colors = PackedImage(colors, self._small)
         self._colors = np.zeros((0, 3), dtype=np.float32)
 
+    def _compute_fractions(self) -> npt.NDArray[Any]:
+        """Return the entries of the collected sum, with rows scaled to add up to 1."""
+        row_sums = np.asarray(self._sum.sum(axis=1)).ravel()
+        # A row without entries stays empty.
+        row_scales = np.where(row_sums > 0.0, 1.0 / np.maximum(row_sums, 1e-30), 0.0)
+        entries_per_row = np.diff(self._sum.indptr)
+        scaled: npt.NDArray[Any] = self._sum.data * np.repeat(
+            row_scales, entries_per_row
+        )
+        return scaled
+
+    def _store_fractions(
+        self, fractions: npt.NDArray[Any], like: scipy.sparse.csr_matrix
+    ) -> None:
+        """Store fractions, packed if the matrix is small, and else with the transpose.
+
+        Args:
+            fractions: values of the entries.
+            like: matrix with the columns and row starts of the entries.
+        """
+        if self._small:
+            self._packed = _PackedRows(
+                fractions.astype(np.float16),
+                like.indices.astype(self._column_type),
+                like.indptr,
+            )
+            return
+        matrix = scipy.sparse.csr_matrix(
+            (fractions, like.indices, like.indptr), self._shape
+        )
+        transposed = matrix.T.tocsr()
+        self._csr_pair = (to_torch_csr(matrix), to_torch_csr(transposed))
+
     def multiply(self, values: Tensor) -> Tensor:
-        """Return the matrix times (columns, 3): (rows, 3)."""
+        """Return the product (rows, 3) of the matrix and `values` (columns, 3)."""
         if self._csr_pair is not None:
-            product = self._csr_pair[0] @ values
+            matrix, _transposed = self._csr_pair
+            product = matrix @ values
         else:
             product = torch.from_numpy(self._unpack() @ values.numpy())
         return product.mul_(self._stored_colors().reshape(-1, 3))
 
     def multiply_transposed(self, values: Tensor) -> Tensor:
-        """Return the transposed matrix times (rows, 3): (columns, 3)."""
+        """Return the product (columns, 3) of the transpose and `values` (rows, 3)."""
         colored = values * self._stored_colors().reshape(-1, 3)
         if self._csr_pair is not None:
-            return self._csr_pair[1] @ colored
+            _matrix, transposed = self._csr_pair
+            return transposed @ colored
         return torch.from_numpy(self._unpack().T @ colored.numpy())
 
     def _unpack(self) -> scipy.sparse.csr_matrix:
@@ -247,7 +277,7 @@ class TextureTransport:
     Args:
         image_shape: height and width of the radiance in pixels.
         texture_shape: height and width of the base color in texels.
-        small: take as little memory as there is room for one of many matrices.
+        small: whether to take little memory, for one of many matrices.
     """
 
     def __init__(
@@ -294,7 +324,7 @@ class TextureTransport:
         """Memory of both matrices when they are finished."""
         return self._sharp.bytes + self._scattered.bytes
 
-    def add_pass(self, vertices: Sequence[Vertices], fraction: float) -> None:
+    def add_pass(self, vertices: Sequence[Vertices], pass_weight: float) -> None:
         """Add the vertices of one pass of paths to both matrices.
 
         A vertex that a pixel sees sharply counts for the four texels of a bilinear
@@ -303,7 +333,7 @@ class TextureTransport:
 
         Args:
             vertices: the first vertices of all paths, then the second ones, and so on.
-            fraction: fraction of all samples that this pass has.
+            pass_weight: weight of this pass in the mean over all passes.
         """
         n_rows, n_columns = self._cell_shape
         for vertex in vertices:
@@ -315,27 +345,29 @@ class TextureTransport:
                 sharp.pixel.numpy(),
                 texels.astype(np.int64),
                 fractions,
-                sharp.weight.numpy() * np.float32(fraction),
+                colors=sharp.weight.numpy() * np.float32(pass_weight),
             )
             scattered = vertex.select(~vertex.is_sharp)
             uv = scattered.uv.numpy() % 1.0  # the texture repeats
+            # The limit is for a coordinate that rounding makes 1.
             column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
-            row = np.floor(uv[:, 1] * n_rows).astype(np.int64)
-            cell = row.clip(0, n_rows - 1) * n_columns + column.clip(0, n_columns - 1)
-            cell = cell[:, None]  # (n, 1): one for each vertex, of weight 1
+            column = column.clip(0, n_columns - 1)
+            row = np.floor(uv[:, 1] * n_rows).astype(np.int64).clip(0, n_rows - 1)
+            cell = (row * n_columns + column)[:, None]  # (n, 1): one for each vertex
             self._scattered.add(
                 scattered.pixel.numpy(),
                 cell,
                 np.ones_like(cell, dtype=np.float32),
-                scattered.weight.numpy() * np.float32(fraction),
+                colors=scattered.weight.numpy() * np.float32(pass_weight),
             )
 
     def finish(self, smooth: Smooth | None = None) -> None:
-        """Get both matrices ready to multiply; nothing may be added afterwards.
+        """Store both matrices for products; nothing may be added afterwards.
 
         Args:
-            smooth: removes the noise from the colors of a matrix's rows, which are an
-                image: the change of the image when all texels change by one. None
+            smooth: function that removes the noise from the colors of a matrix's rows.
+                These are an image: since the fractions of a row add up to one, its
+                color is the change of the pixel if all texels change by one. None
                 leaves the noise in them.
         """
         self._sharp.finish(self._image_shape, smooth)
@@ -474,24 +506,22 @@ COLLECTED_SPP = 128
 
 The noise that the denoiser leaves in the base image is in all predicted images.
 """
-SAMPLES_PER_PASS = (
-    2**20
-)  # samples of all pixels in one pass; its vertices are held in memory
-MAX_CORRECTION = (
-    4.0  # largest factor by which the noise of the base image corrects a row
-)
+# samples of all pixels in one pass, whose vertices are in memory at the same time
+SAMPLES_PER_PASS = 2**20
+# largest factor by which the ratio of the denoised to the noisy base image corrects the
+# color of a row
+MAX_CORRECTION = 4.0
 TOO_LARGE = "the matrix would take more than"
 LINEAR_SUFFIXES = (".base_color", PATTERN_SUFFIX)
-"""Ends of names of inputs to which radiance is linear.
+"""Suffixes of the names of inputs to which radiance is linear.
 
-That is but for light that meets a base color twice.
+Radiance is linear in them except for light that meets a base color twice.
 """
 
 Inputs = Mapping[str, Tensor]
 OptionalNames = Collection[str] | None
-ProgressCallback = Callable[
-    [int], None
-]  # called with samples per pixel as they are traced
+# called with samples per pixel as they are traced
+ProgressCallback = Callable[[int], None]
 
 
 def ignore_progress(samples: int) -> None:
@@ -499,45 +529,50 @@ def ignore_progress(samples: int) -> None:
 
 
 class TransportTooLargeError(Exception):
-    """A matrix that takes more memory than it may."""
+    """A matrix would take more memory than `MAX_BYTES`."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearizedScene:
-    """What a `LinearRenderer` has collected; it can be sent to another process."""
+    """Base image and matrices of a `LinearRenderer`.
 
-    transports: Mapping[str, TextureTransport]  # transports by input, finished
-    linearized_at: dict[str, Tensor]  # the inputs where it was linearised
-    image_inputs: Inputs  # those that belong to the finished image, not to the scene
-    # the image there, linear radiance, and coverage where there is a backdrop
+    It can be sent to another process.
+    """
+
+    transports: Mapping[str, TextureTransport]  # finished matrices by input
+    # values of the inputs with a matrix, at which the image is linearized
+    linearized_at: dict[str, Tensor]
+    image_inputs: Inputs  # inputs of the finished image, not of the scene
+    # linear radiance at `linearized_at`; with a backdrop also coverage
     base_image: PackedImage
-    non_finite: int = 0  # values that were not finite
+    non_finite: int = 0  # how many values were not finite
 
 
 class LinearRenderer(Predictor):
-    """Predict images by a matrix for each base color, linearised at a configuration.
+    """Predict images by a matrix for each base color, linearized at a configuration.
 
     Args:
         traced: renderer of the scene.
-        u: (d,) configuration at which it is linearised.
+        u: (d,) configuration at which the image is linearized.
         seed: seed of the noise.
-        tick: is called with samples per pixel as they are traced; there are
-            `count_samples` in all.
+        tick: called with the samples per pixel of each pass as it is done; they add up
+            to `count_samples`.
         spp: samples per pixel.
-        quick: remove the noise from the rows of the matrix as from the base image,
-            which they resemble, and not by the denoiser.
+        quick: whether to remove the noise of the matrices as that of the base image,
+            which they resemble, and not by the denoiser; and to store them in 16 bits.
         names: inputs that get a matrix; None for all base colors that the space sets.
-            Without any there is the base image alone.
-        light: inputs that replace those of u.
-        collected: what was collected elsewhere with the same arguments; then nothing is
+            If it is empty, there is only the base image.
+        light: scene inputs that replace those of u.
+        collected: result of another renderer with the same arguments; then nothing is
             traced.
 
     Attributes:
-        linearized_at: the inputs where it is linearised, by name.
-        non_finite: numbers that were not finite, and were replaced by 0.
+        linearized_at: values of the inputs with a matrix, at which the image is
+            linearized, by name.
+        non_finite: how many numbers were not finite, and were replaced by 0.
 
     Raises:
-        TransportTooLargeError: a matrix would take more than `MAX_BYTES`.
+        TransportTooLargeError: the matrices would take more than `MAX_BYTES`.
     """
 
     def __init__(
@@ -557,14 +592,14 @@ class LinearRenderer(Predictor):
 
         Args:
             traced: renderer of the scene.
-            u: (d,) configuration at which the image is linearised.
+            u: (d,) configuration at which the image is linearized.
             seed: seed of the noise.
             tick: called with the samples per pixel of each pass as it is done.
             spp: samples per pixel.
             quick: denoise the matrices by a cheaper method, and store them in 16 bits.
             names: inputs that get a matrix; None for all base colors.
             light: scene inputs that replace those of u.
-            collected: what was collected elsewhere with the same arguments.
+            collected: result of another renderer with the same arguments.
         """
         super().__init__(traced)
         if collected is None:
@@ -597,11 +632,12 @@ class LinearRenderer(Predictor):
         return sum(transport.bytes for transport in transports) + 8 * height * width
 
     def release_scene(self, space: InputSpace) -> None:
-        """Release the scene, which only tracing needs; the images stay.
+        """Release the scene, which only tracing needs. Predictions stay possible.
 
-        The renderer is a copy, so that others that share it keep their scene. `space`
-        is the same space without a scene.
+        Args:
+            space: copy of the space that does not refer to the scene.
         """
+        # The scene is removed from a copy: others may use the same renderer.
         self.path_renderer = self.path_renderer.copy_with()
         del self.path_renderer.scene
         self.path_renderer.space = space
@@ -610,7 +646,7 @@ class LinearRenderer(Predictor):
         """Return the radiance (H, W, 3) of scene inputs; with a backdrop more channels.
 
         It is the base image plus the change by each base color: its matrix times its
-        difference from the value at which the image was linearised. The channels behind
+        difference from the value at which the image was linearized. The channels after
         the first three, such as coverage, stay as they are.
 
         Args:
@@ -620,13 +656,16 @@ class LinearRenderer(Predictor):
         radiance = base[..., :3]
         crop = self.path_renderer.crop
         for name, transport in self.collected.transports.items():
-            change = transport(inputs[name] - self.linearized_at[name])
+            color_change = inputs[name] - self.linearized_at[name]
+            change = transport(color_change)
             if crop is not None:
+                # The matrix covers the window of the crop, the base the full image.
                 change = crop.window.pad(change, (base.shape[0], base.shape[1]))
             radiance = radiance + change
-        if base.shape[-1] == 3:
+        further_channels = base[..., 3:]
+        if further_channels.shape[-1] == 0:
             return radiance
-        return torch.cat([radiance, base[..., 3:]], dim=-1)
+        return torch.cat([radiance, further_channels], dim=-1)
 
     def predict_image(self, inputs: Inputs, u: Tensor) -> Tensor:
         """Return the image (H, W, 3) sRGB of scene inputs.
@@ -649,7 +688,7 @@ def _collect(
     names: OptionalNames,
     light: Inputs,
 ) -> LinearizedScene:
-    """Trace what a `LinearRenderer` needs: its base image and its matrices.
+    """Trace the base image and the matrices of a `LinearRenderer`.
 
     If no input gets a matrix, the base image is an ordinary render. Otherwise it is the
     mean of the paths that fill the matrices. With a backdrop, radiance leaves out the
@@ -657,7 +696,7 @@ def _collect(
 
     Args:
         renderer: renderer of the scene; it counts what is traced.
-        u: (d,) configuration at which the image is linearised.
+        u: (d,) configuration at which the image is linearized.
         seed: seed of the noise.
         tick: called with the samples per pixel of each pass as it is done.
         spp: samples per pixel.
@@ -665,10 +704,11 @@ def _collect(
         names: inputs that get a matrix; None for all base colors.
         light: scene inputs that replace those of u.
     """
-    # the renderer counts on; the difference is the count of this call
+    # The renderer counts the values of all calls; those of this call are the increase.
     non_finite_before = renderer.non_finite
+    # `find_front` adds which part of a photograph is in front of the object.
     inputs = renderer.find_front(renderer.scene.assembly(renderer.space.inputs(u)))
-    # those that belong to the finished image, not to the scene
+    # inputs of the finished image, and inputs of the scene
     image_inputs = {
         name: value for name, value in inputs.items() if name in IMAGE_INPUTS
     }
@@ -734,19 +774,22 @@ def _trace_matrices(
         tick: called with the samples per pixel of each pass as it is done.
         spp: samples per pixel of each matrix.
         quick: denoise the matrices by a cheaper method.
-        has_backdrop: whether a photograph takes the place of the environment.
+        has_backdrop: whether the camera sees a photograph or a plain color instead of
+            the environment.
 
     Returns:
-        (H, W, 3) linear radiance; with a backdrop also coverage and, where a plane
-        takes the shadow, the change of its radiance.
+        (H, W, 3) linear radiance; with a backdrop also coverage and, if a plane in the
+        scene receives the shadow, the change of its radiance.
     """
     with renderer.scene.limit_window(renderer.window):
         paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
+    # The environment behind the object is subtracted before denoising, which would mix
+    # it with the object at its outline.
     radiance = paths.radiance
-    if has_backdrop:  # which takes the place of the environment
+    if has_backdrop:
         radiance = radiance - paths.background
     radiance = renderer.replace_non_finite(radiance)
-    base, smooth = _make_smooth(renderer, radiance, paths, quick)
+    base, smooth = _denoise_base(renderer, radiance, paths, quick)
     for transport in transports.values():
         transport.finish(smooth)
     if has_backdrop:
@@ -758,26 +801,29 @@ def _trace_matrices(
 
 
 def _append_plane_change(
-    renderer: Renderer, base: Tensor, traced: Inputs, seed: int, spp: int
+    renderer: Renderer, base: Tensor, scene_inputs: Inputs, seed: int, spp: int
 ) -> Tensor:
-    """Append to a base image the change of the plane that takes the shadow.
+    """Append to a base image the change of the plane that receives the shadow.
 
-    The channels are rendered once, since no base color changes them. If the scene has
+    The channels are rendered once, and base colors do not change them. If the scene has
     no such plane, the image is returned as it is.
 
     Args:
         renderer: renderer of the scene.
-        base: (H, W, 4) radiance and coverage.
-        traced: inputs of the scene, without those of the finished image.
+        base: (H, W, 4) radiance and coverage; with a crop, of its window.
+        scene_inputs: inputs of the scene, without those of the finished image.
         seed: seed of the noise.
         spp: samples per pixel.
     """
     if renderer.scene.plane_radiance is None:
         return base
-    image = renderer.render_radiance(traced, seed, spp, True)
+    has_backdrop = True
+    image = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
     if renderer.crop is not None:
         image = renderer.crop.window.select(image)
-    return torch.cat([base, image[..., 4:]], dim=-1)
+    # The first channels are radiance and coverage, which `base` has already.
+    plane_channels = image[..., 4:]
+    return torch.cat([base, plane_channels], dim=-1)
 
 
 def _fill_transports(
@@ -790,6 +836,9 @@ def _fill_transports(
 ) -> Paths:
     """Trace paths for each matrix and add them; return the mean images of all.
 
+    The paths differ only in the texture at whose vertices they collect weights, and in
+    their noise. So all of them are samples of the same image.
+
     The vertices of a pass are released when they are added, so that memory holds one
     pass at a time. `tick` is called with the samples per pixel of each pass.
 
@@ -798,6 +847,7 @@ def _fill_transports(
     """
     samples, n_passes = plan_passes(renderer, spp)
     height, width = _get_traced_size(renderer)
+    base_image_bytes = 2 * 4 * height * width  # up to four channels of 16 bits
     images: list[Paths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
@@ -805,10 +855,9 @@ def _fill_transports(
             paths = renderer.scene.collect_paths(
                 scene_inputs, name, noise_seed, samples
             )
-            transport.add_pass(paths.vertices, 1.0 / n_passes)
-            size = sum(filled.bytes for filled in transports.values())
-            # 8 bytes a pixel are for the base image: up to four channels of 16 bits
-            if size + 8 * height * width > scale_limit(MAX_BYTES):
+            transport.add_pass(paths.vertices, pass_weight=1.0 / n_passes)
+            matrix_bytes = sum(filled.bytes for filled in transports.values())
+            if matrix_bytes + base_image_bytes > scale_limit(MAX_BYTES):
                 raise TransportTooLargeError(
                     f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
                 )
@@ -817,7 +866,7 @@ def _fill_transports(
     return average_passes(images)
 
 
-def _make_smooth(
+def _denoise_base(
     renderer: Renderer, radiance: Tensor, paths: Paths, quick: bool
 ) -> tuple[Tensor, Smooth | None]:
     """Denoise the base image; also return the function that denoises a matrix's colors.
@@ -827,25 +876,28 @@ def _make_smooth(
 
     Args:
         renderer: renderer of the scene.
-        radiance: (H, W, 3) the base image with its noise.
-        paths: the paths that it is made of, with what guides the denoiser.
-        quick: the function multiplies by the ratio of the denoised and the noisy base
-            image, within a factor `MAX_CORRECTION` either way; otherwise it runs the
-            denoiser, guided by the normals and by where surfaces are.
+        radiance: (H, W, 3) base image with its noise.
+        paths: images of the same paths, with the guides of the denoiser.
+        quick: whether the function multiplies by the ratio of the denoised and the
+            noisy base image, within a factor `MAX_CORRECTION` either way. Otherwise it
+            runs the denoiser, guided by the normals and by the outlines of surfaces.
     """
     if renderer.formation.denoiser != "oidn":
         return radiance, None
     clean = denoise(radiance, paths.albedo.clamp(0.0, 1.0), paths.normal)
+    # The paths of a matrix are those of the base image, so that both have about the
+    # same noise: this ratio removes it from the matrix too.
     ratio = (clean / radiance.clamp_min(1e-12)).clamp(
         1.0 / MAX_CORRECTION, MAX_CORRECTION
     )
+    # The denoiser retains the edges of its guides. The colors of a matrix do not show
+    # the pattern of the base color, but the change by it. So the guide shows none
+    # either: it is 1 on all surfaces.
     is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
-    # The denoiser keeps the edges of its guide image. The base color's pattern is not
-    # in a matrix's colors, so that the guide is 1 on all surfaces, whatever their
-    # color.
     even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
 
     def smooth(image: Tensor) -> Tensor:
+        """Remove the noise from the colors (H, W, 3) of a matrix."""
         if quick:
             return image * ratio
         return denoise(image.contiguous(), even_albedo, paths.normal)
@@ -861,7 +913,7 @@ def find_linear_inputs(renderer: Renderer) -> frozenset[str]:
 
 
 def _get_traced_size(renderer: Renderer) -> tuple[int, int]:
-    """Return height and width of what is traced of an image, in pixels."""
+    """Return height and width of the traced part of an image, in pixels."""
     if renderer.crop is None:
         return renderer.formation.resolution
     return renderer.crop.window.height, renderer.crop.window.width

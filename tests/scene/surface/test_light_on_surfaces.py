@@ -223,7 +223,7 @@ def test_a_sun_of_one_texel_is_as_wide_as_the_map_shows_it() -> None:
     """Looked up between texels it is a tent, a texel to each side, whose variance is a sixth of a texel squared."""
     padded = torch.full((16, 34, 3), 0.3)
     padded[7, 12] = 1e5
-    ways, light = prepare_sky(padded).hot
+    ways, light = (sky := prepare_sky(padded)).hot_directions, sky.hot_light
     row, column = ways[:, 1].acos() * (15.0 / torch.pi), torch.atan2(ways[:, 0], -ways[:, 2]) * (16.0 / torch.pi)
     for found, middle in ((row, 7.0), (column, 11.5)):
         assert float(found.mean()) == pytest.approx(middle, abs=0.01)
