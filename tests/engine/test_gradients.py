@@ -156,7 +156,7 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
     recorded, plain = (
         load_scene("mug").renderer(controls, resolution=24, denoise="none", estimators={"*": "material"}) for _ in "ab"
     )
-    plain.scene._freeze = False
+    plain.scene._uses_recordings = False
     generator = torch.Generator().manual_seed(0)
     of_a_move: dict[int, Any] = {}  # by their ids, which others get when a recording is let go
     for number in range(6):

@@ -516,7 +516,7 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     # Second step: single shells are turned over.
     is_shell_turned = is_negative.copy()
     for index in np.flatnonzero(is_closed & is_negative):
-        if _is_enclosed(index, is_closed, bounds):
+        if _is_enclosed(int(index), is_closed, bounds):
             # The wall of a hollow space, which stays if the normals agree with it.
             is_shell_turned[index] = step_agreement[index] < 0.0
     # A closed shell that is turned over in both steps is as before.
