@@ -123,7 +123,7 @@ def test_photographs_that_can_not_be_chosen_among_are_named(tmp_path: Path) -> N
         if name != NAMES[1]:
             change_json((folder / name).with_suffix(".json"), up=[0.0, -1.0, 0.0])
     scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
-    with pytest.raises(InputError, match=r"in 000003.jpg the object stands with another side down than in"):
+    with pytest.raises(InputError, match=r"in 000003.jpg the object stands on another side than in"):
         scene.renderer("backdrop", resolution=96)
     for name in NAMES:
         change_json(

@@ -158,9 +158,8 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    families.check_instance_name(
-        where, last_instance or first_instance, last_colon or first_colon
-    )
+    if last_colon or first_colon:
+        families.check_instance_name(where, last_instance or first_instance)
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
