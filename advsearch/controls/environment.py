@@ -139,12 +139,12 @@ class EnvironmentControl(Control):
             if _is_file(name)
         }
         notes = [note for asset in assets_by_file.values() for note in asset.warnings]
-        allows_own = (
+        is_scene_environment_allowed = (
             SCENE_ENVIRONMENT in allowed
             or self._find_scene_environment_name(scene) is not None
         )
         is_fixed = isinstance(self.specs.get("which"), Fixed)
-        if not allows_own and (is_fixed or assets_by_file):
+        if not is_scene_environment_allowed and (is_fixed or assets_by_file):
             name = str(allowed[0])
             scene = replace(
                 scene, environment=_load_environment(name), environment_spec=name
