@@ -97,7 +97,7 @@ class HazeControl(Control):
         )
 
     def get_scene_value(self, parameter: Parameter) -> float | str:
-        # Only that of the density is used (`strength_parameter`).
+        # Only the value of the density is used (`strength_parameter`).
         return 0.0 if _find_haze(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:

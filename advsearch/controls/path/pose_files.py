@@ -275,7 +275,6 @@ def _read_table(
                 f"{path}: expected {count} numbers in each row, got "
                 f"{reading.format_name(' '.join(row))}"
             )
-    # An array of objects, since one of strings would have the length of the longest.
     table: assets.Float64Array = np.array(rows, dtype=object).astype(np.float64)
     if not np.isfinite(table).all():
         raise errors.FileFormatError(
