@@ -1,6 +1,7 @@
-"""Controls: the families of scene parameters that may vary. `CONTROLS` is the registry.
+"""Controls: the families of scene parameters that can be searched.
 
-A package outside adds its own (docs/controls/writing.md).
+`CONTROLS` is the registry of all controls. Other packages can add theirs
+(docs/controls/writing.md).
 """
 
 from __future__ import annotations
@@ -37,8 +38,9 @@ CONTROLS: Registry[type[Control]] = Registry(
     ),
     imports=True,
 )
-"""Every control by its word on the command line, imported when it is asked for; and any
-by "package.module:Class".
+"""Classes of controls by their name on the command line, such as "pose".
+
+"package.module:Class" is looked up too. A class is imported when it is looked up.
 """
 
 
@@ -57,9 +59,9 @@ def make_control(
             - "pose.yaw", the kind and the only parameter to search, over its default
               range.
 
-            If the settings have a "kind", this is the name of the instance. A kind may
-            also be a class, "package.module:Class".
-        settings: values of its parameters and choices. None, or a missing one, means
+            A kind may also be a class, "package.module:Class". If the settings have a
+            "kind", `control_name` is only the name of the instance.
+        settings: values of its parameters and choices. A missing value, or None, means
             the default.
 
     Raises:
@@ -70,7 +72,7 @@ def make_control(
         name: value for name, value in (settings or {}).items() if value is not None
     }
     kind, name, parameter = _parse_name(control_name, options)
-    if kind not in CONTROLS:
+    if kind not in CONTROLS:  # false for a class "package.module:Class" as well
         raise make_unknown_control_error(kind)
     control = CONTROLS[kind]
     if parameter is not None:
@@ -79,7 +81,8 @@ def make_control(
     known += [
         known_parameter.name for known_parameter in control.declare_parameters(options)
     ]
-    for setting in options:  # "name" is set below, and no setting of a user
+    # Checked before "name" is added to the options, because users can't set that.
+    for setting in options:
         if setting not in known:
             raise UnknownNameError(f"setting of control {kind}", setting, known)
     if name != kind:
@@ -121,10 +124,13 @@ def _parse_name(
 ) -> tuple[str, str, str | None]:
     """Split the full name of a control into kind, instance name and parameter.
 
+    The kind is not checked: it may be unknown.
+
     Args:
-        control_name: "pose", "pose:chair", "pose.yaw", "pose.yaw:chair" or a class of
-            controls, "package.module:Class". If the settings have a "kind", it is the
-            name of the instance.
+        control_name: "pose", "pose:chair", "pose.yaw", or "pose.yaw:chair", where the
+            parameter stands before the colon; or a class of controls,
+            "package.module:Class". If the settings have a "kind", it is only the name
+            of the instance.
         settings: settings of the control; a "kind" is removed from them.
 
     Returns:
@@ -137,29 +143,40 @@ def _parse_name(
         return control_name, CONTROLS[control_name].kind, None
     head, colon, name = control_name.partition(":")
     kind, dot, parameter = head.partition(".")
-    check_instance_name(f"`controls` {control_name}", name, colon)
+    if colon:
+        check_instance_name(f"`controls` {control_name}", name)
     return kind, make_instance_name(kind, name), parameter if dot else None
 
 
 def make_instance_name(kind: str, name: str) -> str:
-    """Return the name of an instance.
+    """Return the name of a control for `KIND:NAME`, by which results refer to it.
 
-    It is "key" for ``light:key``, but "pose:chair" where the name is that of a mesh,
-    and the kind where there is no colon (an empty name).
+    It is "key" for ``light:key``. For kinds that act on a mesh, `NAME` is the mesh, and
+    the result is "pose:chair" for ``pose:chair`` and "pose" for ``pose:object``.
+
+    Args:
+        kind: kind of the control.
+        name: text after the colon; empty if there is no colon, which makes the result
+            the kind.
     """
-    of_a_mesh = kind in CONTROLS and CONTROLS[kind].targets_mesh
-    if not name or (of_a_mesh and name == OBJECT):
+    acts_on_mesh = kind in CONTROLS and CONTROLS[kind].targets_mesh
+    if not name or (acts_on_mesh and name == OBJECT):
         return kind
-    return f"{kind}:{name}" if of_a_mesh else name
+    return f"{kind}:{name}" if acts_on_mesh else name
 
 
-def check_instance_name(label: str, name: str, colon: str = ":") -> None:
-    """Check what stands behind the colon of `KIND:NAME`.
+def check_instance_name(label: str, name: str) -> None:
+    """Check the name after the colon of `KIND:NAME`.
 
-    Raises InputError: it has other characters than letters, digits, dashes and
-    underscores, or is empty.
+    Args:
+        label: beginning of the message.
+        name: the name to check.
+
+    Raises:
+        InputError: the name is empty, or has other characters than letters and digits
+            (of any alphabet), dashes and underscores.
     """
-    if colon and not re.fullmatch(r"[\w-]+", name):
+    if not re.fullmatch(r"[\w-]+", name):
         raise InputError(
             f"{label}: expected a name of letters, digits, - and _ after "
             f"the colon, got {name!r}"
@@ -173,15 +190,21 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
         control: class of the control.
         parameter: name of the parameter, e.g. "yaw" of "pose.yaw".
 
+    Returns:
+        A setting as a user would write it: [low, high] or {"choices": [...]}.
+
     Raises:
         UnknownNameError: the control has no such parameter.
-        InputError: the control has no ranges of its own, as mitsuba.
+        InputError: the control has no default ranges.
     """
+    # The control `mitsuba` declares no parameters: users name those of Mitsuba.
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in "
             f"{control.kind}:{parameter}=[0.2, 0.8]"
         )
+    # Besides the parameters of the class, a control may have one by the name that a
+    # user states, such as a joint of a mesh.
     parameter_by_name = {
         declared_parameter.name: declared_parameter
         for declared_parameter in control.declare_parameters((parameter,))
@@ -193,6 +216,7 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
     declared = parameter_by_name[parameter]
     if declared.options:
         return {"choices": list(declared.options)}
+    # without a default search range, all allowed values
     return list(declared.search or (declared.low, declared.high))
 
 
@@ -224,12 +248,12 @@ def merge_control_settings(
     """Merge settings of single parameters into the settings of each control.
 
     `camera.azimuth` and `camera.elevation` become one control that searches both. A
-    parameter that is only named is searched over its default range, unless the settings
-    state another one.
+    parameter in a name is searched over its default range, unless its settings state
+    another one.
 
     Args:
-        settings: settings by name; a name may be "kind", "kind:name", "kind.parameter"
-            or "kind:name.parameter".
+        settings: settings by name. A name is "pose", "pose:chair", "pose.yaw",
+            "pose:chair.yaw" or "pose.yaw:chair".
 
     Returns:
         Settings by the name of each control, as `make_control` takes them.
@@ -238,14 +262,15 @@ def merge_control_settings(
     for name, control_settings in check_control_settings(settings).items():
         head, dot, rest = name.partition(".")
         kind = head.partition(":")[0]
-        if not dot or kind not in CONTROLS:
+        if not dot or kind not in CONTROLS:  # no parameter, or a class with its module
             by_control.setdefault(name, {}).update(control_settings)
             continue
-        # kind.parameter, kind:name.parameter or kind.parameter:name
+        # "pose.yaw:chair" is split into "pose", "yaw" and ":chair"; in "pose:chair.yaw"
+        # the instance is in the head already.
         parameter, colon, instance = rest.partition(":")
         control_name = head + colon + instance
         default_range = _get_default_range(CONTROLS[kind], parameter)
-        # what the settings state of the parameter wins
+        # A range in the settings replaces the default range.
         new_settings = {parameter: default_range, **control_settings}
         by_control.setdefault(control_name, {}).update(new_settings)
     return by_control
@@ -272,10 +297,11 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def _make_example_range(control: Control) -> str:
-    """Return how a user could write a range of one of a control's parameters.
+    """Return an example of a range for a control, such as "pose={yaw: [0, 360]}".
 
-    It is a parameter that has a default range, if there is one.
+    The parameter is one with a default range, if there is one.
     """
+    # Only the control `mitsuba` declares no parameters; KEY is a name of Mitsuba's.
     if not control.parameters:
         return f"{control.name}:KEY=[0.2, 0.8]"
     parameters = control.instance_parameters
@@ -288,8 +314,8 @@ def _make_example_range(control: Control) -> str:
 def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -> None:
     """Check that no control is named after a mesh that it does not act on.
 
-    In "pose:chair" the chair is the mesh that is moved. "light:chair" is only a light
-    with that name, and would be misunderstood.
+    In "pose:chair" the chair is the mesh that is moved. "light:chair" would only be a
+    light named "chair", but it looks as if it acted on the chair.
 
     Args:
         controls: controls to check.
@@ -300,15 +326,15 @@ def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -
     """
     for control in controls:
         if control.name != control.kind and control.name in scene.surrounding_meshes:
-            able = ", ".join(
+            kinds_for_meshes = ", ".join(
                 kind
                 for kind, usable in CONTROLS.list_usable().items()
                 if usable.targets_mesh
             )
             raise InputError(
-                f"`controls` {control.kind}:{control.name}: {control.kind} can't be "
-                "given to another mesh than the "
-                f"object; {able} can, as in pose:{control.name}"
+                f"`controls` {control.kind}:{control.name}: {control.kind} can't act "
+                "on another mesh than the "
+                f"object; {kinds_for_meshes} can, as in pose:{control.name}"
             )
 
 
@@ -318,8 +344,8 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     There may be no controls, or only fixed ones. All prepare the scene, e.g. add a
     mesh, before any is bound to it, so that each is bound to the final scene. If
     controls replace default values of the clean scene, the space lists these as
-    adjusted defaults, in the order of the controls. If one of them replaces the
-    environment, the space has its name.
+    adjusted defaults, in the order of the controls. If a control replaces the
+    environment, the space has the name of the new environment.
 
     Raises:
         InputError: two controls have the same name, one does not fit the scene, or one
@@ -338,14 +364,17 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     bound = tuple(control.bind(scene) for control in controls)
     for control in bound:
         adjusted += control.adjusted_defaults
+    # Two lists were joined: adjustments by `prepare`, and those by `bind`.
     names = [control.name for control in controls]
     adjusted.sort(key=lambda default: names.index(default.control))
-    environments = [
-        str(default.used) for default in adjusted if default.parameter == ENVIRONMENT
-    ]
+    # A new environment is an adjusted default, or a control has recorded it in the
+    # scene.
+    environment = None
     if scene.environment_spec != described_scene.environment_spec:
-        environments.append(scene.environment_spec)
-    environment = environments[0] if environments else None
+        environment = scene.environment_spec
+    for default in reversed(adjusted):  # the first one takes precedence
+        if default.parameter == ENVIRONMENT:
+            environment = str(default.used)
     return Space(bound, scene, tuple(adjusted), environment)
 
 
@@ -359,7 +388,7 @@ def _check_controls(controls: Sequence[Control], scene: SceneDescription) -> Non
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
         raise InputError(
-            "controls: every instance needs a name of its own, got "
+            "controls: every control needs a different name, got "
             f"{', '.join(names)}; write KIND:NAME, such as "
             f"light:key,light:fill"
         )

@@ -1,14 +1,14 @@
 """The `backdrop` control: which photograph of a folder the scene is rendered into.
 
-The photographs were taken by cameras of their own, of an object that may have been
-turned and moved. The object stays as it stands in the first photograph, and camera and
-light are carried there from the others:
+Each photograph has its own camera, and the object may have been turned and moved between
+photographs. In the scene the object stays as it is in the first photograph. The cameras
+and the light of the other photographs are transformed instead, by a map T:
 
     T = pose of the object in the first . inverse(pose of the object in another)
     camera = T . camera of the other;   light is turned about the vertical by T
 
-so that controls of the object mean the same in each. T has to leave the plane that
-takes the shadow level; its height is carried there too.
+So a control of the object has the same meaning in each photograph. T has to keep the
+ground plane, which receives the shadow, level. Its height is transformed as well.
 """
 
 from __future__ import annotations
@@ -34,13 +34,14 @@ from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import Parameter
 
-PLANE_TOLERANCE = 1e-3  # of a cosine: how far the plane may be from level
-# settings of the plane that have one value in a scene
+# largest difference between the vertical direction and (0, 0, 1), per component
+PLANE_TOLERANCE = 1e-3
+# settings of the plane that must be the same in all photographs of a scene
 PLANE_SURFACE = ("ground.size", "ground.gloss", "ground.roughness")
 
 
 class BackdropControl(Control):
-    """Which photograph of a folder the scene is rendered into, seen by its camera."""
+    """Which photograph of a folder the scene is rendered into, with its camera."""
 
     kind = "backdrop"
     parameters = (
@@ -54,7 +55,7 @@ class BackdropControl(Control):
 
     @classmethod
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameter, with the photographs that a setting names as options.
+        """Return the parameter `which`, with the photographs in the settings as options.
 
         See `list_set_names` for the forms of the setting.
         """
@@ -62,14 +63,15 @@ class BackdropControl(Control):
         options = tuple(dict.fromkeys(list_set_names(settings, "which")))
         if not options:
             return (which,)
+        # The value of a choice among names is the index of an option.
         high = len(options) - 1.0
         return (replace(which, options=options, default=options[0], high=high),)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene in the first allowed photograph, after checking all of them.
 
-        If one of the photographs has a camera model, the scene gets one: all are then
-        seen through the same kind of lens.
+        If any of the photographs has a camera model, the scene gets that of the first
+        photograph, or the model of a pinhole with its field of view.
 
         Args:
             scene: scene that is rendered into a folder of photographs.
@@ -82,7 +84,7 @@ class BackdropControl(Control):
         if folder is None:
             raise InputError(
                 f"`controls` {self.name}: chooses among the photographs of a folder, "
-                "and there is none; give `backdrop=FOLDER`"
+                "and the scene has none; set `backdrop=FOLDER`"
             )
         allowed = [str(name) for name in self._list_names(scene)]
         for name in allowed:
@@ -102,6 +104,7 @@ class BackdropControl(Control):
                 camera=first.camera,
                 values=first.values,
             )
+        # Then the other photographs get a model too, see `_compute_view_inputs`.
         has_model = any(view.camera_model is not None for view in views.values())
         return replace(
             scene,
@@ -173,9 +176,8 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     """
     assert scene.photographs is not None
     view = list(scene.photographs.scenes.values())[index]
-    # (4, 4) from the world of the photograph to that of the scene
-    carry = _compute_carry(view, scene)
-    pose = carry @ camera_to_world(view)
+    view_to_scene = _compute_view_to_first(view, scene)
+    pose = view_to_scene @ camera_to_world(view)
     inputs = {
         PHOTOGRAPH_INPUT: torch.tensor(float(index)),
         "camera.to_world": torch.from_numpy(pose).float(),
@@ -187,35 +189,56 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     else:
         inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
     if has_plane(scene):
-        inputs["ground.to_world"] = _compute_plane_pose(view, carry)
+        inputs["ground.to_world"] = _compute_plane_pose(view, view_to_scene)
     if scene.environment is not None:
         radiance = torch.from_numpy(scene.environment.radiance.copy())
-        # the turn about the vertical axis, the only one that `carry` may have
-        degrees = math.degrees(math.atan2(carry[1, 0], carry[0, 0]))
-        inputs["environment.data"] = rotate_map(radiance, torch.tensor(degrees))
+        # The map to the scene may only turn about the vertical (`_check_compatible`);
+        # this is the angle, counter-clockwise seen from above.
+        angle = math.atan2(view_to_scene[1, 0], view_to_scene[0, 0])
+        degrees = torch.tensor(math.degrees(angle))
+        inputs["environment.data"] = rotate_map(radiance, degrees)
     return inputs
 
 
-def _compute_carry(view: SceneDescription, first: SceneDescription) -> Float64Array:
-    """Return the map (4, 4) by which an object in a view stands as in the first."""
-    carry: Float64Array = object_to_world(first) @ np.linalg.inv(object_to_world(view))
-    return carry
+def _compute_view_to_first(
+    view: SceneDescription, first: SceneDescription
+) -> Float64Array:
+    """Return the map (4, 4) from the world of one photograph to that of the first.
+
+    It maps the object's pose in the one to its pose in the other.
+
+    Args:
+        view: scene in one photograph.
+        first: scene in the first photograph.
+    """
+    view_to_first: Float64Array = object_to_world(first) @ np.linalg.inv(
+        object_to_world(view)
+    )
+    return view_to_first
 
 
-def _compute_plane_pose(view: SceneDescription, carry: Float64Array) -> Tensor:
-    """Return the pose (4, 4) of the plane of a view, at the height to which it is
-    carried.
+def _compute_plane_pose(view: SceneDescription, view_to_first: Float64Array) -> Tensor:
+    """Return the pose (4, 4) of the ground plane of a photograph in the scene.
 
-    `carry` is as in `_compute_carry`. The plane is a square with a side of 2 before.
+    Its mesh is a square with a side of 2 at height 0, so that it is scaled by half the
+    plane's size and lifted to the plane's height.
+
+    Args:
+        view: scene in the photograph.
+        view_to_first: (4, 4) map from the photograph's world to that of the scene. Only
+            its vertical shift is used, since the plane follows the object otherwise.
     """
     half_size = view.get_number("ground.size") / 2.0
     pose = torch.diag(torch.tensor([half_size, half_size, half_size, 1.0]))
-    pose[2, 3] = view.get_number("ground.level") + float(carry[2, 3])
+    pose[2, 3] = view.get_number("ground.level") + float(view_to_first[2, 3])
     return pose
 
 
 def _get_lens(view: SceneDescription) -> CameraModel:
-    """Return the camera model of a view, for a pinhole without one that of its angle."""
+    """Return the camera model of a photograph.
+
+    Without one, it is the model of a pinhole with the photograph's field of view.
+    """
     if view.camera_model is not None:
         return view.camera_model
     return make_pinhole(view.get_number("camera.fov"), view.aspect)
@@ -235,27 +258,28 @@ def _check_compatible(
     """
     if view.environment_spec != first.environment_spec:
         raise InputError(
-            f"`controls` backdrop: {name} has a light of its own beside it; state one "
-            "`environment` for all photographs, or sweep over them"
+            f"`controls` backdrop: {name} has a file with its own light next to it; "
+            "state one `environment` for all photographs, or sweep over them"
         )
-    # (4, 4) from the world of this photograph to that of the first
-    carry = _compute_carry(view, first)
-    # Row 2 gives z in the first world: it has to be z here as well, but for a shift.
-    up_change = carry[2, :3] - [0.0, 0.0, 1.0]
-    is_upright = np.abs(up_change).max() <= PLANE_TOLERANCE and carry[2, 2] > 0.0
+    view_to_first = _compute_view_to_first(view, first)
+    # Row 2 of the map gives the height in the world of the first photograph. Up to a
+    # shift, it has to be the height in the world of this photograph.
+    height_row = view_to_first[2, :3]
+    up_error = np.abs(height_row - [0.0, 0.0, 1.0]).max()
+    is_upright = up_error <= PLANE_TOLERANCE
     same_surface = all(
         view.get_number(setting) == first.get_number(setting)
         for setting in PLANE_SURFACE
     )
     if not is_upright:
-        reason = "the object stands with another side down"
+        difference = "the object stands on another side"
     elif has_plane(view) != has_plane(first):
-        reason = "the camera is on another side of the plane, or it has another size,"
+        difference = "the camera is on another side of the plane, or its size differs,"
     elif not same_surface:
-        reason = f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"
+        difference = f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"
     else:
         return
     raise InputError(
-        f"`controls` backdrop: in {name} {reason} than in the first photograph; leave "
-        "it out of backdrop.which, or sweep over the photographs"
+        f"`controls` backdrop: in {name} {difference} than in the first photograph; "
+        "leave it out of backdrop.which, or sweep over the photographs"
     )

@@ -1,9 +1,10 @@
-"""The `background` control: a plain colour behind the object, in place of what the
-camera sees of the environment.
+"""The `background` control: a plain color behind the object.
+
+It replaces the environment in the image:
 
     sRGB = hsv(hue, saturation, value);   backdrop = linear(sRGB)
 
-The environment keeps lighting the object (Xiao et al. 2020, Noise or signal, arXiv
+The environment still lights the object (Xiao et al. 2020, Noise or signal, arXiv
 2006.09994). Hue, saturation and value are the hexcone model of Smith (Color gamut
 transform pairs, SIGGRAPH 1978), in display-referred values.
 """
@@ -49,7 +50,7 @@ class BackgroundControl(Control):
             "what",
             BACKDROPS,
             "colour",
-            "What is behind the object: the colour, or the environment as ever.",
+            "Whether the background is the colour or the environment.",
         ),
         _image(
             "hue",
@@ -92,14 +93,16 @@ class BackgroundControl(Control):
             InputError: `what` is fixed at the environment, which shows no color.
         """
         super().__init__(name, **settings)
-        # If only `what` has a list, the color is searched too, unless it is fixed.
+        # Only a range of the color counts as a requested search. If the user sets a
+        # list of values of `what` only, the color is searched over its default range
+        # as well.
         color_specs = [
             self.specs[parameter_name]
             for parameter_name in COLOR_PARAMETERS
             if parameter_name in self.specs
         ]
-        self.has_requested_search = not all(
-            isinstance(spec, Fixed) for spec in color_specs
+        self.has_requested_search = any(
+            not isinstance(spec, Fixed) for spec in color_specs
         )
         if self.specs.get("what") == Fixed("environment"):
             raise InputError(
@@ -109,7 +112,7 @@ class BackgroundControl(Control):
             )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """See the base; `what` defaults to the environment where that is allowed."""
+        """Return a parameter; `what` is the environment by default, if that is allowed."""
         if parameter.name == "what" and "environment" in self.list_allowed_values(
             "what"
         ):
@@ -126,8 +129,9 @@ class BackgroundControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the linear color (3,) of the backdrop; nothing where the environment
-        is shown.
+        """Return the linear color (3,) of the background.
+
+        There is no input if the background is the environment.
         """
         if BACKDROPS[int(values["what"])] == "environment":
             return {}
@@ -140,9 +144,7 @@ class BackgroundControl(Control):
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return the sRGB levels of the color, which is searched as hue, saturation and
-        value.
-        """
+        """Return red, green and blue of the color, in sRGB."""
         levels = hsv_to_rgb(*(values[name] for name in COLOR_PARAMETERS))
         channels = zip(color.CHANNELS, levels, strict=True)
         return {
@@ -153,12 +155,14 @@ class BackgroundControl(Control):
 def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
     """Return the color (3,) of a hue in degrees, a saturation and a value in [0, 1].
 
-    All are display-referred. Piecewise linear in each argument, so differentiable
-    almost everywhere; a grey has the derivative 0 by hue.
+    All are display-referred. The color is piecewise linear in each argument, so
+    differentiable almost everywhere. The derivative of a gray by its hue is 0.
     """
-    # (3,) position of the hue on the color circle, which has six sectors; each channel
-    # has an offset of its own
-    sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0]).to(hue) + hue / 60.0, 6.0)
-    # how much of the saturation is taken from each channel
-    ramp = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)
-    return value * (1.0 - saturation * ramp)
+    # The color circle has six sectors of 60 degrees. The same function of the position
+    # on the circle gives each channel, with an offset for red, green and blue.
+    offsets = torch.tensor([5.0, 3.0, 1.0]).to(hue)
+    sector = torch.remainder(offsets + hue / 60.0, 6.0)
+    # 0 where the channel has its full value (two sectors), and 1 where the saturation
+    # darkens it most (two sectors); linear in between.
+    darkening = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)
+    return value * (1.0 - saturation * darkening)

@@ -1,10 +1,12 @@
-"""What a control is: a named family of scene parameters that may vary, and their map
-from the unit box.
+"""The base class of controls.
 
-A control declares its parameters as data. Bound to a scene it has a slice of u and the
-map from it to scene inputs, in torch. Most are a handful of named numbers, each fixed,
-a range, or a list: they declare the parameters, and say in `scene_inputs` what they do
-to the scene (docs/controls/writing.md):
+A control is a named family of scene parameters, such as the object's pose. A
+configuration is a vector u in the unit box [0, 1]^d. Each control reads a slice of u
+and maps it to scene inputs, by differentiable torch operations.
+
+Most controls declare a few named numbers. The user fixes each of them, or sets a range
+or a list of values. The method `scene_inputs` defines their effect on the scene
+(docs/controls/writing.md):
 
     class Exposure(Control):
         kind = "exposure"
@@ -65,25 +67,25 @@ from advsearch.scene.settings import Parameter as Parameter
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# no distance from where a control starts is larger, in whichever norm
+# upper bound of every `epsilon`, the largest distance from the start, in any norm
 MAX_EPSILON = 1e6
 
-# Where a control leaves out a value of the clean scene that was asked for, the two
-# contradict each other, and that is refused. Where it leaves out only a default, the
-# clean scene has the nearest value that the control allows, and that is said: a
-# `AdjustedDefault`.
+# The range of a control may exclude a value of the clean scene. If the user set that
+# value, the two settings contradict each other, which is an error. If it is only a
+# default, the clean scene gets the nearest value in the range, and the change is
+# reported as an `AdjustedDefault`.
 
 
 @dataclass(frozen=True)
 class AdjustedDefault:
-    """A value of the clean scene that a control had to adjust, unrequested.
+    """A default value of the clean scene that a control had to adjust.
 
     Attributes:
         control: name of the control.
         parameter: parameter that was adjusted (``pose.yaw``, ``ground.size``,
             ``environment``).
-        unit: unit of the values; "name" of names.
-        scene: the value that the scene was described with.
+        unit: unit of the values; "name" for names.
+        scene: value in the scene as it was described.
         used: the value that is used instead.
     """
 
@@ -95,15 +97,22 @@ class AdjustedDefault:
 
 
 def describe_adjusted_defaults(adjusted: Sequence[AdjustedDefault]) -> list[str]:
-    """Return one sentence a control about the values that had to be adjusted."""
-    result = []
+    """Return a sentence for each control about the values that it adjusted.
+
+    For example "The clean scene has pose.yaw 10 degrees instead of 0, which the control
+    pose leaves out.": the range of `pose` leaves out 0.
+
+    Args:
+        adjusted: adjusted values; those of the same control follow each other.
+    """
+    sentences = []
     for control, values in groupby(adjusted, key=lambda value: value.control):
         adjustments = " and ".join(map(_describe_adjustment, values))
-        result.append(
+        sentences.append(
             f"The clean scene has {adjustments}, which the control {control} leaves "
             "out."
         )
-    return result
+    return sentences
 
 
 def _describe_adjustment(value: AdjustedDefault) -> str:
@@ -113,7 +122,7 @@ def _describe_adjustment(value: AdjustedDefault) -> str:
         unit = ""
     used = value.used if isinstance(value.used, str) else format_rounded(value.used)
     scene = value.scene if isinstance(value.scene, str) else format_rounded(value.scene)
-    if used == scene:
+    if used == scene:  # the values differ by less than the rounding: show more digits
         used = format_value(value.used)
         scene = format_value(value.scene)
     return f"{value.parameter} {used}{unit} instead of {scene}"
@@ -125,7 +134,7 @@ def list_replaced_settings(
     """Yield the default values of a scene that a control has replaced.
 
     They are the environment, and settings such as "ground.size" that differ between
-    both scenes.
+    both scenes. A value that the user set must not be replaced.
 
     Args:
         control: name of the control, for messages.
@@ -133,13 +142,14 @@ def list_replaced_settings(
         after: scene that the control returned.
 
     Raises:
-        InputError: a replaced value was set by the user, so it is no default.
+        InputError: the control replaced a value that the user set.
     """
     environment = _find_replaced_environment(control, before, after)
     if environment is not None:
         yield environment
     for name, value in after.values.items():
         value_before = before.values[name]
+        # None is a default that the scene computes: it has no value to compare.
         if value is None or value_before is None or is_same_value(value, value_before):
             continue
         if name in before.requested:
@@ -157,26 +167,26 @@ def _find_replaced_environment(
 ) -> AdjustedDefault | None:
     """Return the environment that a control has replaced in a scene, or None.
 
-    It is also None if the new scene names the new environment in its
-    `environment_spec`: then the environment is not an adjusted default.
-
     Args:
         control: name of the control, for messages.
         before: scene before the control has prepared it.
         after: scene that the control returned.
 
     Raises:
-        InputError: the user set the environment that was replaced.
+        InputError: the user set the environment that was replaced; or a part of the
+            scene is an environment too.
     """
     if after.environment is None or after.environment is before.environment:
         return None
     check_single_environment(after.parts, f"`controls` {control}")
+    # An environment that the user set must not be replaced.
     if ENVIRONMENT in before.requested:
         raise InputError(
             f"`environment={before.environment_spec}` and `controls` {control} "
             "contradict each other: the control "
             f"puts {after.environment.name} in its place; leave one of the two out"
         )
+    # The control has recorded the new name in the scene itself; `compose` reads it.
     if after.environment_spec != before.environment_spec:
         return None
     return AdjustedDefault(
@@ -189,23 +199,29 @@ NO_INPUTS: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
 
 @dataclass(frozen=True)
 class Choice:
-    """One setting of a control that is chosen, not searched (a norm, a resolution).
+    """A setting of a control that is not searched, such as a norm or a resolution.
+
+    If neither `options`, `integer_bounds` nor `max_value` is set, any value is allowed,
+    and `Control.check_choices` should check it.
 
     Attributes:
-        name: short name.
-        default: what it is when nothing is said.
-        description: one sentence.
-        run_setting: the setting of a whole run that says it for all controls
-            ("epsilon"), unless the control itself says something else; empty if there
-            is none.
-        bounds: the parameter that it says something about; empty if it counts always.
-            Where that parameter is not searched, the control does not take the setting.
-        fixes: the parameter that is not searched where this is chosen; empty if there
-            is none.
-        options: the names that can be chosen; empty for anything else.
-        integer_bounds: the smallest and the largest whole number that can be chosen, or None.
-        max_value: the largest number that can be chosen, all over 0; None for anything else.
-        signed: numbers down to minus `max_value` can be chosen, too.
+        name: name of the setting, without that of the control.
+        default: value that is used if the user sets none.
+        description: one sentence for the user.
+        run_setting: setting of a run that sets this choice for all its controls, such
+            as "epsilon". A value that the user sets in the control itself takes
+            precedence. Empty if there is no such setting.
+        bounds: name of the parameter that this choice limits. The choice has no effect
+            if that parameter is not searched. Empty if it always has an effect.
+        fixes: name of the parameter that is not searched if this choice is set. Empty
+            if there is none.
+        options: allowed names. Empty if the value is no name.
+        integer_bounds: smallest and largest allowed integer. None if the value need
+            not be an integer.
+        max_value: largest allowed number. Numbers have to be positive, unless `signed`
+            is true. None if the value is not limited by it.
+        signed: whether numbers from ``-max_value`` to `max_value` are allowed,
+            including 0.
     """
 
     name: str
@@ -238,7 +254,10 @@ class Choice:
             )
 
     def _describe_expected(self) -> str | None:
-        """Return a phrase about what can be chosen; None if anything can."""
+        """Return a phrase about the allowed values; None if any value is allowed.
+
+        For example "a whole number from 1 to 64".
+        """
         if self.options:
             return f"one of {', '.join(self.options)}"
         if self.integer_bounds is not None:
@@ -257,84 +276,89 @@ class Choice:
         return Parameter.is_number(value) and self._is_in_bounds(value)
 
     def _is_in_bounds(self, value: float) -> bool:
-        """Return whether a number can be chosen where numbers can be."""
+        """Return whether a number meets `integer_bounds`, or `max_value` and `signed`.
+
+        Without either any number does.
+        """
         if self.integer_bounds is not None:
             low, high = self.integer_bounds
             return low <= value <= high and value == int(value)
         if self.max_value is None:
             return True
-        return (
-            abs(value) <= self.max_value
-            if self.signed
-            else 0.0 < value <= self.max_value
-        )
+        if self.signed:
+            return abs(value) <= self.max_value
+        return 0.0 < value <= self.max_value
 
 
 Values = Mapping[str, Tensor]
-"""A configuration: parameter name to a float32 tensor of the parameter's shape; of a
-discrete choice, its number.
+"""The value of each parameter of a control, by the parameter's name.
+
+A value is a float32 tensor of the parameter's shape. For a parameter with named options
+it is the index of the option.
 """
 
 
 class Control:
-    """A family of scene parameters.
+    """Base class for all controls: a family of scene parameters.
 
-    `bind` returns a copy with a scene, which has a slice of u and maps it to inputs.
+    Your controls should subclass this class and define `kind`, `parameters` and
+    `scene_inputs`.
 
-    It is made of named numbers and choices. Once one parameter is given a range or a
-    list, only those given so are searched; otherwise each parameter is searched over
-    its own `search` range, if it has one. Of a picture among the parameters, the
-    numbers are not said one by one.
-
-    Args:
-        name: the instance's name; the kind unless given.
-        **to_settings: a value for any parameter (fixed, range or list) or choice, by name.
+    A control has parameters, which can be searched, and choices, which can't. If the
+    user sets a range or a list of values for any parameter, only such parameters are
+    searched. Otherwise every parameter with a `search` range is searched over that.
+    `bind` returns a copy of the control for a scene, which maps a slice of u to scene
+    inputs.
 
     Attributes:
-        kind: the word for it on the command line.
-        summary: one sentence; of a class that says none, the first of its docstring.
-        parameters: what may vary.
-        choices: what may be chosen.
-        targets_mesh: it is about one mesh, and may be about another than the object: the
-            name of that is then `KIND:MESH`.
-        strength_parameter: the parameter whose value in the scene as it was described means that
-            the rest of the control does not show: the power of a lamp, say. None where
-            the scene has all parameters of itself.
-        instance_parameters: the parameters of this instance: `declare_parameters` of
-            its settings.
-        chosen: what is chosen, by name; the default where nothing was said.
-        specs: what parameters were set to, of those that were given.
-        has_requested_search: whether a parameter was given a range or a list.
-        scene: once bound, the scene that all controls of the space have prepared.
-        start: once bound, (d,) float32 in [0, 1], the value that leaves the scene as it
-            is.
-        groups: once bound, the coordinates of the slice in order; their sizes add up to
-            d.
-        slots: once bound, each parameter with what it is set to, in the order of its
-            coordinates; none where its coordinates are no parameters one by one.
-        adjusted_defaults: once bound, values of the clean scene that the start has not,
-            because the control leaves them out.
-        refines: the scene inputs that it takes from the controls before it, and may
-            change (a patch on a texture).
-        on_top: what it refines lies over what all other controls make of it, whatever
-            the order in which they were asked for (a patch on any material).
-        exposure: seconds that the shutter is open, and that the rows of a picture are
-            read in, below 0 from the bottom; see `advsearch.scene.formation`.
-        flashes: how often a second it changes its light at most.
-        travels: whether it moves something along a path; it has `seconds` and
-            `distances()` then, and its parameter `PATH_PARAMETER` says which path is
-            taken where there are several.
-        competes_with_ambient: whether it throws light that ambient light weakens, see
-            `ambient`.
-        photograph_refusal: why it would not be true of a scene that is rendered into a
-            photograph; empty if it is.
-
-    Raises:
-        UnknownNameError: no such parameter or choice.
-        InputError: a value is out of range.
+        kind: name of the control on the command line.
+        summary: one sentence for the user. The first paragraph of the class docstring
+            by default.
+        parameters: parameters that can be searched.
+        choices: settings that are not searched.
+        targets_mesh: whether the control acts on one mesh, which can be another mesh
+            than the object under test. The control of such a mesh is named
+            ``KIND:MESH``.
+        strength_parameter: name of the parameter that switches the control off, such
+            as the power of a lamp: at its value in the clean scene, the other
+            parameters have no effect. None if there is no such parameter.
+        instance_parameters: parameters of this instance, as `declare_parameters`
+            returns them for its settings.
+        chosen: value of each choice, by name.
+        specs: fixed value, range or list of values of each parameter that the user
+            set, by name.
+        has_requested_search: whether the user set a range or a list of values for any
+            parameter.
+        scene: scene after all controls have prepared it. Set by `bind`.
+        start: (d,) float32 in [0, 1], the configuration that leaves the scene
+            unchanged. Set by `bind`.
+        groups: groups of coordinates that are differentiated alike, in the order of
+            the coordinates. Their sizes add up to d. Set by `bind`.
+        slots: each parameter with its spec and the offset of its coordinates, in the
+            order of the coordinates. Empty if coordinates are not single parameters,
+            such as pixels. Set by `bind`.
+        adjusted_defaults: default values of the clean scene that the ranges exclude.
+            The start has the nearest allowed values instead. Set by `bind`.
+        refines: names of scene inputs of earlier controls that this control reads and
+            may change. For example, a patch changes the texture that a material
+            control has set.
+        on_top: whether this control is evaluated after all others that refine the same
+            input, in whichever order the user names them. For example, a patch lies on
+            any material.
+        exposure: seconds during which the shutter is open, and seconds in which all
+            rows of an image are read out, negative if the lowest row is read first. See
+            `advsearch.scene.formation`.
+        flashes: largest number of times per second that the control changes its light.
+        travels: whether the control moves something along a path. It then has the
+            attribute `seconds` and the method `distances`.
+        PATH_PARAMETER: name of the parameter that selects one of several paths, if the
+            control travels.
+        competes_with_ambient: whether the control adds light that is less visible in
+            brighter ambient light. See `ambient`.
+        photograph_refusal: reason why the control can't be used if the scene is
+            rendered into a photograph. Empty if it can.
     """
 
-    # the parameter that says which of several paths is taken
     PATH_PARAMETER: ClassVar[str] = "way"
     kind: ClassVar[str]
     summary: ClassVar[str]
@@ -358,9 +382,11 @@ class Control:
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
         names = [method.__name__ for method in METHODS_WITH_COPIES]
-        hand_copies(cls, **dict.fromkeys(names, slice(None)))
+        all_arguments = slice(None)
+        hand_copies(cls, **dict.fromkeys(names, all_arguments))
         if "summary" not in vars(cls) and cls.__doc__:
-            cls.summary = " ".join(cls.__doc__.partition("\n\n")[0].split())
+            first_paragraph = cls.__doc__.partition("\n\n")[0]
+            cls.summary = " ".join(first_paragraph.split())
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         """Read and check the settings of a control, without a scene.
@@ -410,7 +436,7 @@ class Control:
                 )
 
     def _parse_specs(self) -> dict[str, Spec]:
-        """Return what parameters are set to, by name; only of those with a setting."""
+        """Return the fixed value, range or list of each parameter that the user set."""
         specs: dict[str, Spec] = {}
         for parameter in self.instance_parameters:
             name = parameter.name
@@ -424,39 +450,45 @@ class Control:
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters of an instance with some settings.
 
-        They are those of the class. Subclasses add parameters that settings name.
-        `settings` are the names, or a mapping that has the values too.
+        By default they are the parameters of the class. A subclass whose parameters
+        depend on the user's settings can override this method, for example if the names
+        of the settings are those of joints.
+
+        Args:
+            settings: names of the settings, or a mapping from names to values.
         """
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check the values of the choices, `self.chosen`, in ways of a subclass.
+        """Check the values of the choices, `self.chosen`.
 
-        For example, two choices may exclude each other. By default nothing is checked.
+        Does nothing by default. Subclasses override it for what `Choice` can't check,
+        such as two choices that exclude each other.
 
         Raises:
-            InputError: a choice is out of range.
+            InputError: the value of a choice is not allowed.
         """
 
     def to_settings(self) -> dict[str, object]:
-        """Return what `make_control` needs to make an equal instance, as JSON
-        values.
-        """
+        """Return JSON values from which `make_control` makes an equal instance."""
         if self.name == self.kind:
             return dict(self._settings)
         return {"kind": self.kind, **self._settings}
 
     @property
     def mesh(self) -> str:
-        """Name of the mesh that it is about.
+        """Name of the mesh that the control acts on.
 
-        It stands behind the colon of the control's name; by default it is the object.
+        It is "chair" for the control "pose:chair", and the object for "pose".
         """
-        return (self.name.partition(":")[2] if self.targets_mesh else "") or OBJECT
+        mesh_name = ""
+        if self.targets_mesh:
+            mesh_name = self.name.partition(":")[2]
+        return mesh_name or OBJECT
 
     @property
     def file_name(self) -> str:
-        """Its name as it stands in names of files."""
+        """Name of the control in file names, which have no colon."""
         return to_file_name(self.name)
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
@@ -464,8 +496,8 @@ class Control:
 
         Raises:
             UnknownNameError: the scene has no such mesh.
-            InputError: it belongs to the surroundings of a Mitsuba scene, which can't
-                be changed by this control.
+            InputError: the mesh belongs to the surroundings of a Mitsuba scene, which
+                this control can't change.
         """
         mesh = self.mesh
         if mesh in scene.meshes:
@@ -487,28 +519,31 @@ class Control:
         )
 
     def setting_name(self, parameter: Parameter) -> str:
-        """Return the name of a parameter among the scene's settings.
+        """Return the name that a parameter would have among the scene's settings.
 
-        Whether or not the scene has it.
+        For example "pose.yaw". There need not be such a setting.
         """
-        return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
+        prefix = self.kind if self.mesh == OBJECT else self.name
+        return f"{prefix}.{parameter.name}"
 
     def select_form(self, forms: Sequence[str]) -> str:
         """Return the form in which a control acts, such as "palette" for `texture`.
 
         Each form has one parameter. The user requests a form by the setting `form`, or
-        by setting its parameter to its full range.
+        by setting the form's parameter to its full range, e.g. ``texels: [0, 1]``. Any
+        other range is an error, because `epsilon` limits how far the parameter may go.
 
         Args:
             forms: names of the forms, in the order of their parameters; the first is
                 the default.
 
         Raises:
-            InputError: two forms are requested, or a parameter is set to a narrower
-                range than its full one.
+            InputError: two forms are requested, or a parameter is set to something
+                else than its full range.
             UnknownNameError: there is no such form.
         """
         requested = []
+        # The parameters of the class are in the order of the forms.
         for parameter, form in zip(self.parameters, forms, strict=True):
             value = self._settings.get(parameter.name)
             if value is None:
@@ -539,7 +574,8 @@ class Control:
 
         Args:
             parameter: name of the parameter.
-            *defaults: returned if it was not set, or was set to a range.
+            *defaults: values that are returned if the user did not set the parameter,
+                or set it to a range.
         """
         spec = self.specs.get(parameter)
         if isinstance(spec, OneOf):
@@ -549,9 +585,7 @@ class Control:
         return defaults
 
     def is_searched(self, parameter: str) -> bool:
-        """Return whether a parameter with a range of its own is among what is
-        searched.
-        """
+        """Return whether a parameter is searched, if it has a default search range."""
         if parameter in self.specs:
             return not isinstance(self.specs[parameter], Fixed)
         return not self.has_requested_search
@@ -559,9 +593,9 @@ class Control:
     # ---- in a scene
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Return the scene with the parts that this control needs (a light, a medium).
+        """Return the scene with the parts that this control needs, such as a lamp.
 
-        By default it is unchanged.
+        Returns the scene unchanged by default.
 
         Raises:
             InputError: the control does not fit the scene.
@@ -569,7 +603,7 @@ class Control:
         return scene
 
     def with_scene(self, scene: SceneDescription) -> Self:
-        """Return a copy that has a scene, without a slice of u yet."""
+        """Return a copy with a scene, which is not bound to it yet (see `bind`)."""
         in_scene = copy.copy(self)
         in_scene.scene = scene if is_ours(type(self)) else copy_value(scene)
         return in_scene
@@ -587,8 +621,9 @@ class Control:
     def fit(self) -> None:
         """Set `slots`, `start`, `groups` and `adjusted_defaults` for `self.scene`.
 
-        A slot is the place of one parameter in the control's slice of u; a fixed one
-        has no coordinates. A group has the coordinates of one searched parameter.
+        A slot is a parameter with the position of its coordinates in the control's
+        slice of u; a fixed parameter has no coordinates. A group has the coordinates of
+        one searched parameter.
 
         Raises:
             InputError: a setting of the control is impossible in this scene.
@@ -607,23 +642,25 @@ class Control:
         )
         self.groups = tuple(self._group(slot) for slot in slots if slot.n_coordinates)
         # For `values`: the lower bound and the width of the range of each coordinate,
-        # (d,) each. All coordinates of a slot have the same range; a slot without one
-        # gets a range that is not used.
+        # (d,) each. All coordinates of a slot have the same range. A slot that is fixed
+        # or has a list of values has no range; its placeholder is never read.
+        placeholder = Range(0.0, 1.0)
         ranges = [
-            slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0)
-            for slot in slots
+            slot.spec if isinstance(slot.spec, Range) else placeholder for slot in slots
         ]
-        low_and_span = torch.tensor(
+        low_and_span_of_slot = torch.tensor(
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
         counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
-        self._low, self._span = low_and_span.T.repeat_interleave(counts, dim=1)
+        low_and_span = low_and_span_of_slot.T.repeat_interleave(counts, dim=1)
+        self._low = low_and_span[0]
+        self._span = low_and_span[1]
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter as this scene has it.
+        """Return a parameter with its value in the unchanged scene as the default.
 
-        Its default is its value in the unchanged scene. A control may also give it the
-        search range, unit, shape and estimators that it has there.
+        Subclasses can also adapt its search range, unit, shape and estimators to the
+        scene.
         """
         value = self.scene.values.get(self.setting_name(parameter))
         return parameter if value is None else replace(parameter, default=value)
@@ -639,17 +676,21 @@ class Control:
     def get_scene_value(self, parameter: Parameter) -> ParameterValue:
         """Return the value of a parameter in the scene as it was described.
 
-        That is its default, unless that changes the scene. The parameter is as
-        `resolve_parameter` returned it.
+        By default it is the parameter's default. Subclasses override this if that
+        changes the scene: a scene without a lamp has a lamp of power 0, but the default
+        power of a lamp whose color is searched is not 0.
+
+        Args:
+            parameter: parameter as `resolve_parameter` returned it.
         """
         return parameter.default
 
     def get_spec(self, parameter: Parameter) -> Spec:
-        """Return what a parameter is set to: a value, a range or a list of values.
+        """Return the spec of a parameter: a fixed value, a range or a list of values.
 
         A parameter that the user did not set is searched over its default range. But it
-        is fixed at its default if it has no such range, or if the user gave another
-        parameter a range.
+        is fixed at its default value if it has no such range, or if the user set a
+        range for another parameter.
 
         Args:
             parameter: parameter with its range in the scene (`resolve_parameter`).
@@ -663,7 +704,7 @@ class Control:
         return Range(*parameter.search)
 
     def get_budget(self, parameter: Parameter) -> Budget:
-        """Return how far a searched parameter may go: by default its whole range."""
+        """Return how far a searched parameter may go: its full range by default."""
         return FULL_RANGE
 
     def list_parameter_specs(self) -> Iterator[tuple[Parameter, Spec]]:
@@ -672,9 +713,10 @@ class Control:
             yield parameter, self.get_spec(parameter)
 
     def must_match_scene(self, parameter: Parameter, spec: Spec) -> bool:
-        """Return whether the start has to have the clean scene's value of a parameter.
+        """Return whether the start should have the clean scene's value of a parameter.
 
-        By default always.
+        True by default. If it is false, a start with another value is not reported as
+        an adjusted default.
         """
         return True
 
@@ -705,12 +747,12 @@ class Control:
     def _list_adjusted_defaults(self) -> Iterator[AdjustedDefault]:
         """Yield the parameters whose start differs from the value in the clean scene.
 
-        Parameters that the user fixed are left out. If the control has an `amount`,
-        such as the density of a haze, only that is compared: at the amount of the clean
-        scene, its other parameters have no effect.
+        Parameters that the user fixed in the control are left out. If the control has a
+        `strength_parameter`, such as the density of a haze, only that is compared: at
+        its value in the clean scene, the other parameters have no effect.
 
         Raises:
-            InputError: the user set the scene's value, and the range excludes it.
+            InputError: the user set the scene's value, and the control excludes it.
         """
         for slot in self.slots:
             parameter = slot.parameter
@@ -718,10 +760,10 @@ class Control:
                 continue
             scene_value = self.get_scene_value(parameter)
             used = slot.start_value()
-            hides_others = self.strength_parameter not in (None, parameter.name)
-            if hides_others or is_same_value(used, scene_value, is_angle=slot.is_angle):
+            is_hidden = self.strength_parameter not in (None, parameter.name)
+            if is_hidden or is_same_value(used, scene_value, is_angle=slot.is_angle):
                 continue
-            # the scene's setting that has the same meaning
+            # the scene's setting for the same value, such as "pose.yaw"
             setting = self.setting_name(parameter)
             label = f"{self.name}.{parameter.name}"
             if setting in self.scene.requested:
@@ -737,6 +779,8 @@ class Control:
             if not is_fixed_by_user:
                 yield AdjustedDefault(
                     self.name,
+                    # The environment is one value, which several controls may replace:
+                    # it has the same label in all of them.
                     setting if setting == ENVIRONMENT else label,
                     "name" if parameter.options else parameter.unit,
                     scene_value,
@@ -744,7 +788,7 @@ class Control:
                 )
 
     def _quote_setting(self, setting: str) -> str:
-        """Return how a setting of the scene is written, with its value."""
+        """Return how the user writes a setting of the scene, with its value."""
         if setting == ENVIRONMENT:
             return f"`environment={self.scene.environment_spec}`"
         return f"`set` {setting}={format_value(self.scene.get_number(setting))}"
@@ -755,10 +799,11 @@ class Control:
         A list of values gets no gradient estimators, since it has no derivative.
 
         Args:
-            slot: the parameter's place in u.
+            slot: the parameter with its spec.
 
         Raises:
-            InputError: a parameter with a norm budget was given a distribution.
+            InputError: the user set a distribution for a parameter that is searched
+                in the ball of a norm.
         """
         parameter = slot.parameter
         name = parameter.name
@@ -772,8 +817,8 @@ class Control:
         is_distribution = type(spec) is not Range  # a subclass of it
         if is_distribution and budget != FULL_RANGE:
             raise InputError(
-                f"{self.name}.{name}: it has a ball and no distribution; give it a "
-                "range"
+                f"{self.name}.{name}: expected a range, got a distribution; its values "
+                "are limited by a norm (epsilon)"
             )
         return Group(
             name,
@@ -786,9 +831,9 @@ class Control:
 
     @property
     def ambient(self) -> float | None:
-        """Lux of ambient light beside the light that it throws.
+        """Ambient light in lux, in addition to the light of this control.
 
-        None where there is none, or where it is searched.
+        None if there is none, or if it is searched.
         """
         return None
 
@@ -802,14 +847,17 @@ class Control:
 
     @property
     def budget(self) -> Budget:
-        """The budget of the slice of u: that of its largest group."""
+        """Budget of the largest group of coordinates, which stands for all of them."""
         if not self.groups:
             return FULL_RANGE
         return max(self.groups, key=lambda group: group.size).budget
 
     @property
     def refines(self) -> frozenset[str]:
-        """See the class; a plain attribute will do."""
+        """Names of the earlier controls' scene inputs that this control may change.
+
+        A subclass can define a class attribute instead.
+        """
         return frozenset()
 
     # ---- at a configuration
@@ -852,11 +900,16 @@ class Control:
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the scene inputs that the values set, by name; differentiable.
+        """Return the scene inputs that the values set, by name.
 
-        None by default: subclasses that act on the scene override it, and those that
-        act on the finished image override `on_picture`. `earlier_inputs` is as for
-        `inputs`.
+        Returns no inputs by default. Subclasses that act on the scene override it,
+        by differentiable torch operations. Those that act on the finished image override
+        `on_picture` instead.
+
+        Args:
+            values: value of each parameter, by name.
+            earlier_inputs: inputs of the controls before this one. Only names in
+                `refines` may be returned again.
         """
         return {}
 
@@ -865,25 +918,37 @@ class Control:
     ) -> dict[str, Tensor]:
         """Map a slice of u to scene inputs by name.
 
-        By differentiable torch operations, on the device of u.
+        The map is differentiable, and its results are on the device of u.
 
         Args:
-            u: (d,) in [0, 1].
-            earlier_inputs: inputs of the controls before this one; only names in `refines`
-                may be returned again.
+            u: (d,) the control's slice of a configuration, in [0, 1].
+            earlier_inputs: inputs of the controls before this one. Only names in
+                `refines` may be returned again.
         """
         return self.scene_inputs(self.values(u), earlier_inputs)
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        """Return what the values make of the finished image; see `apply_to_image`."""
+        """Return the finished image as the values change it.
+
+        Returns the image unchanged by default. Subclasses that act on the image override
+        it, by differentiable torch operations.
+
+        Args:
+            values: value of each parameter, by name.
+            image: (H, W, 3) display-referred sRGB in [0, 1].
+        """
         return image
 
     def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
-        """Change the finished image, (H, W, 3) display-referred sRGB in [0, 1].
+        """Return the finished image as a configuration changes it.
 
-        Differentiable in both arguments.
+        The result is differentiable in both arguments.
+
+        Args:
+            u: (d,) the control's slice of a configuration, in [0, 1].
+            image: (H, W, 3) display-referred sRGB in [0, 1].
         """
-        # many do nothing to the image: their values are not worked out again
+        # Most controls leave the image unchanged, so that their values are not needed.
         if type(self).on_picture is Control.on_picture:
             return image
         return self.on_picture(self.values(u), image)
@@ -891,7 +956,16 @@ class Control:
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return further values to store, by name without the instance's."""
+        """Return further values to store with a configuration; none by default.
+
+        Args:
+            values: value of each parameter, by name.
+            earlier_inputs: inputs of the controls before this one.
+
+        Returns:
+            Values with their units (see `make_value`), by name without that of the
+            control.
+        """
         return {}
 
     def describe(
@@ -900,8 +974,8 @@ class Control:
         """Describe a configuration by a few named values with units.
 
         They are the parameters that are not fixed, except images, and the values of
-        `measured`. Names are `<control>.<parameter>`, such as "pose.yaw", with an index
-        for an element of a vector.
+        `compute_measurements`. Names are `<control>.<parameter>`, such as "pose.yaw";
+        elements of a vector have an index, such as "pose.rotation.0".
 
         Args:
             u: (d,) the control's slice of a configuration, in [0, 1].
@@ -945,66 +1019,90 @@ class Control:
         return numbers
 
     def get_printable_colors(self, u: Tensor) -> Tensor | None:
-        """Return the searched colors that a printer would print; None without any.
+        """Return the searched colors that would have to be printed; None without any.
 
         Returns:
-            (h, w, 3) display-referred sRGB in [0, 1], differentiable in u. Where
-                only some are searched (h, w, 4), with 1 for these and 0 for others.
+            (h, w, 3) display-referred sRGB in [0, 1], differentiable in u. If only some
+            colors are searched, (h, w, 4), where the fourth channel is 1 for those and
+            0 for the others.
         """
         return None
 
     def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return images to store with a result, by file stem; none by default.
+        """Return images to store with a result; none by default.
 
-        Each is (h, w, 3), display-referred sRGB in [0, 1].
+        Args:
+            values: value of each parameter, by name.
+            earlier_inputs: inputs of the controls before this one.
+
+        Returns:
+            Images (h, w, 3), display-referred sRGB in [0, 1], by file name without
+            suffix.
         """
         return {}
 
     def get_artifact_images(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
-        """Return images to store with a result, by file stem, such as a texture.
+        """Return images to store with a result, such as a texture.
 
-        A subclass provides them by `kept_pictures`.
+        A subclass provides them by `make_artifact_images`.
 
         Args:
             u: (d,) the control's slice of a configuration, in [0, 1].
             earlier_inputs: inputs of the controls that are evaluated before this one.
 
         Returns:
-            Images (h, w, 3), display-referred sRGB in [0, 1].
+            Images (h, w, 3), display-referred sRGB in [0, 1], by file name without
+            suffix.
         """
         return self.make_artifact_images(self.values(u.detach()), earlier_inputs)
 
     def make_artifact_files(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, bytes]:
-        """Return other files to store with a result, by name with suffix."""
+        """Return other files to store with a result; none by default.
+
+        Args:
+            values: value of each parameter, by name.
+            earlier_inputs: inputs of the controls before this one.
+
+        Returns:
+            Content of each file, by file name with suffix.
+        """
         return {}
 
     def get_artifact_files(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
-        """Return other files to store with a result, by name with suffix.
+        """Return other files to store with a result, such as a mesh as PLY.
 
-        A file may be a mesh as PLY. A subclass provides them by `kept_files`.
+        A subclass provides them by `make_artifact_files`.
 
         Args:
             u: (d,) the control's slice of a configuration, in [0, 1].
             earlier_inputs: inputs of the controls that are evaluated before this one.
+
+        Returns:
+            Content of each file, by file name with suffix.
         """
         return self.make_artifact_files(self.values(u.detach()), earlier_inputs)
 
 
-NumberControl = Control  # its name in packages that add controls
+NumberControl = Control  # alias for packages that add controls
 
 
 def _to_tensor(constant: ParameterValue, slot: Slot, device: torch.device) -> Tensor:
     """Return a fixed value as a tensor of the shape of its parameter.
 
     A name becomes its index among the parameter's options.
+
+    Args:
+        constant: the value; all elements of a vector have it.
+        slot: the parameter with its spec.
+        device: device of the tensor.
     """
     if isinstance(constant, str):
         return torch.full(
@@ -1013,6 +1111,7 @@ def _to_tensor(constant: ParameterValue, slot: Slot, device: torch.device) -> Te
             dtype=torch.float32,
             device=device,
         )
+    # The values of a vector or an array are a flat vector, like its coordinates.
     shape = (slot.n_values,) if slot.parameter.shape else ()
     return torch.full(shape, float(constant), dtype=torch.float32, device=device)
 
@@ -1033,7 +1132,10 @@ METHODS_WITH_COPIES = (
     Control.make_artifact_images,
     Control.make_artifact_files,
 )
-"""Methods of controls that get copies of tensors in controls of another package."""
+"""Methods that get copies of their tensors if another package defines the control.
+
+So such a control can't change the tensors of the caller in place.
+"""
 
 
 def make_value(value: Tensor | float, unit: str) -> Value:
@@ -1056,5 +1158,5 @@ def describe_color_change(name: str, change: Tensor) -> dict[str, Value]:
 
 
 def to_file_name(name: str) -> str:
-    """Return a control's name as file names have it: texture@chair of texture:chair."""
+    """Return a control's name for file names: "texture@chair" for "texture:chair"."""
     return name.replace(":", "@")

@@ -1,6 +1,4 @@
-"""The `body` control: how a mesh with joints stands or moves, and what a person is
-like, by the rig of the mesh.
-"""
+"""The `body` control: the joints and the animation of a rigged mesh, such as a person."""
 
 from __future__ import annotations
 
@@ -23,9 +21,7 @@ from advsearch.extend import (
 
 
 class BodyControl(Control):
-    """What a person is like, how they stand or walk, and how a rigged file of your own
-    moves.
-    """
+    """A person's shape, pose and walk, or the joints and animations of a rigged file."""
 
     kind = "body"
     targets_mesh = True
@@ -34,7 +30,8 @@ class BodyControl(Control):
         Choice(
             "clip",
             None,
-            "Name or number of the animation that `time` is of; by itself the first.",
+            "Name or number of the animation that `time` refers to; by default the "
+            "first.",
         ),
     )
 
@@ -42,7 +39,7 @@ class BodyControl(Control):
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters of the class, and those of a rig that are set.
 
-        A name that no rig can have is left out here, and rejected later.
+        A name that no rig can have is left out here; `Control` rejects it.
         """
         known = {parameter.name for parameter in cls.parameters}
         declared = (
@@ -63,7 +60,7 @@ class BodyControl(Control):
         mesh = self.get_mesh(self.scene)
         if mesh.mesh.rig is None:
             raise InputError(
-                f"`controls` {self.name}: {mesh.name} has no joints; take "
+                f"`controls` {self.name}: {mesh.name} has no joints; use "
                 "`object=person`, or a rigged file (.glb, "
                 ".gltf, .vrm)"
             )
@@ -71,9 +68,10 @@ class BodyControl(Control):
 
     @property
     def clip(self) -> str | None:
-        """The name of the animation that is played, or None.
+        """The name of the animation that is played; None for no animation.
 
-        The choice `clip` is a name, or the number of an animation from 0 on.
+        The choice `clip` is the name or the index of an animation. Without it, the
+        first animation is played if the user set its `time`, or no setting at all.
 
         Raises:
             UnknownNameError: the mesh has no animation of that name or number.
@@ -81,12 +79,10 @@ class BodyControl(Control):
         clips = self.rig.clips
         requested = self.chosen["clip"]
         if requested is None:
-            # By default the first animation is played, if the control has no settings
-            # or its time is set.
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
         index = -1  # no index of an animation
-        # a number may be given as text
+        # The index may be a string, such as "1".
         if Parameter.is_number(requested) or str(requested).isdecimal():
             index = int(requested)
         if requested not in clips and not 0 <= index < len(clips):
@@ -103,35 +99,39 @@ class BodyControl(Control):
 
         Raises:
             InputError: there is nothing to search.
-            UnknownNameError: the rig has no such parameter.
+            UnknownNameError: the rig has no such parameter, or no such clip.
         """
         known = [parameter.name for parameter in self.rig.parameters]
         for name in self.specs:
             if name not in known:
-                where = f"It stands in `controls` {self.name}."
+                hint = f"It stands in `controls` {self.name}."
                 raise errors.UnknownNameError(
-                    f"parameter of {self.mesh}", name, known, where
+                    f"parameter of {self.mesh}", name, known, hint
                 )
-        if not self._settings and not any(
+        # With settings, `make_space` reports if nothing is searched.
+        has_default_search = any(
             self.resolve_parameter(parameter).search for parameter in self.parameters
-        ):
+        )
+        if not self._settings and not has_default_search:
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(
-                f"`controls` {self.name}: {self.mesh} has no animation to play; give "
+                f"`controls` {self.name}: {self.mesh} has no animation to play; set "
                 "ranges, as in "
                 f"{self.name}={{{example}: [-20, 20]}}"
             )
+        # The class has parameters of persons, which other rigs do not have.
         self.instance_parameters = tuple(
             parameter
             for parameter in self.instance_parameters
             if parameter.name in known
         )
-        self.clip  # noqa: B018 - raises for an animation that is not there
+        self.clip  # noqa: B018 - raises if there is no such animation
         super().fit()
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter with the value of the rig; not searched if the rig lacks
-        it.
+        """Return a parameter with its default in the rig.
+
+        A parameter that the rig does not have is not searched.
         """
         default = self.rig.defaults.get(parameter.name)
         if default is None:

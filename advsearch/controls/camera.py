@@ -1,10 +1,10 @@
 """The `camera` control: an orbit around the object, the lens, and the exposure.
 
-The camera looks at the middle of the object in its default pose. Its lens bends as a
-calibrated one does where a coefficient is asked for, or a camera file has one: see
-`advsearch.scene.camera_model`. While the distance is not searched or set, it follows
-the field of view so that the object keeps its place in the picture (a dolly zoom), down
-to where the camera would enter the sphere around the object: see
+The camera looks at the center of the object in its default pose. If a distortion
+coefficient is set, or a camera file has some, the lens is a calibrated one with
+distortion: see `advsearch.scene.camera_model`. If the distance is neither searched nor
+set, it follows the field of view, so that the object keeps its size in the image (a
+dolly zoom). The camera stays outside of the sphere around the object: see
 `advsearch.scene.geometry`.
 """
 
@@ -42,7 +42,7 @@ from advsearch.scene.geometry import (
 from advsearch.scene.grounds import is_against_traffic, make_traffic_remark
 from advsearch.scene.settings import CAMERA, ORBIT_CAMERA, Parameter
 
-# metres above the road from which vehicles are seen: from a bumper to the roof of a
+# range of a camera's height around road vehicles, metres: from a bumper to the roof of a
 # lorry
 ROAD_USER_HEIGHTS = (0.5, 4.0)
 DISTORTION_KINDS = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}
@@ -55,7 +55,7 @@ EQUIVALENT_PARAMETERS = (
     ("elevation", "height"),
     ("distance", "sizes"),
 )
-"""Pairs of parameters that say the same thing."""
+"""Pairs of parameters that determine the same number."""
 _moving = partial(Parameter.moving, Parameter.ORBIT)
 _number = partial(Parameter.number, Parameter.ORBIT)
 
@@ -75,7 +75,7 @@ class CameraControl(Control):
             1.5,
             2100.0,
             "as fov",
-            "The same for a sensor 36 mm wide.",
+            "Field of view as the focal length for a sensor 36 mm wide.",
             log=True,
         ),
         _moving(
@@ -84,7 +84,7 @@ class CameraControl(Control):
             1e-4,
             1e5,
             "as distance",
-            "The same as `distance`.",
+            "Distance in object sizes, instead of `distance`.",
             log=True,
         ),
         _moving(
@@ -117,7 +117,7 @@ class CameraControl(Control):
             1e-4,
             1e5,
             "the object's middle",
-            "Distance in focus.",
+            "Distance at which the image is sharp.",
             log=True,
         ),
         *(
@@ -143,15 +143,15 @@ class CameraControl(Control):
         remark is added.
 
         Raises:
-            InputError: the scene's camera does not orbit, two settings determine the
-                same number, or the lens does not support a setting.
+            InputError: the scene's camera is not the orbit camera, two settings
+                determine the same number, or the lens does not support a setting.
         """
         self._check_can_orbit(scene)
         needs_thin_lens = "aperture" in self.specs or "focus" in self.specs
-        if needs_thin_lens and self._is_shifted:
+        if needs_thin_lens and self._sets_shift:
             raise InputError(
                 f"`controls` {self.name}: a shifted picture together with an aperture "
-                "is not supported; leave one out"
+                "is not supported; leave one of them out"
             )
         if "azimuth" in self.specs and self._drives_against_traffic(scene):
             scene = replace(scene, remarks=(*scene.remarks, make_traffic_remark(scene)))
@@ -161,6 +161,7 @@ class CameraControl(Control):
             pinhole = make_pinhole(scene.get_number("camera.fov"), scene.aspect)
             scene = replace(scene, camera_model=pinhole)
         if scene.camera_model is not None:
+            # raises if the settings need a thin lens as well
             self._check_lens(scene.camera_model, distortion_names)
         elif needs_thin_lens:
             scene = replace(scene, thin_lens=True)
@@ -175,24 +176,23 @@ class CameraControl(Control):
         """
         if scene.camera != ORBIT_CAMERA:
             raise InputError(
-                f"`controls` {self.name}: moves along an orbit around the object, and "
-                "the scene is seen by its camera "
-                f"{scene.camera!r}; leave the control out, or have it seen by "
-                f"{ORBIT_CAMERA!r}"
+                f"`controls` {self.name}: moves the camera along an orbit around the "
+                f"object, and the scene uses its own camera {scene.camera!r}; leave "
+                f"the control out, or set the camera to {ORBIT_CAMERA!r}"
             )
         for first, second in EQUIVALENT_PARAMETERS:
             if first in self.specs and second in self.specs:
                 raise InputError(
-                    f"`controls` {self.name}: {first} and {second} say the same thing; "
-                    "leave one of them out"
+                    f"`controls` {self.name}: {first} and {second} determine the same "
+                    "number; leave one of them out"
                 )
 
     def _check_lens(self, model: CameraModel, distortion_names: Sequence[str]) -> None:
         """Check that a lens has all the numbers that the settings change.
 
         Args:
-            model: lens from a camera file, or a pinhole with distortion, which has no
-                name.
+            model: lens from a camera file; or a model without a name, which is a
+                pinhole with distortion or raindrops.
             distortion_names: distortion coefficients that were set, such as "k1".
 
         Raises:
@@ -209,7 +209,7 @@ class CameraControl(Control):
         unsupported_names = ["aperture", "focus"]
         if model.name:  # a calibrated lens has its focal length already
             unsupported_names += ["fov", "focal_length"]
-        if not supported_names:
+        if not supported_names:  # an equirectangular image, which shows all directions
             unsupported_names += ["shift_x", "shift_y"]
         lens = "a lens with distortion, or raindrops"
         if model.name:
@@ -222,14 +222,14 @@ class CameraControl(Control):
                 )
 
     def _drives_against_traffic(self, scene: SceneDescription) -> bool:
-        """Return whether the camera always drives against the traffic.
+        """Return whether the camera seems to drive against the traffic everywhere.
 
-        Three configurations are checked: all parameters at the lower bound, the center
-        and the upper bound of their ranges.
+        Only three configurations are checked: all parameters at the lower bound, the
+        center and the upper bound of their ranges.
         """
-        control = self.bind(scene)
+        control = self.bind(scene)  # a copy for this check
         configurations = (
-            torch.full_like(control.start, value) for value in (0.0, 0.5, 1.0)
+            torch.full_like(control.start, coordinate) for coordinate in (0.0, 0.5, 1.0)
         )
         poses = [
             control.inputs(u)["camera.to_world"].detach().double().numpy()
@@ -238,7 +238,7 @@ class CameraControl(Control):
         return all(is_against_traffic(scene, pose) for pose in poses)
 
     @property
-    def _is_shifted(self) -> bool:
+    def _sets_shift(self) -> bool:
         return "shift_x" in self.specs or "shift_y" in self.specs
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -263,8 +263,9 @@ class CameraControl(Control):
         name = parameter.name
         if name in COEFFICIENTS and scene.camera_model is not None:
             return scene.camera_model.values[name]
-        # All three are the distance of the object, as the camera is focused on it.
+        # All three are the distance of the object: the camera is focused on it.
         if name in ("distance", "focus", "sizes"):
+            # The default distance depends on the field of view.
             fixed_lens_scene = self._with_fixed_lens()
             camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
             offset = camera_position - compute_center(fixed_lens_scene)
@@ -285,9 +286,10 @@ class CameraControl(Control):
     ) -> tuple[float, float] | None:
         """Return the range that a parameter is searched over if the user sets none.
 
-        If the scene has a preset, it is that of the preset. Around a road vehicle, the
-        camera's height is searched over the eye heights of road users, and the
-        elevation is not searched. A distance is searched over multiples of its default.
+        If the scene has a preset, only ranges of the preset are searched. Otherwise,
+        around a road vehicle, the camera's height is searched over the eye heights of
+        road users, and the elevation is not searched. The distance is searched over
+        multiples of its default, since its declared `search` is a pair of factors.
 
         Args:
             parameter: the parameter.
@@ -307,10 +309,11 @@ class CameraControl(Control):
             scene_azimuth = scene.get_number("camera.azimuth")
             return scene_azimuth - max_turn, scene_azimuth + max_turn
         if preset is not None:
-            return preset.search_ranges.get(name)
+            return preset.search_ranges.get(name)  # None if it has no such range
         if is_road_vehicle(scene.object) and name == "elevation":
             return None
         if is_road_vehicle(scene.object) and name == "height":
+            # The range includes the default height of a camera that is higher.
             return ROAD_USER_HEIGHTS[0], max(ROAD_USER_HEIGHTS[1], float(default))
         if name == "distance" and search is not None:
             return search[0] * float(default), search[1] * float(default)
@@ -343,15 +346,18 @@ class CameraControl(Control):
             )
         else:
             inputs["camera.fov"] = fov.reshape(1)
-        if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
+        sets_thin_lens = "aperture" in self.specs or "focus" in self.specs
+        if scene.thin_lens and sets_thin_lens:
+            # A thin lens needs a positive aperture.
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
             focus = distance
             if "focus" in self.specs:
                 focus = values["focus"] / scene.size_in_metres
             inputs["camera.focus"] = focus.reshape(1)
-        if scene.camera_model is None and self._is_shifted:
+        if scene.camera_model is None and self._sets_shift:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
+            # The renderer applies the scene's own exposure already.
             inputs["camera.exposure"] = values["exposure"] - scene.get_number(
                 "camera.exposure"
             )
@@ -365,22 +371,23 @@ class CameraControl(Control):
         Distortion coefficients that were set replace those of the model.
 
         Args:
-            model: lens from a camera file; or one without a name, which is a pinhole
-                whose focal lengths follow from the field of view.
+            model: lens from a camera file; or a model without a name, which is a
+                pinhole whose focal lengths follow from the field of view.
             values: values of the control by parameter.
-            fov: () field of view along the larger side, degrees.
+            fov: () field of view along the longer side of the image, degrees.
         """
         model_values = {
             name: torch.tensor(value) for name, value in model.values.items()
         }
         if not model.name:
-            aspect = self.scene.aspect
-            # as a fraction of the larger side, along which the field of view is
+            aspect = self.scene.aspect  # width over height
+            # as a fraction of the longer side, along which the field of view is
             focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
+            longer_side_in_widths = max(1.0, 1.0 / aspect)
+            longer_side_in_heights = max(1.0, aspect)
             model_values |= {
-                # fx is a fraction of the width, fy of the height
-                "fx": focal * max(1.0, 1.0 / aspect),
-                "fy": focal * max(1.0, aspect),
+                "fx": focal * longer_side_in_widths,
+                "fy": focal * longer_side_in_heights,
             }
         model_values |= {
             name: values[name] for name in COEFFICIENTS if name in self.specs
@@ -411,8 +418,8 @@ class CameraControl(Control):
         """Return the camera's distance () from the object's center, in object sizes.
 
         It is the value of `sizes` or `distance` if the user or the scene sets one of
-        them, or if all parameters are searched. Otherwise only other parameters are
-        searched: then it is the distance at which the object fills the image.
+        them, or if `distance` is searched by default. Otherwise it is the distance at
+        which the object fills the image.
 
         Args:
             values: values of the control by parameter.
@@ -422,32 +429,22 @@ class CameraControl(Control):
         if "sizes" in self.specs:
             return values["sizes"]
         scene_has_distance = scene.values.get("camera.distance") is not None
-        searches_all = not self.has_requested_search
-        if "distance" in self.specs or searches_all or scene_has_distance:
+        searches_default_ranges = not self.has_requested_search
+        if "distance" in self.specs or searches_default_ranges or scene_has_distance:
+            # from metres to object sizes
             return values["distance"] / scene.size_in_metres
         return compute_framing_distance(scene, fov, scene.aspect).float()
 
     def _compute_elevation(self, values: Values, distance: Tensor) -> Tensor:
         """Return the elevation () of the camera over the object's center, radians.
 
-        It follows from the height in two cases: the user set the height; or the user
-        set neither height nor elevation, and the scene states a height or the height is
-        searched.
+        It is the value of `elevation`, or follows from the `height`.
 
         Args:
             values: values of the control by parameter.
             distance: () distance from the object's center, object sizes.
         """
-        has_height = "height" in self.specs
-        if not {"elevation", "height"} & self.specs.keys():
-            is_height_searched = any(
-                slot.n_coordinates
-                for slot in self.slots
-                if slot.parameter.name == "height"
-            )
-            scene_height = self.scene.values.get("camera.height")
-            has_height = scene_height is not None or is_height_searched
-        if not has_height:
+        if not self._uses_height():
             return torch.deg2rad(values["elevation"])
         center_height = float(compute_center(self.scene)[2])
         height_over_center = (
@@ -455,6 +452,24 @@ class CameraControl(Control):
         )
         sine = height_over_center / distance
         return torch.asin(sine.clamp(-MAX_ELEVATION_SINE, MAX_ELEVATION_SINE))
+
+    def _uses_height(self) -> bool:
+        """Return whether the camera's height, not its elevation, determines its pose.
+
+        A setting of the user decides. Without one, the height is used if the scene
+        states it, or if it is searched by default.
+        """
+        if "height" in self.specs:
+            return True
+        if "elevation" in self.specs:
+            return False
+        if self.scene.values.get("camera.height") is not None:
+            return True
+        return any(
+            slot.n_coordinates > 0
+            for slot in self.slots
+            if slot.parameter.name == "height"
+        )
 
     def _compute_pose(self, values: Values, distance: Tensor) -> Tensor:
         """Return the pose (4, 4) on the orbit, at a distance () in object sizes.
@@ -473,14 +488,18 @@ class CameraControl(Control):
                 elevation.sin(),
             ]
         )
+        # Axes without roll: left is level, and up is at right angles to left and to
+        # the direction of view.
         level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         level_up = torch.linalg.cross(-outwards, level_left)
-        # The roll turns the camera about its direction of view.
+        # A positive roll turns left towards up: the camera turns clockwise as seen from
+        # behind it.
         left = roll.cos() * level_left + roll.sin() * level_up
         up = roll.cos() * level_up - roll.sin() * level_left
+        forward = -outwards
         center = torch.from_numpy(compute_center(self.scene)).to(distance)
         position = center + distance * outwards
-        return make_affine(torch.stack([left, up, -outwards], dim=1), position)
+        return make_affine(torch.stack([left, up, forward], dim=1), position)
 
 
 def adapt_length_unit(parameter: Parameter, has_metres: bool) -> Parameter:

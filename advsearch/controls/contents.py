@@ -1,16 +1,15 @@
-"""The `contents` control: what a vessel is filled with, and how high: water, coffee and
-milk in any proportions.
+"""The `contents` control: a vessel is filled with water, coffee and milk.
 
-Rain that cannot run off the mesh (a height map with its basins filled: Barnes, Lehman
-and Mulla 2014, arXiv 1511.04463, section 2) marks the inside; rays from its axis find
-the wall. Colours are in linear light (Kubelka and Munk 1931):
+The inside of a vessel is where rain could not run off: the largest basin of a height map
+(Barnes, Lehman and Mulla 2014, arXiv 1511.04463, section 2). Rays from its axis find the
+wall. Colors are linear (Kubelka and Munk 1931):
 
     K / S = sum(p_i K_i) / sum(p_i S_i),   milky coffee = 1 + K/S - sqrt((K/S)^2 + 2 K/S)
     color = opacity * milky coffee + (1 - opacity) * vessel * tint of water
     opacity = 1 - exp(-DENSITY (1 - water))
 
-Proportions add up to one: the two that are free are cut off a stick of length one in
-turn, each from what is left.
+Proportions add up to 1: two of them are cut off a stick of length 1, one after the
+other, and the third is the remainder.
 """
 
 from __future__ import annotations
@@ -42,32 +41,33 @@ from advsearch.extend import (
 )
 
 GRID_CELLS = 128  # cells of the height map along the longer side of the mesh
-WALL_ROWS = 40  # heights at which the wall is looked for
-WALL_DIRECTIONS = 96  # directions in which it is looked for
+WALL_ROWS = 40  # number of heights at which the wall is found
+WALL_DIRECTIONS = 96  # number of directions in which it is found
 MIN_DEPTH = 0.03  # smallest depth of a vessel in object sizes
 MIN_OPENING = 5e-4  # smallest opening of a vessel in squared object sizes
-MIN_HIT_FRACTION = 0.97  # share of the rays that have to meet the wall
-FILL_LIMIT = 0.985  # a full vessel is filled to this share of its depth
+MIN_HIT_FRACTION = 0.97  # smallest fraction of rays that have to hit the wall
+FILL_LIMIT = 0.985  # fraction of its depth to which a full vessel is filled
+# The lowest rays start this fraction of the depth above the floor: along a flat floor
+# they would graze it.
+MIN_RAY_HEIGHT = 0.004
 
 INGREDIENTS = ("water", "milk", "coffee")
-"""In the order in which they are cut off the stick; what the first two leave is
-coffee.
-"""
-# linear reflectance of a deep cup of each
+"""In the order in which they are cut off the stick; coffee is the remainder."""
+# linear reflectance of an infinitely deep layer; water has none, as it is clear
 REFLECTANCE = {"milk": (0.84, 0.80, 0.70), "coffee": (0.040, 0.016, 0.007)}
 # how strongly each scatters, relative to milk
 SCATTERING = {"milk": 1.0, "coffee": 0.10}
-# what a cup of water leaves of the light that has been to the bottom and back
+# fraction of the light that is left after the way through water to the floor and back
 WATER_TINT = (0.86, 0.94, 0.95)
 # how fast coffee and milk make water opaque: a tenth of them hides half of the vessel's
 # floor
 OPACITY_RATE = 7.0
-SUM_TOLERANCE = 1e-6  # of the sum of proportions, which is 1
+SUM_TOLERANCE = 1e-6  # tolerance of the sum of proportions, which is 1
 # radius of the disk as a fraction of the distance of the wall
 DISK_RADIUS_FRACTION = 0.995
 SINKING_LEVEL = 0.02
-"""Below this level the disk shrinks and sinks into the floor, so that an empty vessel
-shows none of it.
+"""Below this level the disk shrinks and sinks into the floor, so that it can't be seen
+in an empty vessel.
 """
 LIQUID_MATERIAL = assets.Material(roughness=0.08, specular=0.5)
 
@@ -79,7 +79,7 @@ _lit = partial(Parameter.number, Parameter.LIT)
 class Vessel:
     """The inside of a vessel that stands upright."""
 
-    axis: assets.Float64Array  # (2,) x and y of the line that the wall is seen from
+    axis: assets.Float64Array  # (2,) x and y of the vertical axis
     heights: assets.Float64Array  # (R,) evenly spaced z, from the floor to the brim
     # (R, K) distance of the wall from the axis, in K even directions from +x
     # counter-clockwise
@@ -91,8 +91,9 @@ class Vessel:
 def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     """Find the inside of an object in its default pose; None if it is no vessel.
 
-    The largest basin is found on a height map: where most water would stand. Its wall
-    is found by level rays from the axis of the basin, at evenly spaced heights.
+    The largest basin of a height map is where most water would stand. Its wall is found
+    by level rays from the axis of the basin, at evenly spaced heights. The object is no
+    vessel if it has no basin, or if too many rays leave it without hitting a wall.
     """
     mesh = asset.mesh
     basin = _find_basin(mesh)
@@ -100,9 +101,9 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
         return None
     axis, floor, rim = basin
     depth = rim - floor
-    heights = np.linspace(floor, floor + FILL_LIMIT * depth, WALL_ROWS)
-    # Rays start a little above the floor: along a flat floor they would graze it.
-    min_height = floor + 0.004 * depth
+    highest_level = floor + FILL_LIMIT * depth
+    heights = np.linspace(floor, highest_level, WALL_ROWS)
+    min_height = floor + MIN_RAY_HEIGHT * depth
     distances = []
     faces = []
     for height in heights:
@@ -114,10 +115,10 @@ def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
     radii = _fill_missed_radii(np.stack(distances))
     if radii is None:
         return None
-    # The color of the lower half is what is seen through the liquid. A ray that hit no
-    # face has the index -1.
+    # Through the liquid, mostly the lower half of the wall is visible.
     lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
-    wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
+    was_hit = lower_faces >= 0  # the index is -1 for a ray that hit no face
+    wall_color = _mean_face_color(asset, lower_faces[was_hit])
     return Vessel(axis, heights, radii, wall_color)
 
 
@@ -145,10 +146,11 @@ def _mean_face_color(
     """Return the mean linear color (3,) of the texture at the centers of faces (N,)."""
     mesh = asset.mesh
     centers = mesh.uvs[mesh.faces[faces].astype(np.int64)].mean(axis=1)
-    if mesh.repeats:
+    if mesh.repeats:  # the texture repeats outside of [0, 1]
         centers -= np.floor(centers)
     height, width = asset.base_color.shape[:2]
     column = np.clip((centers[:, 0] * width).astype(np.int64), 0, width - 1)
+    # Row 0 of the texture is at v = 1.
     row = np.clip(((1.0 - centers[:, 1]) * height).astype(np.int64), 0, height - 1)
     mean = color.srgb_to_linear(asset.base_color[row, column]).mean(axis=0)
     return np.asarray(mean, dtype=np.float64)
@@ -344,22 +346,18 @@ def _cut_faces(
 class ContentsControl(Control):
     """What a vessel is filled with, and how high: water, coffee and milk.
 
-    Proportions add up to 1 at every point of the unit box: a stick of length 1 is cut
-    into them, one ingredient after the other, and a coordinate is where it is cut in
-    the range that is possible there.
+    Proportions add up to 1 in every configuration: a stick of length 1 is cut into them,
+    one ingredient after the other. The coordinate of an ingredient, its cut, goes from 0
+    for the smallest proportion that is still possible to 1 for the largest.
 
     Attributes:
-        proportion_bounds: lower and upper bound of each ingredient: those that were
-            set; all that the others leave, if it is searched; or the rest, if it is
-            not.
-
-    Raises:
-        InputError: proportions that cannot add up to one.
+        proportion_bounds: lower and upper bound of the proportion of each ingredient.
     """
 
     kind = "contents"
     strength_parameter = "level"
-    # which is not changed; but it comes after whatever moves the vessel
+    # The pose is only read: so the control is evaluated after those that move the
+    # vessel.
     refines = frozenset({"object.to_world"})
     parameters = (
         Parameter.moving(
@@ -379,7 +377,7 @@ class ContentsControl(Control):
                 0.0,
                 1.0,
                 float(name == "coffee"),
-                f"Share of {name}.",
+                f"Fraction of {name}.",
                 (0.0, 1.0),
             )
             for name in INGREDIENTS
@@ -406,16 +404,18 @@ class ContentsControl(Control):
     def _add_default_bounds(self, rest: float) -> None:
         """Add the bounds of the proportions that are not set.
 
-        If proportions are searched, the bounds are 0 and the rest. Otherwise the first
-        of coffee, water and milk that is not set gets all of the rest.
+        If proportions are searched, their bounds are 0 and the rest. Otherwise the
+        first of coffee, water and milk that is not set gets all of the rest, and the
+        others get 0.
 
         Args:
-            rest: what the proportions that are set leave of 1.
+            rest: 1 minus the lower bounds of the proportions that are set.
         """
-        # all parameters are searched unless a range is set for some
+        # All parameters are searched unless the user sets a range for some.
         are_searched = not self.has_requested_search or any(
             isinstance(self.specs.get(name), Range) for name in INGREDIENTS
         )
+        # by default a cup of coffee, as in `parameters`
         for name in ("coffee", "water", "milk"):
             if name in self.proportion_bounds:
                 continue
@@ -429,7 +429,8 @@ class ContentsControl(Control):
         """Return the smallest and largest proportion of each ingredient that is set.
 
         Raises:
-            InputError: one has a list of values or a distribution.
+            InputError: one has a list of values or a distribution, with which the
+                proportions would not add up to 1.
         """
         bounds = dict[str, tuple[float, float]]()
         for name in INGREDIENTS:
@@ -438,16 +439,15 @@ class ContentsControl(Control):
                 continue
             if isinstance(spec, Fixed):
                 bounds[name] = (float(spec.value), float(spec.value))
-            elif type(spec) is Range:
+            elif type(spec) is Range:  # a distribution is a subclass
                 bounds[name] = (spec.low, spec.high)
             else:
-                got = "a distribution; a draw"
+                got = "a distribution"
                 if isinstance(spec, OneOf):
-                    got = "a list of values; a choice"
+                    got = "a list of values"
                 raise InputError(
                     f"{self.name}.{name}: expected a number or a range [low, high], "
-                    f"got {got} among proportions would "
-                    "not add up to 1"
+                    f"got {got}, with which proportions would not add up to 1"
                 )
         return bounds
 
@@ -462,7 +462,7 @@ class ContentsControl(Control):
         """
         max_total = sum(upper for _, upper in self.proportion_bounds.values())
         all_set = len(self.proportion_bounds) == len(INGREDIENTS)
-        # where one is not set, it makes up what is missing
+        # A proportion that is not set makes up for what is missing.
         is_too_little = all_set and max_total < 1.0 - SUM_TOLERANCE
         is_too_much = min_total > 1.0 + SUM_TOLERANCE
         if not is_too_little and not is_too_much:
@@ -499,10 +499,10 @@ class ContentsControl(Control):
             )
         angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        # a disk in the texture, off its edges
+        # Texture coordinates in the order of the vertices: the center, then the circle.
+        # `scene_inputs` replaces the black texture.
         uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * circle])
-        # at half the height, from which `scene_inputs` gives offsets
-        vertices = _liquid_surface(vessel, torch.tensor(0.5)).numpy()
+        vertices = _make_liquid_surface(vessel, torch.tensor(0.5)).numpy()
         mesh = replace(
             parts.make_polygon(WALL_DIRECTIONS),
             vertices=vertices,
@@ -528,8 +528,8 @@ class ContentsControl(Control):
                 self.start[slot.offset] = cuts[slot.parameter.name]
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        values = super().values(u)  # of ingredients, where the stick is cut
-        return {**values, **self.cut_proportions(values)}
+        cuts_and_level = super().values(u)
+        return {**cuts_and_level, **self.cut_proportions(cuts_and_level)}
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -544,9 +544,9 @@ class ContentsControl(Control):
         """Return the offsets, the pose and the color of the liquid's surface."""
         vessel = find_interior(self.scene.object)
         assert vessel is not None  # see `prepare`
-        # `prepare` has made the mesh at half the height
-        base = _liquid_surface(vessel, torch.full_like(values["level"], 0.5))
-        surface = _liquid_surface(vessel, values["level"])
+        # `prepare` has made the mesh at half the height.
+        base = _make_liquid_surface(vessel, torch.full_like(values["level"], 0.5))
+        surface = _make_liquid_surface(vessel, values["level"])
         inputs = {f"{self.name}.offsets": surface - base}
         if "object.to_world" in earlier_inputs:
             inputs[f"{self.name}.to_world"] = earlier_inputs["object.to_world"]
@@ -605,7 +605,8 @@ class ContentsControl(Control):
         cuts = dict[str, float]()
         for name in INGREDIENTS:
             lower, upper = map(float, self._possible_range(name, remainder))
-            proportion = min(max(proportions[name], lower), max(lower, upper))
+            upper = max(lower, upper)  # rounding may leave it below
+            proportion = min(max(proportions[name], lower), upper)
             cuts[name] = 0.0
             if upper > lower:
                 cuts[name] = (proportion - lower) / (upper - lower)
@@ -620,28 +621,29 @@ class ContentsControl(Control):
 
         Args:
             name: name of the ingredient.
-            remainder: () what the ingredients before it have left of 1.
+            remainder: () 1 minus the proportions of the ingredients before it.
         """
         index = INGREDIENTS.index(name)
         limits = remainder.new_tensor(
             [self.proportion_bounds[ingredient] for ingredient in INGREDIENTS]
         )
         lower, upper = limits[index]
-        # of all ingredients after this one together
+        # bounds of the sum of all ingredients after this one
         rest_lower, rest_upper = limits[index + 1 :].sum(dim=0)
-        least = torch.maximum(lower, remainder - rest_upper)
+        smallest = torch.maximum(lower, remainder - rest_upper)
         largest = torch.minimum(upper, remainder - rest_lower)
-        return least, largest
+        return smallest, largest
 
 
-# ---- how it looks
+# ---- appearance
 
 
 def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
     """Return the linear reflectance (3,) of a cup of water, milk and coffee.
 
     By Kubelka and Munk (1931): a layer absorbs and scatters light, and the coefficients
-    of a mixture are sums over its ingredients.
+    of a mixture are sums over its ingredients. Only milk and coffee absorb, scatter and
+    hide the vessel; the vessel is visible through the rest, tinted by water.
 
     Args:
         proportions: proportions (3,) in the order of `INGREDIENTS`.
@@ -649,9 +651,9 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
     """
     amounts = dict(zip(INGREDIENTS, proportions, strict=True))
     absorption = proportions.new_zeros(3)
-    # not 0, since it is divided by; water itself does not scatter
+    # Pure water does not scatter. A tiny number avoids a division by 0.
     scattering = proportions.new_tensor(1e-6)
-    for name, reflectance in REFLECTANCE.items():
+    for name, reflectance in REFLECTANCE.items():  # milk and coffee
         deep_reflectance = proportions.new_tensor(reflectance)
         added_scattering = amounts[name] * SCATTERING[name]
         # Kubelka and Munk: K / S = (1 - R)^2 / (2 R), by the reflectance R of an
@@ -668,12 +670,12 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
     return opacity * mixed_color + floor_color
 
 
-def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
+def _make_liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     """Return the vertices (1 + K, 3) of the liquid's surface, the center first.
 
     They are in mesh coordinates, and differentiable in the level, with kinks at the
     heights at which the wall is known. Below `SINKING_LEVEL` the surface shrinks and
-    sinks into the floor, as an empty vessel has no liquid to show.
+    sinks into the floor, so that it can't be seen in an empty vessel.
 
     Args:
         vessel: inside of the vessel; its wall is known in K directions at some heights.
@@ -681,16 +683,17 @@ def _liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     """
     heights = torch.from_numpy(vessel.heights).to(level)
     radii = torch.from_numpy(vessel.radii).to(level)  # (len(heights), K)
-    # a fractional index into the heights, which are even
+    # a fractional index into the heights, which are evenly spaced
     position = level * (len(heights) - 1)
     row = int(position.detach().clamp(0, len(heights) - 2))
     radius = (
         torch.lerp(radii[row], radii[row + 1], position - row) * DISK_RADIUS_FRACTION
     )
-    # Size of the disk: 1 above the level at which it begins to shrink. It never gets 0,
-    # so that its faces keep an area.
+    # Relative size of the disk: 1 above the level at which it begins to shrink. It is
+    # never 0, so that its faces keep an area.
     opening = (level / SINKING_LEVEL).clamp(1e-3, 1.0)
     depth = heights[-1] - heights[0]
+    # At level 0 the disk is below the floor by almost `SINKING_LEVEL` of the depth.
     height = heights[0] + level * depth - (1.0 - opening) * SINKING_LEVEL * depth
     angle = torch.arange(WALL_DIRECTIONS, device=level.device) * (
         2.0 * torch.pi / WALL_DIRECTIONS

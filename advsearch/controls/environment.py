@@ -1,15 +1,14 @@
-"""The `environment` control: which map lights the scene, how it is turned, how bright
-it is, and its colour.
+"""The `environment` control: the map that lights the scene.
 
-Mitsuba's own derivative of a rotation has the wrong sign (docs/gradients.md). So the
-map is resampled by torch:
+Its rotation, exposure and color can be searched. Mitsuba's own derivative of a rotation
+has the wrong sign (docs/gradients.md), so the map is resampled by torch:
 
     map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1]
     rotation / 360 * columns = k + f
 
 `compute_harmonic_light` adds real spherical harmonics of degrees 0 to 2 (Ramamoorthi
-and Hanrahan 2001, section 3), 9 coefficients for each colour channel as multiples of
-the map's mean radiance, inside an L2 ball.
+and Hanrahan 2001, section 3): 9 coefficients for each color channel, as multiples of
+the map's mean radiance, in an L2 ball.
 """
 
 from __future__ import annotations
@@ -46,18 +45,16 @@ from advsearch.scene.library import import_environment
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import CHANNELS, Parameter
 
-N_COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels
+N_COEFFICIENTS = 27  # degrees 0 to 2 of three color channels
 BUNDLED_MAPS = tuple(
     sorted({*library.list_environments()} - {*library.list_environments("place")})
 )
-"""The bundled environments that are a map; the others are a place around the object."""
+"""Bundled environments that are a map only; the others have meshes around the object."""
 _lit = partial(Parameter.number, Parameter.LIT)
 
 
 class EnvironmentControl(Control):
-    """Which environment lights the scene, how it is turned, how bright it is, and its
-    colour.
-    """
+    """The environment that lights the scene, its rotation, exposure and colour."""
 
     kind = "environment"
     photograph_refusal = (
@@ -69,8 +66,7 @@ class EnvironmentControl(Control):
             (SCENE_ENVIRONMENT, *BUNDLED_MAPS),
             SCENE_ENVIRONMENT,
             "Another environment instead of the scene's own, metered "
-            "afresh: bundled, or a .hdr or .exr "
-            "file.",
+            "anew: a bundled one, or a .hdr or .exr file.",
         ),
         *settings.ENVIRONMENT,
         *(
@@ -84,9 +80,8 @@ class EnvironmentControl(Control):
             -1.0,
             1.0,
             0.0,
-            "Low-order light that is added: spherical-harmonic coefficients, 9 "
-            "for each channel, inside the "
-            "ball.",
+            "Low-frequency light that is added: coefficients of spherical harmonics, 9 "
+            "for each channel, in the ball of epsilon.",
             estimators=Parameter.LIT,
         ),
     )
@@ -94,8 +89,7 @@ class EnvironmentControl(Control):
         Choice(
             "epsilon",
             0.5,
-            "Radius of the ball of `compute_harmonic_light`: L2 norm of all "
-            "coefficients.",
+            "Radius of the ball of `harmonics`: largest L2 norm of all coefficients.",
             "epsilon",
             "harmonics",
             max_value=100.0,
@@ -118,24 +112,25 @@ class EnvironmentControl(Control):
         return (replace(which, options=options), *others)
 
     def check_choices(self) -> None:
-        """Raise InputError if an epsilon, which limits the harmonics, is set without
-        them.
-        """
+        """Raise InputError if `epsilon` is set without the harmonics that it limits."""
         epsilon = self.chosen["epsilon"]
         if "epsilon" in self._settings and "harmonics" not in self._settings:
             raise InputError(
-                f"{self.name}.epsilon: the radius of the ball of harmonics, which are "
-                "not there; leave it out, or give "
-                f"harmonics a range too, as in {self.name}={{harmonics: [-1, 1], "
+                f"{self.name}.epsilon: limits the harmonics, which are not set; leave "
+                "it out, or set "
+                f"a range of harmonics too, as in {self.name}={{harmonics: [-1, 1], "
                 f"epsilon: {epsilon}}}"
             )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with the first allowed environment, or with its own.
 
-        Its own environment stays if it is among the allowed ones, or if several bundled
-        ones are searched; the scene must have one then. Notes on environment files
-        become remarks.
+        The scene gets the first allowed environment if its own one is not allowed, and
+        the allowed one is fixed or any of several is a file. Otherwise it keeps its own
+        environment, which it must have. Notes on environment files become remarks.
+
+        Raises:
+            InputError: the scene has no environment and needs one.
         """
         allowed = self.list_allowed_values("which", SCENE_ENVIRONMENT)
         assets_by_file = {
@@ -144,12 +139,12 @@ class EnvironmentControl(Control):
             if _is_file(name)
         }
         notes = [note for asset in assets_by_file.values() for note in asset.warnings]
-        may_keep = (
+        is_scene_environment_allowed = (
             SCENE_ENVIRONMENT in allowed
             or self._find_scene_environment_name(scene) is not None
         )
         is_fixed = isinstance(self.specs.get("which"), Fixed)
-        if not may_keep and (is_fixed or assets_by_file):
+        if not is_scene_environment_allowed and (is_fixed or assets_by_file):
             name = str(allowed[0])
             scene = replace(
                 scene, environment=_load_environment(name), environment_spec=name
@@ -157,6 +152,7 @@ class EnvironmentControl(Control):
         else:
             environment = scene.require_environment(f"`controls` {self.name}")
             shows_photograph = scene.photograph is not None or environment.photographed
+            # A photograph shows its own floor instead of the table.
             if assets_by_file and not shows_photograph:
                 notes += _describe_table(scene, list(assets_by_file))
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
@@ -164,7 +160,9 @@ class EnvironmentControl(Control):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; the default of `which` is the scene's own environment.
 
-        That is `SCENE_ENVIRONMENT`, or its name if the user allows it by name only.
+        Its value is `SCENE_ENVIRONMENT`, the option that keeps the scene's environment.
+        If the user lists environments without that option, it is the name of the
+        scene's environment, if that is among them.
         """
         if parameter.name != "which":
             return super().resolve_parameter(parameter)
@@ -184,8 +182,10 @@ class EnvironmentControl(Control):
         return super().setting_name(parameter)
 
     def get_scene_value(self, parameter: Parameter) -> ParameterValue:
-        """Return the value in the scene as it was described; of `which` the name of
-        its environment, unless the default stands for that.
+        """Return the value of a parameter in the scene as it was described.
+
+        For `which` it is `SCENE_ENVIRONMENT` if that is allowed. Otherwise it is the
+        allowed name of the scene's environment, or else how the user stated it.
         """
         if parameter.name != "which" or self._allows_scene_environment:
             return parameter.default
@@ -193,9 +193,9 @@ class EnvironmentControl(Control):
         return name or self.scene.environment_spec
 
     def _find_scene_environment_name(self, scene: SceneDescription) -> str | None:
-        """Return the name of the scene's own environment among the options.
+        """Return the scene's own environment among the allowed names and files.
 
-        None if it is none of them.
+        None if it is not among them. `SCENE_ENVIRONMENT` does not count as a name.
         """
         return next(
             (
@@ -218,10 +218,11 @@ class EnvironmentControl(Control):
     ) -> dict[str, Tensor]:
         """Return the map (H, W, 3) of linear radiance, "environment.data".
 
-        The map of the scene includes the scene's rotation and exposure already, so that
-        only the differences from these are applied.
+        The scene's own rotation and exposure are applied when it is rendered, so that
+        only the differences from these are applied here.
         """
-        name = self.instance_parameters[0].options[int(values["which"])]
+        which, *_ = self.instance_parameters
+        name = which.options[int(values["which"])]
         device = values["rotation"].device
         is_scene_map = name == SCENE_ENVIRONMENT or _is_scene_environment(
             name, self.scene
@@ -244,22 +245,24 @@ class EnvironmentControl(Control):
 
 
 def _describe_table(scene: SceneDescription, files: Sequence[str]) -> list[str]:
-    """Return a note that the scene's table stays in environments from files.
+    """Return a note that the object stands on the scene's table in all environments.
 
-    There is none if the scene has no table.
+    Args:
+        scene: scene; without a table, there is no note.
+        files: paths of the environments from files.
     """
-    if scene.get_number("ground.size") <= 0.0:
+    has_table = scene.get_number("ground.size") > 0.0
+    if not has_table:
         return []
     names = ", ".join(Path(file).name for file in files)
     return [
-        f"{names}: the object stands on the scene's table there, too; "
-        "ground.kind=photograph shows the "
-        "floor of each picture instead"
+        f"{names}: the object stands on the scene's table in these environments, "
+        "too; ground.kind=photograph shows the floor of each picture instead"
     ]
 
 
 def _is_file(name: ParameterValue) -> bool:
-    """Return whether the name of an environment is that of a file, none bundled."""
+    """Return whether an environment is a file, and not a bundled one."""
     return (
         isinstance(name, str) and name not in EnvironmentControl.parameters[0].options
     )
@@ -281,7 +284,8 @@ def _is_scene_environment(name: ParameterValue, scene: SceneDescription) -> bool
 def _load_environment(name: str) -> EnvironmentAsset:
     """Return an environment by its name or from a file.
 
-    Files are cached by their path, time and size, so that a changed file is read again.
+    Files are cached by their path, modification time and size, so that a changed file
+    is read again.
     """
     if not _is_file(name):
         return library.load_environment(name)
@@ -304,8 +308,9 @@ def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAs
 def _load_map(scene: SceneDescription, asset: EnvironmentAsset | None) -> Tensor:
     """Return the map (H, W, 3) of an environment, linear radiance.
 
-    If the scene is metered, i.e. exposed by the brightness of its environment, another
-    map is scaled so that it would be exposed in the same way.
+    A scene can be metered: its exposure is set by the brightness of its environment. As
+    that exposure does not change later, another map is scaled by the ratio of both
+    exposures: the image is as bright as if the other map had been metered.
 
     Args:
         scene: the scene.
@@ -314,6 +319,7 @@ def _load_map(scene: SceneDescription, asset: EnvironmentAsset | None) -> Tensor
     scene_environment = scene.require_environment("the environment")
     if asset is None:
         return torch.from_numpy(scene_environment.radiance.copy())
+    # `photographed` decides the kind of ground, and the scene keeps its own ground.
     other_scene = replace(
         scene, environment=replace(asset, photographed=scene_environment.photographed)
     )
@@ -327,9 +333,9 @@ def compute_harmonic_light(coefficients: Tensor, reference: Tensor) -> Tensor:
     """Return light (H, W, 3) as a sum of 9 spherical harmonics in each channel.
 
     Args:
-        coefficients: (27,) in units of the map's mean: for each harmonic three
-            channels.
-        reference: the map (H, W, 3).
+        coefficients: (27,) in units of the map's mean; three channels for each
+            harmonic.
+        reference: (H, W, 3) the map.
     """
     height, width = reference.shape[:2]
     basis = compute_real_harmonics(height, width).to(coefficients.device)

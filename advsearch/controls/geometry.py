@@ -1,20 +1,20 @@
-"""The `geometry` control: a smooth change of the object's shape, at most so far.
+"""The `geometry` control: a bounded, smooth change of the object's shape.
 
     modes          d = sum_k a_k m_k,  a = 2 u - 1
     large-steps    d = g R (I + lambda L)^-2 (2 u - 1)
     offsets        epsilon s(d) d
 
 The m_k are the smoothest displacement fields of the mesh. In the form large-steps each
-vertex has a push, which is spread out over its surroundings. s is one factor that keeps
-the mesh whole.
+vertex is pushed, and the push is spread over its neighborhood. The factor s keeps the
+mesh intact: for any u, no vertex moves by more than epsilon, no face turns over, and the
+two sides of a wall do not meet.
 
-No vertex moves by more than epsilon, no face turns over and no wall meets the other,
-for any u. A mode varies slowly over SPACE, so that close walls move together: diffusion
-maps (Coifman and Lafon 2006, "Diffusion maps", sections 2 and 3, alpha = 1) of points
-spread over the surface, extended to the vertices by the Nystrom formula, without rigid
-motions. R (I + lambda L)^-2 is Nicolet et al.'s (2021, "Large Steps in Inverse
-Rendering of Geometry", section 3.2), with edges weighted by their length and links
-through thin walls added to L.
+A mode varies slowly over space, not over the surface, so that both sides of a wall move
+together. Modes are diffusion maps (Coifman and Lafon 2006, "Diffusion maps", sections 2
+and 3, alpha = 1) of points spread over the surface, extended to the vertices by the
+Nystrom formula, without rigid motions. R (I + lambda L)^-2 is from Nicolet et al. (2021,
+"Large Steps in Inverse Rendering of Geometry", section 3.2). Here edges are weighted by
+their length, and L has additional links through thin walls.
 """
 
 from __future__ import annotations
@@ -46,36 +46,36 @@ from advsearch.scene.assets import Float64Array, IntArray, Mesh, compute_area_ve
 from advsearch.scene.raster import weld_vertices
 
 CELL_SIZE = 0.035
-"""Side of the cubes that the surface is thinned to one point in, in extents of the
-mesh; larger if that is too many.
+"""Side of the cubic cells with one landmark each, in extents of the mesh. It is increased
+if there are more than `MAX_LANDMARKS`.
 """
-MAX_LANDMARKS = 900  # largest number of such points
+MAX_LANDMARKS = 900  # largest number of landmarks
 N_SURFACE_SAMPLES = 20000
-"""Points spread over the surface before they are thinned, so that large triangles count
-as what they cover.
+"""Number of points on the surface that are averaged to landmarks. They are spread evenly,
+so that large triangles get more of them.
 """
 BANDWIDTH = 1.8  # standard deviation of the kernel, in cells
-MIN_EIGENVALUE = 0.05  # smallest one that a function is divided by; the largest is 1
+MIN_EIGENVALUE = 0.05  # lower limit of the eigenvalues in a division; the largest is 1
 # largest displacement gradient along a face; below 1 no face can turn over
 MAX_FACE_STRAIN = 0.7
 # largest change of the distance between the two sides of a wall, as a fraction of it
 MAX_WALL_STRAIN = 0.5
-# sides that are further apart than this, in extents, count as no wall
+# largest distance between the two sides of a wall, in extents
 MAX_WALL_DISTANCE = 0.3
 # largest cosine between the normals of the two sides of a wall
 MAX_OPPOSITE_COSINE = -0.3
 MIN_FACE_HEIGHT = 2e-3
-"""Faces whose height is less than this fraction of their longest edge are slivers,
-whose strain is not limited.
+"""Faces whose height is less than this fraction of their longest edge are slivers. Their
+strain is not limited, since it would be huge for a tiny displacement.
 """
-NORM_EXPONENT = 32  # exponent p of the norm that stands in for a maximum
-# distance over which a push on one vertex spreads, in extents (form large-steps)
+NORM_EXPONENT = 32  # exponent p of the norm that approximates a maximum; even
+# distance over which a push on a vertex is spread, in extents (form large-steps)
 SMOOTHING_LENGTH = 0.1
 WALL_WEIGHT = 4.0  # weight of a link through a wall, in edges of the mesh
 
 
 class WeldedMesh:
-    """A mesh whose seams are welded: what a displacement acts on.
+    """A mesh whose seams are welded, so that a displacement can't open them.
 
     Attributes:
         position_of_vertex: (V,) index of the position of each vertex.
@@ -131,7 +131,7 @@ class WeldedMesh:
 # ---- modes over space
 
 
-get_welded_mesh = lru_cache(maxsize=8)(WeldedMesh)  # of a mesh; cached
+get_welded_mesh = lru_cache(maxsize=8)(WeldedMesh)  # cached by the mesh
 
 
 def _compute_landmark_weights(
@@ -168,40 +168,46 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
         the largest length is 1 in each.
     """
     welded_mesh = get_welded_mesh(mesh)
-    points, cell = _sample_landmarks(welded_mesh)
-    # each function gives three fields, one for each axis; two functions more than
-    # needed, for the rotations that are removed
-    n_scalars = min(math.ceil(count / 3) + 2, len(points) - 1)
+    landmarks, cell = _sample_landmarks(welded_mesh)
+    # A function gives three fields, one along each axis. Two more functions are used,
+    # because the three rotations are removed from the fields.
+    n_functions = min(math.ceil(count / 3) + 2, len(landmarks) - 1)
     width = BANDWIDTH * cell
-    density, functions, mass, values = _diffusion_map(points, width, n_scalars)
-    # eigenvalues of the Laplacian, to which the kernel converges: 0 for a constant
-    # function
-    energy = (1.0 - values) / width**2
-    combination = _without_rotation(points, functions, mass, energy, count)
+    density, functions, mass, eigenvalues = _compute_diffusion_map(
+        landmarks, width, n_functions
+    )
+    # Approximate eigenvalues of the Laplacian: 0 for a constant function, and larger
+    # for functions that vary faster.
+    energy = (1.0 - eigenvalues) / width**2
+    # (functions, 3, count)
+    combination = _combine_without_rotation(landmarks, functions, mass, energy, count)
 
-    # Nystrom extension from the landmarks to all positions; small eigenvalues are
-    # limited, since a division by them amplifies noise
-    weights = _compute_landmark_weights(welded_mesh.positions, points, width, density)
-    extended = weights @ (functions / np.maximum(values, MIN_EIGENVALUE))
+    # Nystrom extension from the landmarks to all positions: a weighted mean, divided
+    # by the eigenvalue. Small eigenvalues would amplify noise.
+    weights = _compute_landmark_weights(
+        welded_mesh.positions, landmarks, width, density
+    )
+    extended = weights @ (functions / np.maximum(eigenvalues, MIN_EIGENVALUE))
     # p positions, s scalar functions, c axes, k fields
     fields = np.einsum("ps,sck->pck", extended, combination)
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
 
 
-def _diffusion_map(
-    points: Float64Array, width: float, n_scalars: int
+def _compute_diffusion_map(
+    points: Float64Array, width: float, n_functions: int
 ) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
     """Compute the diffusion map of points (Coifman and Lafon 2006, alpha = 1).
 
     Args:
         points: (N, 3) landmarks.
         width: standard deviation of the Gaussian kernel.
-        n_scalars: number of functions, without the constant one.
+        n_functions: number of functions, without the constant one.
 
     Returns:
         The kernel density (N,) at the points; the most slowly varying functions (N,
-        n_scalars), orthonormal under the mass; the mass (N,) of the points; and the
-        eigenvalues (n_scalars,) of the functions, descending.
+        n_functions), orthonormal under the mass; the mass (N,) of the points, which is
+        the sum of their normalized kernel; and the eigenvalues (n_functions,) of the
+        functions, descending.
     """
     kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
     density = kernel.sum(axis=1)
@@ -209,25 +215,28 @@ def _diffusion_map(
     kernel /= density[:, None] * density[None, :]
     mass = kernel.sum(axis=1)
     symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
-    # A sparse matrix without negligible entries, for the Lanczos method: dense solvers
-    # wait for all threads, which takes ten times as long on a busy machine.
+    # A sparse matrix without negligible entries, for the Lanczos method. Dense solvers
+    # run in many threads, and take ten times as long on a busy machine.
     matrix = sparse.csr_matrix(
         np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
     )
-    # a fixed start, so that the result does not depend on chance
+    # a fixed start, so that the result is deterministic
     first_vector = np.cos(np.arange(len(points)))
-    n_lanczos = min(len(points), 4 * (n_scalars + 1))
-    values, vectors = sparse_linalg.eigsh(
-        matrix, n_scalars + 1, which="LA", v0=first_vector, ncv=n_lanczos
+    n_lanczos_vectors = min(len(points), 4 * (n_functions + 1))
+    eigenvalues, vectors = sparse_linalg.eigsh(
+        matrix, n_functions + 1, which="LA", v0=first_vector, ncv=n_lanczos_vectors
     )
-    descending = np.argsort(-values)[1:]  # the function of the first is constant
+    # without the largest eigenvalue, whose function is constant
+    descending = np.argsort(-eigenvalues)[1:]
+    # from eigenvectors of the symmetric matrix to functions
     functions = _fix_signs(vectors[:, descending]) / np.sqrt(mass)[:, None]
-    return density, functions, mass, values[descending]
+    return density, functions, mass, eigenvalues[descending]
 
 
 def _fix_signs(vectors: Float64Array) -> Float64Array:
-    """Return columns with the sign that makes their largest entry positive, since
-    solvers return either sign.
+    """Return columns with the sign that makes their largest entry positive.
+
+    Solvers return an eigenvector with either sign.
     """
     largest = vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])]
     return np.asarray(vectors * np.where(largest < 0.0, -1.0, 1.0))
@@ -243,8 +252,7 @@ def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
     corners = welded_mesh.positions[welded_mesh.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
     generator = np.random.default_rng(0)
-    # The face of each sample, by its area: samples are even steps along the sum of all
-    # areas.
+    # The face of each sample: samples are evenly spaced in the cumulative area.
     quantiles = (np.arange(N_SURFACE_SAMPLES) + 0.5) / N_SURFACE_SAMPLES
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
     face = face.clip(max=len(areas) - 1)
@@ -264,7 +272,7 @@ def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
     return np.stack(means, axis=1), cell
 
 
-def _without_rotation(
+def _combine_without_rotation(
     points: Float64Array,
     functions: Float64Array,
     mass: Float64Array,
@@ -278,6 +286,9 @@ def _without_rotation(
     vary (their energy). Shifts need not be removed, because the constant function is
     not among the functions.
 
+    In this function a field is a vector of 3 S coefficients: for each function, the
+    weights in the x, y and z component.
+
     Args:
         points: (N, 3) landmarks.
         functions: (N, S) scalar functions, orthonormal under `mass`.
@@ -288,52 +299,56 @@ def _without_rotation(
     Returns:
         (S, 3, count), the weight of each function in each component of a field.
     """
-    n_scalars = functions.shape[1]
+    n_functions = functions.shape[1]
     center = (points * mass[:, None]).sum(axis=0) / mass.sum()
     # (N, 3) displacements by a small rotation about each axis
     turns = [np.cross(axis, points - center) for axis in np.eye(3)]
-    # (3, 3 S) coefficients of the rotations in the functions
+    # (3, 3 S) coefficients of the three rotations
     rotations = np.stack(
         [(functions.T @ (mass[:, None] * turn)).reshape(-1) for turn in turns]
     )
-    # (3 S, M) basis of the fields without rotation, and their energy in it
+    # (3 S, M) orthonormal basis of the fields without rotation
     basis = linalg.null_space(rotations)
-    basis_energy = basis.T @ (np.repeat(energy, 3)[:, None] * basis)
-    _, vectors = linalg.eigh(basis_energy)  # ascending energy
+    # Energy as a quadratic form, first of coefficients, then in the basis. Its
+    # eigenvectors are the fields, with the smallest energy first.
+    coefficient_energy = np.repeat(energy, 3)[:, None]
+    basis_energy = basis.T @ (coefficient_energy * basis)
+    _, vectors = linalg.eigh(basis_energy)
     n_fields = min(count, basis.shape[1])
     combined = _fix_signs(basis @ vectors[:, :n_fields])
-    return np.asarray(combined.reshape(n_scalars, 3, -1))
+    return np.asarray(combined.reshape(n_functions, 3, -1))
 
 
 # ---- one push per vertex
 
 
 class Preconditioner:
-    """Spreads pushes over the neighborhood of a welded mesh: `R (I + lambda L)^-2 p`.
+    """Spreads pushes p over the neighborhood on a mesh: `R (I + lambda L)^-2 p`.
 
-    L is the Laplacian of the mesh, and R takes rigid motions out (Nicolet, Jacobson and
+    L is the Laplacian of the mesh, and R removes rigid motions (Nicolet, Jacobson and
     Jakob 2021, "Large steps in inverse rendering of geometry").
 
     Attributes:
-        _factor: factor of the sparse matrix I + lambda L.
+        _factor: LU factorization of the sparse matrix I + lambda L.
         _rigid: (3 P, 6) orthonormal basis of the rigid motions.
     """
 
     def __init__(self, welded_mesh: WeldedMesh) -> None:
-        """Factorise I + lambda L, and compute an orthonormal basis of rigid motions.
+        """Factorize I + lambda L, and compute an orthonormal basis of rigid motions.
 
         L is the Laplacian of the mesh, and lambda the squared smoothing length.
         """
         positions = welded_mesh.positions
         laplacian, mean_edge_length = _compute_wall_laplacian(welded_mesh)
-        # The Laplacian has the mean edge length as its unit.
-        smoothing_edges = SMOOTHING_LENGTH * welded_mesh.extent / mean_edge_length
-        system = sparse.identity(len(positions)) + smoothing_edges**2 * laplacian
+        # The Laplacian counts lengths in mean edges, so lambda does as well.
+        smoothing_length = SMOOTHING_LENGTH * welded_mesh.extent / mean_edge_length
+        system = sparse.identity(len(positions)) + smoothing_length**2 * laplacian
         self._factor = sparse_linalg.splu(system.tocsc())
         # displacement fields (P, 3) by a shift along and a small turn about each axis
         shifts = [np.broadcast_to(axis, positions.shape) for axis in np.eye(3)]
         centered = positions - positions.mean(axis=0)
         turns = [np.cross(axis, centered) for axis in np.eye(3)]
+        # (3 P, 6), with the three components of a position next to each other
         motions = np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)
         self._rigid = torch.from_numpy(np.asarray(linalg.orth(motions)))
 
@@ -343,7 +358,8 @@ class Preconditioner:
         smooth: Tensor = _Solve.apply(solved, self._factor)  # type: ignore[no-untyped-call]
         vector = smooth.reshape(-1)
         rigid = self._rigid.to(vector.device)
-        return (vector - rigid @ (rigid.T @ vector)).reshape(smooth.shape)
+        rigid_motion = rigid @ (rigid.T @ vector)
+        return (vector - rigid_motion).reshape(smooth.shape)
 
 
 def _compute_wall_laplacian(welded_mesh: WeldedMesh) -> tuple[Any, float]:
@@ -385,7 +401,8 @@ def _compute_wall_laplacian(welded_mesh: WeldedMesh) -> tuple[Any, float]:
 class _Solve(torch.autograd.Function):
     """Solution of a symmetric sparse system.
 
-    Its derivative is the same solution, any number of times.
+    The derivative is the solution of the same system, so that any number of derivatives
+    can be computed.
     """
 
     @staticmethod
@@ -399,7 +416,7 @@ class _Solve(torch.autograd.Function):
         return _Solve.apply(cotangent.contiguous(), ctx.factor), None  # type: ignore[no-untyped-call]
 
 
-# ---- how far
+# ---- limits
 
 
 class DisplacementLimits:
@@ -407,25 +424,25 @@ class DisplacementLimits:
 
         offsets = epsilon s d,    s = (1 + sum_i r_i^p)^(-1/p)
 
-    with r_i the fraction of each bound that epsilon d would use up: of the length of d
-    at each position (1), the gradient of the displacement along each face
-    (`MAX_FACE_STRAIN`), and the change between the two sides of each wall
-    (`MAX_WALL_STRAIN`). As `s max r < 1`, no position moves further than epsilon, no
+    r_i is the fraction of each bound that epsilon d would use. There are bounds of the
+    length of d at each position (1), of the gradient of the displacement on each face
+    (`MAX_FACE_STRAIN`), and of the change between the two sides of each wall
+    (`MAX_WALL_STRAIN`). As `s max r < 1`, no position moves farther than epsilon, no
     face turns over (its tangent map is I + B with ||B|| < 1, and so has a positive
     determinant), and walls and gaps keep more than half their width.
 
     Attributes:
         epsilon: largest displacement, in the mesh's units.
         _faces: (F, 3) indices of positions, without slivers.
-        _inverse_axes: (F, 3) numbers of a face that turn differences along its edges
-            into a gradient, see `_compute_squared_gradients`.
+        _gradient_factors: (F, 3) numbers of a face that turn differences along its
+            edges into a gradient, see `_compute_squared_gradients`.
         _walls: (W, 2) indices of positions.
-        _wall_widths: (W,) distances of the sides.
-        _positions: (P, 3) of the mesh.
+        _wall_widths: (W,) distances between both sides.
+        _positions: (P, 3) positions of the mesh, for `find_thinnest_wall`.
     """
 
     def __init__(self, welded_mesh: WeldedMesh, epsilon: float) -> None:
-        """Compute from the mesh what each bound needs: edges, heights and wall widths.
+        """Compute the properties of faces and walls that the bounds need.
 
         Args:
             welded_mesh: the mesh.
@@ -438,18 +455,18 @@ class DisplacementLimits:
         edges = np.stack([edge_1, edge_2, edge_1 - edge_2])
         longest = np.linalg.norm(edges, axis=-1).max(axis=0)
         double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
-        # The strain of a face that is almost a line would be huge, and is not bounded.
-        is_sound = double_area > MIN_FACE_HEIGHT * longest**2
-        edge_1 = edge_1[is_sound]
-        edge_2 = edge_2[is_sound]
-        double_area = double_area[is_sound]
-        # see `_compute_squared_gradients`
-        length = np.linalg.norm(edge_1, axis=1)
-        edge_2_along = (edge_1 * edge_2).sum(axis=1) / length
-        inverse_height = length / double_area
-        self._faces = torch.from_numpy(welded_mesh.faces[is_sound])
-        self._inverse_axes = torch.from_numpy(
-            np.stack([1.0 / length, edge_2_along / length, inverse_height], axis=1)
+        # Double the area is the longest edge times the height over it.
+        is_no_sliver = double_area > MIN_FACE_HEIGHT * longest**2
+        edge_1 = edge_1[is_no_sliver]
+        edge_2 = edge_2[is_no_sliver]
+        double_area = double_area[is_no_sliver]
+        # Edge 2 is split into a multiple of edge 1 and the height over edge 1.
+        length_1 = np.linalg.norm(edge_1, axis=1)
+        projection = (edge_1 * edge_2).sum(axis=1) / length_1
+        inverse_height = length_1 / double_area
+        self._faces = torch.from_numpy(welded_mesh.faces[is_no_sliver])
+        self._gradient_factors = torch.from_numpy(
+            np.stack([1.0 / length_1, projection / length_1, inverse_height], axis=1)
         )
         self._walls = torch.from_numpy(welded_mesh.walls)
         wall_vectors = (
@@ -460,7 +477,7 @@ class DisplacementLimits:
         self._positions = torch.from_numpy(welded_mesh.positions)
 
     def compute_squared_usage(self, field: Tensor) -> Tensor:
-        """Return the squared fraction of each bound that a displacement uses up.
+        """Return the squared fraction of each bound that a displacement uses.
 
         The displacement is epsilon d. It is bounded by the length epsilon at each
         position, the strain `MAX_FACE_STRAIN` of each face, and the strain
@@ -490,21 +507,22 @@ class DisplacementLimits:
         """Return the squared norm (F,) of the gradient of a field (P, 3) on each face.
 
         The field changes by d1 along edge 1 of the face, and by d2 along edge 2. Edge 2
-        is `along` times edge 1 plus a height across it. So the field changes by d1 /
-        length per unit along edge 1, and by (d2 - along d1) / height across it.
+        is the sum of a multiple m of edge 1 and a vector at right angles to it, whose
+        length is the height of the face. So the gradient is d1 / length along edge 1,
+        and (d2 - m d1) / height at right angles to it.
 
         Args:
             field: (P, 3) vectors at the positions of the mesh.
         """
-        inverse_axes = self._inverse_axes.to(field.device)
-        # (F, 1) each: 1 / length, along, and 1 / height
-        inverse_length, along, inverse_height = inverse_axes.split(1, dim=1)
+        factors = self._gradient_factors.to(field.device)
+        # (F, 1) each
+        inverse_length, multiple, inverse_height = factors.split(1, dim=1)
         face_corners = self._faces.to(field.device)
         corners = [field.index_select(0, corner) for corner in face_corners.T]
         d1 = corners[1] - corners[0]
         d2 = corners[2] - corners[0]
         along_gradient = d1 * inverse_length
-        across_gradient = (d2 - d1 * along) * inverse_height
+        across_gradient = (d2 - d1 * multiple) * inverse_height
         squared_norm: Tensor = along_gradient.square() + across_gradient.square()
         return squared_norm.sum(dim=1)
 
@@ -512,16 +530,19 @@ class DisplacementLimits:
         """Return offsets (P, 3) within all bounds for a field d (P, 3), float64.
 
         They are epsilon d / (1 + sum r^p)^(1/p), where r are the fractions of the
-        bounds that epsilon d uses up and p is `NORM_EXPONENT`: small fields stay as
-        they are, large ones reach the tightest bound, and all is differentiable.
+        bounds that epsilon d uses and p is `NORM_EXPONENT`. Small fields are hardly
+        changed, large ones reach the tightest bound, and the result is differentiable.
         """
         squared_usage = self.compute_squared_usage(field)
-        # The r are divided by the largest one, so that powers do not overflow.
-        # `largest` is a square: 1 + sum r^p = largest^(p/2) * total.
-        largest = squared_usage.detach().max().clamp_min(1.0)
-        powers = (squared_usage / largest).pow(NORM_EXPONENT // 2).sum()
-        total = powers + largest ** (-NORM_EXPONENT // 2)
-        return self.epsilon * field * (total ** (-1.0 / NORM_EXPONENT) / largest.sqrt())
+        half_exponent = NORM_EXPONENT // 2  # as usages are squared already
+        # To avoid an overflow, all r are divided by the largest one, R (at least 1):
+        #     1 + sum r^p = R^p total,    total = R^-p + sum (r / R)^p
+        # R cancels in the result, so that it may be a constant for the derivative.
+        squared_max = squared_usage.detach().max().clamp_min(1.0)
+        sum_of_powers = (squared_usage / squared_max).pow(half_exponent).sum()
+        total = sum_of_powers + squared_max**-half_exponent
+        scale = total ** (-1.0 / NORM_EXPONENT) / squared_max.sqrt()
+        return self.epsilon * field * scale
 
     def find_thinnest_wall(self, offsets: Tensor) -> float:
         """Return the smallest width of a wall or gap after a displacement (P, 3).
@@ -541,21 +562,21 @@ MAX_EPSILON = 0.5
 DEFAULT_MODES = 24
 MAX_MODES = 200
 PUSH_FACTOR = 4.0
-"""Factor on the pushes of form large-steps: pushes at their largest over a
-neighbourhood pass the bound on the length of d, so that it is reached without every
-vertex of the object agreeing.
+"""Factor of the pushes in the form large-steps. With it, pushes on a neighborhood are
+enough to reach the bound of the displacement; not all vertices have to be pushed.
 """
+# gradient estimators of both parameters, the preferred one first
 ESTIMATORS = ("material", "differences")
 
 
 class GeometryControl(Control):
-    """A smooth change of the object's shape, at most so far.
+    """A bounded, smooth change of the object's shape.
 
     Attributes:
-        form: one of `FORMS`, what the coordinates are.
+        form: one of `FORMS`, the meaning of the coordinates.
         _mesh: mesh that is changed.
         _offsets_input: name of the scene input with the offsets of its vertices.
-        _index: (V,) position of each vertex, see `WeldedMesh`.
+        _position_of_vertex: (V,) position of each vertex, see `WeldedMesh`.
         _limits: limits of the displacement.
         _field: map from coordinates in [-1, 1] to a displacement (P, 3), not limited.
     """
@@ -570,7 +591,7 @@ class GeometryControl(Control):
             -1.0,
             1.0,
             0.0,
-            "How much of each smooth mode of the shape is added (form modes).",
+            "Amplitude of each smooth mode of the shape (form modes).",
             moves_silhouettes=True,
             search=(-1.0, 1.0),
             estimators=ESTIMATORS,
@@ -582,7 +603,8 @@ class GeometryControl(Control):
             -1.0,
             1.0,
             0.0,
-            "Push on each vertex before it is spread out (form large-steps).",
+            "Push on each vertex, which is spread over its neighborhood (form "
+            "large-steps).",
             moves_silhouettes=True,
             search=(-1.0, 1.0),
             estimators=ESTIMATORS,
@@ -622,13 +644,15 @@ class GeometryControl(Control):
         self._offsets_input = f"{self.mesh}.offsets"
         self._mesh = self.get_mesh(self.scene).mesh
         welded_mesh = get_welded_mesh(self._mesh)
-        self._index = torch.from_numpy(welded_mesh.position_of_vertex)
+        self._position_of_vertex = torch.from_numpy(welded_mesh.position_of_vertex)
         self._limits = DisplacementLimits(welded_mesh, float(self.chosen["epsilon"]))
         if self.form == "modes":
+            # (P, 3, modes)
             modes = torch.from_numpy(
                 compute_shape_modes(self._mesh, int(self.chosen["modes"]))
             )
-            group = Group("amplitudes", modes.shape[2], ESTIMATORS)
+            n_modes = modes.shape[2]
+            group = Group("amplitudes", n_modes, ESTIMATORS)
             self._field: Callable[[Tensor], Tensor] = lambda amplitudes: (
                 modes.to(amplitudes.device) @ amplitudes
             )
@@ -639,23 +663,29 @@ class GeometryControl(Control):
                 PUSH_FACTOR * precondition(pushes.reshape(-1, 3))
             )
         self.groups = (group,)
+        # no displacement, see `compute_offsets`
         self.start = torch.full((group.size,), 0.5)
 
     def inputs(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Tensor]:
         """Return the offset of each vertex, (V, 3)."""
-        offsets = self.compute_offsets(u).index_select(0, self._index.to(u.device))
+        index = self._position_of_vertex.to(u.device)
+        offsets = self.compute_offsets(u).index_select(0, index)
         return {self._offsets_input: offsets.float()}
 
     def compute_offsets(self, u: Tensor) -> Tensor:
         """Return the displacement of each position, (P, 3) float64."""
-        return self._limits.limit(self._field(2.0 * u.double() - 1.0))
+        coordinates = 2.0 * u.double() - 1.0  # from [0, 1] to [-1, 1]
+        return self._limits.limit(self._field(coordinates))
 
     def describe(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
-        """Return how far vertices move, and how much the thinnest wall has lost."""
+        """Return the largest and the root-mean-square offset, and the thinnest wall.
+
+        The latter is the width of the wall as a fraction of its original width.
+        """
         offsets = self.compute_offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {
@@ -671,13 +701,17 @@ class GeometryControl(Control):
     def get_artifact_files(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
-        """Return the displaced mesh as an OBJ file."""
+        """Return the displaced mesh as an OBJ file; earlier inputs are not used."""
         moving = MovingMesh(self._mesh, np.eye(4))
         offsets = self.inputs(u.detach())[self._offsets_input]
+        # without another pose
         vertices, normals = moving.transform_mesh(None, offsets)
         lines = ["# advsearch: z is up; texture coordinates as of the original object"]
         lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
-        lines += [f"vt {u:.7g} {v:.7g}" for u, v in self._mesh.uvs.tolist()]
+        lines += [
+            f"vt {right:.7g} {upwards:.7g}"
+            for right, upwards in self._mesh.uvs.tolist()
+        ]
         lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
         faces = (self._mesh.faces.astype(np.int64) + 1).tolist()
         lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in faces]

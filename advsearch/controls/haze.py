@@ -1,11 +1,10 @@
-"""The `haze` control: a uniform haze around camera and object, by how dense it is and
-of which colour.
+"""The `haze` control: density and color of a uniform haze around camera and object.
 
-A share `1 - exp(-density * l)` of the light is taken out of a line of length l (Beer
-and Lambert), and scattered light comes in:
-`advsearch.scene.mitsuba_backend.own_plugins` has the equation. Colour is the share that
-is scattered and not absorbed, per channel: white haze takes nothing away, dark haze is
-smoke. Haze fills a ball; the environment is outside.
+Over a distance l, haze removes the fraction `1 - exp(-density * l)` of the light (Beer
+and Lambert), and adds scattered light: see
+`advsearch.scene.mitsuba_backend.own_plugins` for the equation. The color is the fraction
+of the removed light that is scattered and not absorbed, per channel: white haze absorbs
+nothing, dark haze is smoke. Haze fills a ball; the environment is outside.
 """
 
 from __future__ import annotations
@@ -27,19 +26,18 @@ from advsearch.extend import (
     parts,
 )
 
-# the haze reaches at least this far from the scene's middle, object sizes
+# smallest radius of the ball of haze, object sizes
 MIN_RADIUS = 4.0
-CAMERA_DISTANCE_FACTOR = (
-    1.5  # it reaches at least so many times as far as the camera is away
-)
-DEFAULT_DENSITY = 0.1  # density where it is not searched and was not given
+# smallest radius as a multiple of the camera's distance from the origin
+CAMERA_DISTANCE_FACTOR = 1.5
+DEFAULT_DENSITY = 0.1  # density if only the color is searched
 
 
 class HazeControl(Control):
-    """A uniform haze around camera and object: how dense it is, and its colour."""
+    """A uniform haze around camera and object: its density and colour."""
 
     kind = "haze"
-    photograph_refusal = "haze would lie before the object and not before the rest"
+    photograph_refusal = "haze would cover the object, but not the photograph"
     strength_parameter = "density"
     parameters = (
         Parameter.number(
@@ -49,12 +47,14 @@ class HazeControl(Control):
             0.0,
             2.0,
             0.0,
-            "Extinction: over 1 / density the haze takes 63 % of the "
-            "light out of a ray.",
+            "Extinction: over a distance of 1 / density the haze removes 63 % of the "
+            "light of a ray.",
             (0.0, 0.3),
         ),
         *Parameter.colors(
-            "of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02
+            "of the haze: the light that it scatters and does not absorb.",
+            (0.6, 1.0),
+            low=0.02,
         ),
     )
 
@@ -87,7 +87,7 @@ class HazeControl(Control):
             default = scene_haze.density
         elif self.has_requested_search and not self.is_searched("density"):
             default = DEFAULT_DENSITY
-        # the adjoint needs a density over 0
+        # The adjoint needs a positive density.
         spec = self.specs.get("density")
         has_adjoint = isinstance(spec, Range) and spec.low > 0.0
         return replace(
@@ -97,7 +97,7 @@ class HazeControl(Control):
         )
 
     def get_scene_value(self, parameter: Parameter) -> float | str:
-        # of the density; see `amount`
+        # Only the value of the density is used (`strength_parameter`).
         return 0.0 if _find_haze(self.scene) is None else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
@@ -131,7 +131,7 @@ class HazeControl(Control):
 
 
 def _find_haze(scene: SceneDescription) -> parts.HazePart | None:
-    """Return the haze that a scene comes with; None without any, or of density 0."""
+    """Return the haze of a scene; None if it has none, or only one of density 0."""
     return next(
         (
             part

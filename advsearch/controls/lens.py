@@ -1,12 +1,11 @@
-"""The `lens` control: translucent dots on the front of the camera's lens, as an
-adversarial sticker has them.
+"""The `lens` control: translucent dots on the camera's lens, as on a sticker.
 
     opacity_k(p) = opacity_k * exp(-(|p - centre_k|^2 / radius_k^2) ^ falloff)
     light(p)    <- (1 - opacity_k(p)) light(p) + opacity_k(p) color_k,     for each dot k in turn
 
 The dots are those of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019,
-arXiv 1904.00759, section 3), who mix display values; here linear light is mixed. They
-are put on the finished picture, and nothing is rendered anew.
+arXiv 1904.00759, section 3). There display values are blended, here linear light. The
+dots are drawn on the finished image, without rendering it again.
 """
 
 from __future__ import annotations
@@ -19,17 +18,16 @@ from torch import Tensor
 
 from advsearch.extend import Choice, Control, OneOf, Parameter, Values, color
 
-DEFAULT_DOTS = 4  # how many dots there are when nothing is said
+DEFAULT_DOTS = 4
 MAX_DOTS = 64
 POSITION_PARAMETERS = ("x", "y")
-# side in pixels of the picture of the sticker that is kept with a run
+# side in pixels of the image of the sticker that is stored with a result
 STICKER_SIDE = 256
-# past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power
-# overflows
+# limit of the exponent, so that powers do not overflow; exp(-40) is 4e-18, invisible
 _MAX_EXPONENT = 40.0
 
 
-def _per_dot(
+def _make_dot_parameter(
     name: str,
     unit: str,
     default: float,
@@ -51,13 +49,13 @@ def _per_dot(
         log: whether it is searched on a logarithmic scale.
     """
     return Parameter(
-        name,
-        (None,),
-        unit,
-        low,
-        1.0,
-        default,
-        text,
+        name=name,
+        shape=(None,),  # the number of dots is a choice, see `resolve_parameter`
+        unit=unit,
+        low=low,
+        high=1.0,
+        default=default,
+        description=text,
         search=search,
         log=log,
         estimators=("image",),
@@ -65,34 +63,38 @@ def _per_dot(
 
 
 class LensControl(Control):
-    """Translucent, blurred dots on the camera's lens: their places, sizes, colours,
+    """Translucent, blurred dots on the camera's lens: positions, sizes, colours and
     opacities.
     """
 
     kind = "lens"
     strength_parameter = "opacity"
     parameters = (
-        _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
-        _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
-        _per_dot(
+        _make_dot_parameter(
+            "x", "picture widths", 0.5, "Centre of each dot, from the left edge."
+        ),
+        _make_dot_parameter(
+            "y", "picture heights", 0.5, "Centre of each dot, from the top edge."
+        ),
+        _make_dot_parameter(
             "radius",
             "picture sizes",
             0.12,
-            "Distance at which a dot has lost 63 % of its opacity, as a share of "
-            "the picture's smaller side.",
+            "Distance from the centre at which a dot has lost 63 % of its opacity, as a "
+            "fraction of the picture's shorter side.",
             (0.03, 0.25),
             0.01,
             log=True,
         ),
         *(
-            _per_dot(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.")
+            _make_dot_parameter(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.")
             for name in color.CHANNELS
         ),
-        _per_dot(
+        _make_dot_parameter(
             "opacity",
             "1",
             0.0,
-            "Opacity in the middle of each dot; 0 is no dot.",
+            "Opacity at the centre of each dot; 0 is no dot.",
             (0.0, 0.5),
         ),
         Parameter.number(
@@ -109,20 +111,19 @@ class LensControl(Control):
         Choice(
             "dots",
             DEFAULT_DOTS,
-            f"How many dots there are, 1 to {MAX_DOTS}.",
+            f"Number of dots, 1 to {MAX_DOTS}.",
             integer_bounds=(1, MAX_DOTS),
         ),
     )
 
     @property
     def n_dots(self) -> int:
-        """How many dots there are."""
+        """Number of dots."""
         return int(self.chosen["dots"])
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        return (
-            replace(parameter, shape=(self.n_dots,)) if parameter.shape else parameter
-        )
+        is_per_dot = bool(parameter.shape)
+        return replace(parameter, shape=(self.n_dots,)) if is_per_dot else parameter
 
     def fit(self) -> None:
         """Spread the dots over the image at the start."""
@@ -130,6 +131,7 @@ class LensControl(Control):
         positions = spread_positions(self.n_dots)
         for slot in self.slots:
             name = slot.parameter.name
+            # A range has a coordinate for each dot, a list of values a single one.
             is_range = slot.n_coordinates > 0 and not isinstance(slot.spec, OneOf)
             if name in POSITION_PARAMETERS and is_range:
                 coordinates = slice(slot.offset, slot.offset + slot.n_coordinates)
@@ -148,13 +150,15 @@ class LensControl(Control):
         return {self.name: draw_dots(checkerboard, self._spread_dots(values))}
 
     def _spread_dots(self, values: Values) -> dict[str, Tensor]:
-        """Return the values with the dots spread over the image along fixed axes.
+        """Return the values with dots spread along the axes that the user did not set.
 
-        If only some parameters are searched, x or y may be fixed at its default, which
-        is the same for all dots: they would cover each other. A searched axis starts
-        with different positions already.
+        If the user sets a range of another parameter, x and y are fixed at their
+        defaults, which are the same for all dots: the dots would cover each other. If
+        the user sets no range at all, x and y are searched, and `fit` has spread their
+        start.
         """
-        if not self.has_requested_search:
+        are_positions_searched = not self.has_requested_search
+        if are_positions_searched:
             return dict(values)
         positions = spread_positions(self.n_dots)
         spread_values = dict(values)
@@ -181,7 +185,7 @@ def spread_positions(count: int) -> Tensor:
 
 
 def draw_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-    """Return an image as it is seen through a lens with dots on it.
+    """Return an image as it looks through a lens with dots on it.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].

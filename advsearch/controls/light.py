@@ -1,16 +1,15 @@
-"""The `light` control: one lamp with a place, a colour, a power and, if it is a ball, a
-size.
+"""The `light` control: a lamp with a position, a color, a power and, as a ball, a size.
 
-Power is in multiples of the irradiance `E` with which a white surface (reflectance 0.8)
-gets the display value `LIT_WHITE`. A lamp of power p and linear colour c puts `p c E /
-d^2` on a surface that faces it at distance d:
+The unit of the power is the irradiance `E` with which a white surface (reflectance 0.8)
+has the display value `LIT_WHITE`. A lamp of power p and linear color c has the irradiance
+`p c E / d^2` on a surface that faces it at distance d:
 
     point              intensity I = p c E
     ball of radius r   radiance L = p c E / (pi r^2)
 
 The irradiance of a uniform ball is `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity
-and Realistic Image Synthesis, section 2.4), so that size changes how soft the shadows
-are and not how bright the lamp is.
+and Realistic Image Synthesis, section 2.4). So the size changes how soft the shadows
+are, but not the irradiance.
 """
 
 from __future__ import annotations
@@ -35,14 +34,15 @@ from advsearch.scene.settings import Parameter
 # linear display value of a white surface that faces a lamp of power 1 at distance 1
 LIT_WHITE = 0.9
 DEFAULT_POWER = 6.0
-"""Power of a lamp whose power is not searched and was not given: at its default place
-about as bright as the environment.
+"""Power of a lamp if only other parameters are searched. At its default position the lamp
+is then about as bright as the environment.
 """
 
 
 def compute_metered_irradiance(scene: SceneDescription) -> float:
-    """Return the irradiance, in scene units, at which a white surface has the display
-    value `LIT_WHITE` with the scene's metered gain.
+    """Return the irradiance, in scene units, at which white has the value `LIT_WHITE`.
+
+    The display value is that with the scene's metered gain.
     """
     return LIT_WHITE * math.pi / (CARD_REFLECTANCE * compute_metered_gain(scene))
 
@@ -50,30 +50,35 @@ def compute_metered_irradiance(scene: SceneDescription) -> float:
 def _make_coordinate(
     name: str, low: float, high: float, default: float, description: str
 ) -> Parameter:
-    """Return a parameter for a coordinate of the lamp, searched from `low` to `high`."""
+    """Return a parameter for a coordinate of the lamp, searched from `low` to `high`.
+
+    It can move an outline, as the ball is visible and a lamp casts shadows.
+    """
     limit = 1000.0
     return Parameter.moving(
-        ("differences",),
-        name,
-        "object sizes",
-        -limit,
-        limit,
-        default,
-        description,
-        (low, high),
+        estimators=("differences",),
+        name=name,
+        unit="object sizes",
+        low=-limit,
+        high=limit,
+        default=default,
+        text=description,
+        search=(low, high),
     )
 
 
 class LightControl(Control):
-    """A lamp: where it stands, its colour, its power, and the size of an area light."""
+    """A lamp: its position, colour and power, and the size of an area light."""
 
     kind = "light"
     strength_parameter = "power"
     parameters = (
-        _make_coordinate("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
-        _make_coordinate("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
+        _make_coordinate("x", -2.0, 2.0, 1.5, "Position of the lamp's centre along x."),
         _make_coordinate(
-            "z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."
+            "y", -2.0, 2.0, -1.0, "Position of the lamp's centre along y."
+        ),
+        _make_coordinate(
+            "z", 2.0, 3.5, 2.0, "Height of the lamp's centre above the ground plane."
         ),
         *Parameter.colors("of the lamp's colour.", (0.6, 1.0)),
         Parameter.number(
@@ -83,9 +88,8 @@ class LightControl(Control):
             0.0,
             1000.0,
             0.0,
-            "Irradiance at distance 1, in multiples of the one that shows "
-            "a white surface just below "
-            "white.",
+            "Irradiance at a distance of one object size, as a multiple of the "
+            "irradiance at which a white surface is displayed just below white.",
             (0.0, 12.0),
         ),
         Parameter.moving(
@@ -95,7 +99,7 @@ class LightControl(Control):
             0.001,
             10.0,
             0.2,
-            "Diameter of an area light; a point has none.",
+            "Diameter of an area light; a point light has no size.",
             (0.05, 0.6),
             log=True,
         ),
@@ -104,7 +108,7 @@ class LightControl(Control):
         Choice(
             "type",
             "area",
-            "area (a ball that glows: soft shadows, visible) or point (sharp "
+            "area (a luminous ball: soft shadows, visible) or point (sharp "
             "shadows, invisible).",
             options=("area", "point"),
         ),
@@ -132,7 +136,7 @@ class LightControl(Control):
         return parameter
 
     def get_scene_value(self, parameter: Parameter) -> ParameterValue:
-        return 0.0  # of the power; see `amount`
+        return 0.0  # only that of the power is used (`strength_parameter`)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         lamp = PointLamp if self.chosen["type"] == "point" else BallLamp
@@ -144,12 +148,9 @@ class LightControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the lamp's position and its brightness.
-
-        A power of 1 gives, at a distance of 1, the scene's metered irradiance, at which
-        a white surface is just below white in the image.
-        """
+        """Return the lamp's position and its brightness."""
         position = torch.stack([values[axis] for axis in ("x", "y", "z")])
+        # At a distance of 1 the irradiance is the intensity.
         intensity = (
             color.combine_channels(values)
             * values["power"]
@@ -170,5 +171,5 @@ class LightControl(Control):
 
 
 def make_ball_pose(center: Tensor, radius: Tensor) -> Tensor:
-    """Return the pose (4, 4) of the unit ball at a place (3,) with a radius ()."""
+    """Return the pose (4, 4) of the unit ball for a center (3,) and a radius ()."""
     return make_affine(torch.eye(3).to(center) * radius, center)

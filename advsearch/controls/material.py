@@ -1,11 +1,10 @@
-"""The `material` control: how the object's surface reflects, its tint, and which named
-material it is made of.
+"""The `material` control: reflection, tint and named materials of the object's surface.
 
     base_color = linear(tint) * (the object's texture, or the named material's pattern)
 
 The numbers are those of the principled BSDF (Burley, *Physically based shading at
-Disney*, SIGGRAPH 2012 course notes). A named material has a seamless pattern and
-numbers of its own, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
+Disney*, SIGGRAPH 2012 course notes). A named material, such as "wood", has a seamless
+pattern and other numbers, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
 """
 
 from __future__ import annotations
@@ -31,21 +30,20 @@ from advsearch.scene.raster import look_up_texture, rasterize_charts
 from advsearch.scene.settings import CHANNELS, MATERIAL, Parameter
 
 # --------------------------------------------------------------------------------------
-# Named materials made by procedure: seamless patterns with a surface of their own, and
-# how they cover an object.
+# Procedural materials: patterns, and how they cover an object.
 #
-# Each is a square tile that repeats without a visible seam (3DB, Leclerc et al. 2021,
-# arXiv 2106.03805, section 4), made of periodic gradient noise (Perlin 1985), cells
+# Each pattern is a square tile that repeats without a visible seam (3DB, Leclerc et al.
+# 2021, arXiv 2106.03805, section 4), made of periodic gradient noise (Perlin 1985), cells
 # (Worley 1996), and iterated band-pass filtering (Turing 1952; Young 1984).
 
 Grid = tuple[Float64Array, Float64Array]
-"""Coordinates x (to the right) and y (down) of texel centres, each (SIDE, SIDE) in (0,
+"""Coordinates x (to the right) and y (down) of texel centers, each (SIDE, SIDE) in (0,
 1).
 """
 
 TILE_SIDE = 512  # side of a tile in texels
-# power of the normal's components that weighs the three projections of a tile: how
-# sharply they meet
+# The weight of each of the three projections of a tile is this power of a component of
+# the normal. The larger it is, the sharper are the borders between projections.
 BLEND_EXPONENT = 20.0
 
 
@@ -53,34 +51,45 @@ BLEND_EXPONENT = 20.0
 class Pattern:
     """A named material.
 
-    The side of a tile in object sizes, the surface beside its colour, and what draws
-    the tile at texels (`Grid`): (SIDE, SIDE, 3) display-referred sRGB, any overshoot
-    clipped later.
+    Attributes:
+        name: name, such as "wood".
+        tile_size: side of the tile on the object, in object sizes.
+        material: surface numbers, such as the roughness.
+        paint: function that returns the tile (SIDE, SIDE, 3), display-referred sRGB,
+            at the texels of a `Grid`. Values outside of [0, 1] are clipped later.
     """
 
     name: str
-    size: float
+    tile_size: float
     material: Material
     paint: Callable[[Grid], Float64Array]
 
 
-PATTERNS: dict[str, Pattern] = {}  # every named material by its name
+PATTERNS: dict[str, Pattern] = {}  # all named materials by name
 
 
 def register_pattern(
-    size: float, **surface: float
+    *, tile_size: float, **surface: float
 ) -> Callable[[Callable[[Grid], Float64Array]], None]:
-    """Make a named material of the function below; see `Pattern`."""
+    """Return a decorator that registers a function as a named material.
+
+    The material gets the name of the function, which is then called through `PATTERNS`
+    only.
+
+    Args:
+        tile_size: side of the tile on the object, in object sizes.
+        **surface: numbers of the `Material`, such as the roughness.
+    """
 
     def register(paint: Callable[[Grid], Float64Array]) -> None:
         PATTERNS[paint.__name__] = Pattern(
-            paint.__name__, size, Material(**surface), paint
+            paint.__name__, tile_size, Material(**surface), paint
         )
 
     return register
 
 
-# ---- ingredients: everything repeats after 1 in x and y
+# ---- building blocks, periodic with the period 1 in x and y
 
 
 def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
@@ -90,7 +99,8 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
 
     Args:
         grid: x and y of the texels, where the tile has length 1.
-        cells: number of lattice cells across and down the tile.
+        cells: number of lattice cells along x and along y. With few along x and many
+            along y, features are long in x.
         seed: seed of the gradients.
     """
     columns, rows = cells
@@ -121,7 +131,10 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
 
 
 def _fade(position: Float64Array) -> Float64Array:
-    """Return the weight of the further corner at a position in a lattice cell."""
+    """Return the weight of the right or lower corner at a position in a lattice cell.
+
+    It rises smoothly from 0 at the position 0 to 1 at the position 1.
+    """
     cubed = position * position * position
     return np.asarray(cubed * (position * (position * 6.0 - 15.0) + 10.0))
 
@@ -129,7 +142,16 @@ def _fade(position: Float64Array) -> Float64Array:
 def _clouds(
     grid: Grid, cells: tuple[int, int], octaves: int, seed: int
 ) -> Float64Array:
-    """Return octaves of noise, each twice as fine and half as strong; about -1 to 1."""
+    """Return the sum of octaves of noise, from about -1 to 1.
+
+    Each octave is twice as fine and half as strong as the one before.
+
+    Args:
+        grid: x and y of the texels, where the tile has length 1.
+        cells: number of cells of the first octave along x and along y.
+        octaves: number of octaves.
+        seed: seed of the noise.
+    """
     total = np.zeros_like(grid[0])
     for octave in range(octaves):
         total += 0.5**octave * _noise(
@@ -137,12 +159,19 @@ def _clouds(
             cells=(cells[0] << octave, cells[1] << octave),
             seed=seed + 101 * octave,
         )
-    # the sum of all weights
-    return total / (2.0 - 0.5 ** (octaves - 1))
+    sum_of_weights = 2.0 - 0.5 ** (octaves - 1)
+    return total / sum_of_weights
 
 
 def _warp_grid(grid: Grid, cells: int, amount: float, seed: int) -> Grid:
-    """Return coordinates displaced by up to about `amount` by noise."""
+    """Return coordinates displaced by noise, so that a pattern becomes irregular.
+
+    Args:
+        grid: x and y of the texels, where the tile has length 1.
+        cells: number of cells of the noise along each side.
+        amount: largest displacement, about.
+        seed: seed of the noise.
+    """
     right = _clouds(grid, cells=(cells, cells), octaves=2, seed=seed)
     down = _clouds(grid, cells=(cells, cells), octaves=2, seed=seed + 7)
     return grid[0] + amount * right, grid[1] + amount * down
@@ -199,8 +228,8 @@ def _grow_turing_pattern(
     Args:
         wavelength: wavelength along x and along y, in tiles. If they differ, stripes
             repeat along the direction of the shorter one.
-        bias: number that is added before saturation; far from 0, stripes break up into
-            spots.
+        bias: number that is added before saturation. If it is not near 0, the result is
+            spots instead of stripes.
         seed: seed of the noise.
         rounds: number of filterings.
     """
@@ -252,14 +281,14 @@ def _ramp(value: Float64Array, *codes: str) -> Float64Array:
 # ---- the patterns
 
 
-@register_pattern(1.0, roughness=0.5)
+@register_pattern(tile_size=1.0, roughness=0.5)
 def plain(grid: Grid) -> Float64Array:
     return np.ones((TILE_SIDE, TILE_SIDE, 3))
 
 
-@register_pattern(0.6, roughness=0.45)
+@register_pattern(tile_size=0.6, roughness=0.45)
 def wood(grid: Grid) -> Float64Array:
-    """Paint year rings with fibres and pores, (SIDE, SIDE, 3) sRGB.
+    """Paint wood with rings, fibers and pores along y, (SIDE, SIDE, 3) sRGB.
 
     Frequencies, strengths and colors are chosen by eye.
     """
@@ -269,10 +298,10 @@ def wood(grid: Grid) -> Float64Array:
     )
     rings = 9.0 * (x + bend) + 0.25 * _noise(grid, cells=(5, 2), seed=17)
     phase = rings % 1.0
-    # slow darkening, sudden end of a year
-    late_wood = _step(phase, edge=0.66, soft=0.6) * (
-        1.0 - _step(phase, edge=0.96, soft=0.08)
-    )
+    # A ring darkens slowly during a year, and ends suddenly.
+    darkening = _step(phase, edge=0.66, soft=0.6)
+    end_of_year = _step(phase, edge=0.96, soft=0.08)
+    late_wood = darkening * (1.0 - end_of_year)
     bent_grid = (x + 0.6 * bend, y)
     fibre = _noise(bent_grid, cells=(120, 3), seed=13) + 0.6 * _noise(
         bent_grid, cells=(240, 5), seed=18
@@ -291,7 +320,7 @@ def wood(grid: Grid) -> Float64Array:
     )
 
 
-@register_pattern(0.9, roughness=0.15)
+@register_pattern(tile_size=0.9, roughness=0.15)
 def marble(grid: Grid) -> Float64Array:
     """Paint marble, light clouds with dark veins, (SIDE, SIDE, 3) sRGB.
 
@@ -302,8 +331,8 @@ def marble(grid: Grid) -> Float64Array:
     x, y = finely_warped
     clouds = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=4, seed=25)
     veins = np.zeros((TILE_SIDE, TILE_SIDE))
-    # A family of parallel veins crosses the tile n_right times to the right and n_down
-    # times down.
+    # Each family of parallel veins has its own frequencies, width, depth and seed. A line
+    # along x crosses n_right veins of the tile, a line along y crosses n_down.
     for n_right, n_down, width, depth, seed in (
         (1, 1, 0.05, 0.75, 23),
         (2, 1, 0.02, 0.45, 24),
@@ -313,9 +342,9 @@ def marble(grid: Grid) -> Float64Array:
         strength = 0.25 + 0.75 * _step(
             _clouds(warped, cells=(3, 3), octaves=2, seed=seed + 50), edge=0.0, soft=0.8
         )
-        profile = _compute_vein_profile(n_right * x + n_down * y + turbulence, width)
-        # n_right and n_down are whole, so that veins meet at the tile's border
-        veins += depth * strength * profile
+        # Frequencies are integers, so that veins continue across the tile's borders.
+        phase = n_right * x + n_down * y + turbulence
+        veins += depth * strength * _compute_vein_profile(phase, width)
     return _mix(
         _mix(
             _color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, edge=0.58, soft=0.8)
@@ -326,14 +355,19 @@ def marble(grid: Grid) -> Float64Array:
 
 
 def _compute_vein_profile(phase: Float64Array, width: float) -> Float64Array:
-    """Return how dark a vein is: a dark core with a halo around each integer phase."""
+    """Return how dark a texel is: veins with a core and a halo at integer phases.
+
+    Args:
+        phase: (SIDE, SIDE) phase, which increases by 1 from vein to vein.
+        width: width of the core, where half the distance between two veins is 1.
+    """
     distance = np.abs(np.sin(np.pi * phase))
     core = np.exp(-((distance / width) ** 2))
     halo = 0.3 * np.exp(-(distance / (4.0 * width)))
     return np.asarray(core + halo)
 
 
-@register_pattern(0.6, roughness=0.9, specular=0.2)
+@register_pattern(tile_size=0.6, roughness=0.9, specular=0.2)
 def brick(grid: Grid) -> Float64Array:
     """Paint a wall of bricks with mortar, (SIDE, SIDE, 3) sRGB.
 
@@ -346,10 +380,11 @@ def brick(grid: Grid) -> Float64Array:
     # every other course is shifted by half a brick
     course_x = x * columns + 0.5 * (row % 2.0)
     column = np.floor(course_x) % columns
-    # Distance to the edge of the brick, in heights of a course. A brick is twice as
-    # long as high, so the one along x is doubled.
+    # Distances to the edges of the brick, as fractions of its height. It is twice as
+    # long as high, so that a fraction of its length is doubled.
     edge_x = 2.0 * (0.5 - np.abs(course_x % 1.0 - 0.5))
     edge_y = 0.5 - np.abs(y * rows % 1.0 - 0.5)
+    # 1 on a brick, and 0 near its edges, where the mortar is
     solid = _step(
         np.minimum(edge_x, edge_y) + 0.02 * _noise(grid, cells=(60, 60), seed=32),
         edge=0.075,
@@ -365,7 +400,10 @@ def brick(grid: Grid) -> Float64Array:
 
 
 def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
-    """Return the color of bricks of some tone, with grain and dark stains."""
+    """Return the color (SIDE, SIDE, 3) of bricks, with grain and dark stains.
+
+    `brick_tone` (SIDE, SIDE) in [0, 1] is the random tone of each brick.
+    """
     grain = _clouds(grid, cells=(40, 40), octaves=3, seed=34)
     clay = _ramp(
         brick_tone + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c"
@@ -376,22 +414,24 @@ def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
     return _mix(clay, _color("4f211a"), stains)
 
 
-@register_pattern(0.45, roughness=0.95, specular=0.1)
+@register_pattern(tile_size=0.45, roughness=0.95, specular=0.1)
 def fabric(grid: Grid) -> Float64Array:
     """Paint a plain weave of two threads, (SIDE, SIDE, 3) sRGB.
 
     Frequencies, strengths and colors are chosen by eye.
     """
     x, y = _warp_grid(grid, cells=6, amount=0.004, seed=41)
-    count = 16
+    count = 16  # threads in each direction
     thread_x = x * count
     thread_y = y * count
-    # height of a round thread across its width
+    # height of the round warp and weft threads across their widths, from 0 to 1
     round_x = np.sin(np.pi * (thread_x % 1.0))
     round_y = np.sin(np.pi * (thread_y % 1.0))
     # The warp is the upright thread. In a plain weave it lies over the level thread in
     # every second cell, like the fields of a chessboard.
     warp_is_over = (np.floor(thread_x) + np.floor(thread_y)) % 2.0 > 0.5
+    # The upper thread is highest in the middle of the lower one, and bends down at its
+    # sides.
     height = np.where(
         warp_is_over,
         round_x * (0.55 + 0.45 * round_y),
@@ -412,12 +452,18 @@ def fabric(grid: Grid) -> Float64Array:
 def _draw_thread_tones(
     generator: np.random.Generator, position: Float64Array, count: int
 ) -> Float64Array:
-    """Return the random tone (SIDE, SIDE, 1) of the thread that each texel is in."""
+    """Return the random tone (SIDE, SIDE, 1) of the thread that each texel is in.
+
+    Args:
+        generator: generator of random numbers; it advances.
+        position: (SIDE, SIDE) position of each texel, in threads.
+        count: number of different threads.
+    """
     tone = generator.uniform(0.8, 1.1, count)
     return np.asarray(tone[np.floor(position).astype(np.int64) % count][..., None])
 
 
-@register_pattern(0.7, roughness=0.8, specular=0.2)
+@register_pattern(tile_size=0.7, roughness=0.8, specular=0.2)
 def leopard(grid: Grid) -> Float64Array:
     """Paint a leopard's rosettes with dots between them, (SIDE, SIDE, 3) sRGB.
 
@@ -427,21 +473,26 @@ def leopard(grid: Grid) -> Float64Array:
         _warp_grid(grid, cells=4, amount=0.03, seed=51), cells=12, amount=0.012, seed=52
     )
     points = _scatter_points(count=42, seed=53)
-    distance, index = _find_nearest_points(warped, points)
-    rosettes, core = _draw_rosettes(warped, points, distance[..., 0], index[..., 0])
+    distances, indices = _find_nearest_points(warped, points)
+    # distance and index of the rosette that each texel belongs to
+    distance = distances[..., 0]
+    index = indices[..., 0]
+    rosettes, core = _draw_rosettes(warped, points, distance, index)
     fur = _clouds(grid, cells=(24, 90), octaves=2, seed=55)
     shade = 0.5 + 0.5 * _clouds(grid, cells=(3, 3), octaves=2, seed=56)
     coat = _mix(_color("d8a861"), _color("e7c58c"), shade)
     coat = _mix(coat, _color("a9692f"), 0.75 * core)
-    dot_distance, _ = _find_nearest_points(
-        warped, _scatter_points(count=150, seed=57), 1
-    )
-    between_rosettes = _step(distance[..., 0], edge=0.07, soft=0.012)
-    dots = 1.0 - _step(
-        dot_distance.reshape(TILE_SIDE, TILE_SIDE), edge=0.011, soft=0.006
-    )
-    spots = np.clip(rosettes + dots * between_rosettes, 0.0, 1.0)
+    between_rosettes = _step(distance, edge=0.07, soft=0.012)
+    spots = np.clip(rosettes + _draw_dots(warped) * between_rosettes, 0.0, 1.0)
     return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
+
+
+def _draw_dots(grid: Grid) -> Float64Array:
+    """Return the opacity (SIDE, SIDE) of scattered dots, from 0 to 1."""
+    points = _scatter_points(count=150, seed=57)
+    # (SIDE, SIDE): SciPy returns no axis of neighbors if there is only one.
+    distance, _ = _find_nearest_points(grid, points, count=1)
+    return 1.0 - _step(distance, edge=0.011, soft=0.006)
 
 
 def _draw_rosettes(
@@ -467,11 +518,11 @@ def _draw_rosettes(
     size = generator.uniform(0.85, 1.15, len(points))[index]
     turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
     radius = distance / size
-    # in the shorter direction on the torus, from -0.5 to 0.5
+    # offsets from the point, in the shorter direction on the torus: -0.5 to 0.5
     x_offset = (grid[0] - points[index, 0] + 0.5) % 1.0 - 0.5
     y_offset = (grid[1] - points[index, 1] + 0.5) % 1.0 - 0.5
     angle = np.arctan2(y_offset, x_offset)
-    # around a ring: it is broken where this is low
+    # A function of the angle: the ring has gaps where it is low.
     waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
     outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
     ring = _step(radius, edge=0.031, soft=0.008) * (
@@ -481,9 +532,13 @@ def _draw_rosettes(
     return ring * _step(waves, edge=-0.75, soft=0.5), core
 
 
-@register_pattern(0.8, roughness=0.8, specular=0.2)
+@register_pattern(tile_size=0.8, roughness=0.8, specular=0.2)
 def zebra(grid: Grid) -> Float64Array:
-    stripes = _grow_turing_pattern((0.42, 0.125), 0.0, 61)
+    """Paint a zebra's stripes, which are long in x, (SIDE, SIDE, 3) sRGB.
+
+    Frequencies, strengths and colors are chosen by eye.
+    """
+    stripes = _grow_turing_pattern(wavelength=(0.42, 0.125), bias=0.0, seed=61)
     black = _step(
         stripes + 0.12 * _noise(grid, cells=(10, 40), seed=62), edge=0.0, soft=0.7
     )
@@ -491,14 +546,15 @@ def zebra(grid: Grid) -> Float64Array:
     return _mix(_color("efeae0"), _color("17140f"), black) * fur[..., None]
 
 
-@register_pattern(0.5, roughness=0.4)
+@register_pattern(tile_size=0.5, roughness=0.4)
 def checker(grid: Grid) -> Float64Array:
+    """Paint a checkerboard of 4 by 4 squares, (SIDE, SIDE, 3) sRGB."""
     x, y = grid
-    odd = (np.floor(4.0 * x) + np.floor(4.0 * y)) % 2.0
-    return _mix(_color("f2f2f0"), _color("191919"), odd)
+    is_dark = (np.floor(4.0 * x) + np.floor(4.0 * y)) % 2.0
+    return _mix(_color("f2f2f0"), _color("191919"), is_dark)
 
 
-@register_pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
+@register_pattern(tile_size=0.7, roughness=0.85, metallic=0.1, specular=0.3)
 def rust(grid: Grid) -> Float64Array:
     """Paint rust under flakes of paint, (SIDE, SIDE, 3) sRGB.
 
@@ -519,9 +575,11 @@ def rust(grid: Grid) -> Float64Array:
         octaves=4,
         seed=76,
     )
-    # paint that has not come off yet, and the dark rim around it
+    # The remaining paint, and a dark rim around it: a slightly larger area without the
+    # paint itself.
     paint_left = _step(flakes, edge=0.26, soft=0.05)
-    rim = _step(flakes, edge=0.20, soft=0.10) - paint_left
+    paint_and_rim = _step(flakes, edge=0.20, soft=0.10)
+    rim = paint_and_rim - paint_left
     rimmed_oxide = _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0))
     surface = _mix(rimmed_oxide, paint, 0.85 * paint_left)
     pits = _step(_noise(grid, cells=(70, 70), seed=77), edge=0.5, soft=0.15)
@@ -556,7 +614,7 @@ def _bend_blades(
     return x, y
 
 
-@register_pattern(0.5, roughness=0.9, specular=0.1)
+@register_pattern(tile_size=0.5, roughness=0.9, specular=0.1)
 def grass(grid: Grid) -> Float64Array:
     """Paint bent blades of grass over each other, (SIDE, SIDE, 3) sRGB.
 
@@ -566,16 +624,18 @@ def grass(grid: Grid) -> Float64Array:
     generator = np.random.Generator(np.random.PCG64(81))
     n_blades = 2600
     root = generator.random((n_blades, 1, 1, 2))
+    # -pi / 2 is upwards, since y points down
     lean = generator.normal(-np.pi / 2, 0.55, (n_blades, 1, 1))
     bend = generator.normal(0.0, 0.9, (n_blades, 1, 1))
     length = generator.uniform(0.08, 0.17, (n_blades, 1, 1))
-    hue = generator.random((n_blades, 1, 1, 1)) ** 1.5
-    # of the samples of a blade: along it from 0 to 1, across it from -1 to 1
+    # from green to yellow; most blades are green
+    yellowness = generator.random((n_blades, 1, 1, 1)) ** 1.5
+    # positions of the samples: along a blade from 0 to 1, across it from -1 to 1
     along = np.linspace(0.0, 1.0, 64)[None, :, None]
     across = np.linspace(-1.0, 1.0, 5)[None, None, :]
     x, y = _bend_blades(root, lean, bend, length, along, across)
     brightness = 0.30 + 0.70 * along + 0.12 * across
-    blade_color = _color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue
+    blade_color = _color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * yellowness
     colors = np.broadcast_to(blade_color * brightness[..., None], (*x.shape, 3))
     return _draw_points(x.reshape(-1), y.reshape(-1), colors.reshape(-1, 3))
 
@@ -599,7 +659,7 @@ def _draw_points(
     return np.asarray(texels.reshape(TILE_SIDE, TILE_SIDE, 3))
 
 
-@register_pattern(0.5, roughness=0.85, specular=0.2)
+@register_pattern(tile_size=0.5, roughness=0.85, specular=0.2)
 def elephant(grid: Grid) -> Float64Array:
     """Paint an elephant's skin with folds, (SIDE, SIDE, 3) sRGB.
 
@@ -609,12 +669,15 @@ def elephant(grid: Grid) -> Float64Array:
         _warp_grid(grid, cells=3, amount=0.05, seed=91), cells=14, amount=0.012, seed=92
     )
     folds = np.zeros((TILE_SIDE, TILE_SIDE))
-    for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
-        points = _scatter_points(count, seed)
+    # A coarse and a fine net of folds. A fold is where the two nearest of some scattered
+    # points are at the same distance: at the borders of their cells.
+    for n_cells, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
+        points = _scatter_points(n_cells, seed)
         distance, _ = _find_nearest_points(warped, points)
-        # folds run where the two nearest points are equally far
-        folds += depth * np.exp(-(((distance[..., 1] - distance[..., 0]) / width) ** 2))
-    long_folds = np.abs(
+        border_distance = distance[..., 1] - distance[..., 0]
+        folds += depth * np.exp(-((border_distance / width) ** 2))
+    # long folds along x, where noise changes its sign
+    distance_from_zero = np.abs(
         _clouds(
             _warp_grid(grid, cells=5, amount=0.04, seed=95),
             cells=(3, 14),
@@ -622,7 +685,7 @@ def elephant(grid: Grid) -> Float64Array:
             seed=96,
         )
     )
-    folds += 0.55 * np.exp(-((long_folds / 0.035) ** 2))
+    folds += 0.55 * np.exp(-((distance_from_zero / 0.035) ** 2))
     tone = (
         0.55
         + 0.25 * _clouds(warped, cells=(3, 3), octaves=3, seed=97)
@@ -632,12 +695,13 @@ def elephant(grid: Grid) -> Float64Array:
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
 
 
-@register_pattern(0.5, roughness=0.32, metallic=1.0)
+@register_pattern(tile_size=0.5, roughness=0.32, metallic=1.0)
 def steel(grid: Grid) -> Float64Array:
-    """Paint brushed steel: scratches along x.
+    """Paint brushed steel with scratches along x, (SIDE, SIDE, 3) sRGB.
 
     Numbers are chosen by eye.
     """
+    # Noise with few cells along x and many along y looks like scratches along x.
     scratches = (
         _noise(grid, cells=(3, 240), seed=101)
         + 0.6 * _noise(grid, cells=(7, 120), seed=102)
@@ -668,8 +732,8 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
 
     Each texel is projected along the three axes into the pattern's tile, and the three
     colors are weighted by the normal ("triplanar" mapping; Geiss, GPU Gems 3, 2007,
-    section 1.5). So charts of the texture meet without a seam, and the pattern has the
-    same scale however the object was unwrapped. The tile is upright on upright walls.
+    section 1.5). So there are no seams between charts of the texture, and the pattern
+    has the same scale on all of them. The tile is upright on vertical walls.
 
     Args:
         mesh: mesh in its own coordinates, with the largest extent 1.
@@ -680,22 +744,23 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
         (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
     """
     positions, normals = _compute_texel_surface(mesh, side)
-    scale = TILE_SIDE / PATTERNS[name].size
+    texels_per_object_size = TILE_SIDE / PATTERNS[name].tile_size
     weights = np.abs(normals) ** BLEND_EXPONENT
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
-    # seen along each axis: the two others, of which the second points up in the tile
+    # For a projection along x, y and z: the axes that are to the right and upwards in the
+    # tile.
     for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
-        projected = look_up_texture(
-            make_tile(name), positions[..., right] * scale, -positions[..., up] * scale
-        )
+        column = positions[..., right] * texels_per_object_size
+        row = -positions[..., up] * texels_per_object_size  # rows go down
+        projected = look_up_texture(make_tile(name), column, row)
         texels += weights[..., axis : axis + 1] * projected
     return texels
 
 
 @lru_cache(maxsize=2)
 def _compute_texel_surface(mesh: Mesh, side: int) -> tuple[Float32Array, Float32Array]:
-    """Positions and normals (side, side, 3) behind the texels of a mesh."""
+    """Return the position and the normal (side, side, 3) of the texels of a mesh."""
     charts = rasterize_charts(mesh, side)
     return charts.compute_positions(), charts.compute_normals()
 
@@ -705,7 +770,7 @@ SURFACE_PARAMETERS = tuple(parameter.name for parameter in MATERIAL)
 
 
 class MaterialControl(Control):
-    """The object's gloss, metal, coat and tint, and which named material covers it."""
+    """The surface of the object: roughness, metal, coat, tint, or a named material."""
 
     kind = "material"
     targets_mesh = True
@@ -714,23 +779,29 @@ class MaterialControl(Control):
             "which",
             (OBJECT_SURFACE, *PATTERNS),
             OBJECT_SURFACE,
-            "The object's own surface, or a named material in its place.",
+            "The object's own surface, or a named material instead.",
             estimators=("differences",),
         ),
         *MATERIAL,
         *Parameter.colors(
-            "of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)
+            "of the tint, a factor on the colour; 1 has no effect.", (0.3, 1.0)
         ),
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Check that the mesh has a principled surface. Raises InputError."""
+        """Return the scene, after checking that the mesh has a principled surface.
+
+        A tint needs none, as it only changes the texture.
+
+        Raises:
+            InputError: the mesh has another surface of a Mitsuba scene.
+        """
         varies_surface = any(self._is_set(name) for name in SURFACE_PARAMETERS)
         has_mitsuba_surface = self.get_mesh(scene).surface is not None
         if has_mitsuba_surface and (varies_surface or self._may_change_material):
             raise InputError(
-                f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's "
-                "own; search red, green or blue, "
+                f"`controls` {self.name}: the {self.mesh} has another surface, from a "
+                "Mitsuba scene; search red, green or blue, "
                 "or its numbers by Mitsuba's names, "
                 f"mitsuba:{self.mesh}.bsdf.KEY=[low, high]"
             )
@@ -740,8 +811,8 @@ class MaterialControl(Control):
         """Return a parameter for the scene.
 
         The default of a surface parameter, such as the roughness, is that of the
-        material. If several materials may be chosen, it is that of the object's own
-        surface, or that of the first material if the own one is not among them.
+        object's own surface if it is among the allowed materials, or else that of the
+        first allowed material.
         """
         if parameter.name not in SURFACE_PARAMETERS:
             return parameter
@@ -766,6 +837,8 @@ class MaterialControl(Control):
     ) -> dict[str, Tensor]:
         """Return the numbers of the surface, and its tinted base color.
 
+        Only inputs that the control changes are returned.
+
         Args:
             values: values of the control by parameter; "which" is the index of the
                 material.
@@ -782,21 +855,30 @@ class MaterialControl(Control):
                 number = float(getattr(material, name))
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([number])
         if self._changes_color():
-            mesh = self.get_mesh(self.scene)
             tint = color.combine_channels(values)
-            # what the controls before made of the texture, which a pattern replaces
-            base = earlier_inputs.get(self._base_color)
-            if which != OBJECT_SURFACE:
-                base = _make_linear_covering(mesh.mesh, which)
-            elif base is None:
-                base = srgb_to_linear(torch.from_numpy(mesh.base_color.copy()))
+            base = self._compute_base_color(which, earlier_inputs)
             inputs[self._base_color] = tint * base.to(tint.device)
         return inputs
+
+    def _compute_base_color(
+        self, which: str, earlier_inputs: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Return the linear base color (h, w, 3) of a material, without the tint.
+
+        It is the pattern of a named material; or for the object's own surface, the
+        texture that an earlier control has set, or else that of the mesh.
+        """
+        mesh = self.get_mesh(self.scene)
+        if which != OBJECT_SURFACE:
+            return _make_linear_covering(mesh.mesh, which)
+        if self._base_color in earlier_inputs:
+            return earlier_inputs[self._base_color]
+        return srgb_to_linear(torch.from_numpy(mesh.base_color.copy()))
 
     def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the texture, where the control changes it."""
+        """Return the texture if the control changes it."""
         if not self._changes_color():
             return {}
         return {
@@ -807,6 +889,7 @@ class MaterialControl(Control):
 
     @property
     def _base_color(self) -> str:
+        """Name of the scene input for the texture."""
         return f"{self.mesh}.base_color"
 
     @property
@@ -819,9 +902,10 @@ class MaterialControl(Control):
         return self._material_names != (OBJECT_SURFACE,)
 
     def _is_set(self, name: str) -> bool:
-        """Return whether a parameter was set or is searched.
+        """Return whether the control sets a parameter.
 
-        Otherwise it is the named material's own.
+        It does if the user set the parameter, or if all parameters are searched.
+        Otherwise the parameter has the value of the material.
         """
         return name in self.specs or not self.has_requested_search
 

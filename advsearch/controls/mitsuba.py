@@ -1,9 +1,9 @@
-"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name, a key
-of `mitsuba.traverse`.
+"""The `mitsuba` control: any number or color of a scene by Mitsuba's name for it.
 
-The object under test is called `object` there. Of a colour, each channel is a number in
-the same range; `KEY.red` is one. Whether Mitsuba's derivative is right nobody knows
-beforehand: `advsearch check` compares it with differences.
+Names are keys of `mitsuba.traverse`; the object under test is called `object`. For a
+color, each channel is a parameter with the same range; `KEY.red` is a single channel.
+Mitsuba's derivative may be wrong for some of them: `advsearch check` compares it with
+finite differences.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from advsearch.extend import (
 
 
 class MitsubaControl(Control):
-    """Anything else in the scene: numbers and colours by Mitsuba's own names."""
+    """Any number or colour of the scene, by Mitsuba's name for it."""
 
     kind = "mitsuba"
-    parameters = ()
+    parameters = ()  # the settings name them, see `declare_parameters`
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
@@ -56,12 +56,14 @@ class MitsubaControl(Control):
             InputError: the scene has no such number; or it does not belong to the
                 object, and the surroundings are a photograph.
         """
-        others = [key for key in self._settings if not key.startswith("object.")]
-        if scene.backdrop_photograph is not None and others:
+        keys_outside_object = [
+            key for key in self._settings if not key.startswith("object.")
+        ]
+        if scene.backdrop_photograph is not None and keys_outside_object:
             raise InputError(
-                f"`controls` {self.name}:{others[0]} and "
+                f"`controls` {self.name}:{keys_outside_object[0]} and "
                 f"`backdrop={scene.backdrop_photograph.spec}` contradict each other: "
-                "the photograph shows what is not the object; leave one of the two out"
+                "everything but the object is the photograph; leave one of the two out"
             )
         return scene.with_part(
             parts.PluginNumbers(
@@ -78,16 +80,17 @@ class MitsubaControl(Control):
         A color has three parameters, one for each channel.
 
         Raises:
-            InputError: a color was given a list of values.
+            InputError: a color is set to a list of values.
         """
         for plugin_number in self._get_numbers():
-            color_spec = self.specs.get(plugin_number.key)
-            if isinstance(color_spec, OneOf) and len(plugin_number.values) > 1:
+            # the spec of a single number, or of all channels of a color
+            full_spec = self.specs.get(plugin_number.key)
+            is_color = len(plugin_number.values) > 1
+            if isinstance(full_spec, OneOf) and is_color:
                 raise InputError(
                     f"`controls` {self.name}:{plugin_number.key}: expected a range, "
-                    "because "
-                    "it is a colour; values one by one "
-                    "are for one channel, such as "
+                    "because it is a colour; only a channel can have a list of values, "
+                    "such as "
                     f"{self.name}:{plugin_number.key}.{color.CHANNELS[0]}"
                 )
             for parameter, value in zip(
@@ -95,7 +98,8 @@ class MitsubaControl(Control):
                 plugin_number.values,
                 strict=True,
             ):
-                spec = self.specs.get(parameter.name, color_spec or Fixed(value))
+                # The spec of a channel, such as KEY.red, takes precedence.
+                spec = self.specs.get(parameter.name, full_spec or Fixed(value))
                 yield replace(parameter, default=value), spec
 
     def scene_inputs(
@@ -124,25 +128,32 @@ class MitsubaControl(Control):
         )
 
 
-def _make_parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:
-    """Return the parameter of a number by Mitsuba's name for it."""
+def _make_parameter(
+    key: str, estimators: tuple[str, ...] = ("differences",)
+) -> Parameter:
+    """Return the parameter for a number of a scene.
+
+    Args:
+        key: Mitsuba's name for the number.
+        estimators: valid estimators of its derivative, the preferred one first.
+    """
     return Parameter(
-        key,
-        (),
-        "1",
-        -Parameter.MAX_VALUE,
-        Parameter.MAX_VALUE,
-        "the scene's own",
-        f"Mitsuba's {key}.",
-        estimators=valid,
+        name=key,
+        shape=(),
+        unit="1",
+        low=-Parameter.MAX_VALUE,
+        high=Parameter.MAX_VALUE,
+        default="the scene's own",  # in words, until the scene is known
+        description=f"Mitsuba's {key}.",
+        estimators=estimators,
     )
 
 
 def _make_channel_parameters(number: parts.PluginNumber) -> list[Parameter]:
-    """Return a parameter for each number."""
-    names = (
-        [f"{number.key}.{channel}" for channel in color.CHANNELS]
-        if len(number.values) > 1
-        else [number.key]
-    )
-    return [_make_parameter(name, number.valid) for name in names]
+    """Return a parameter for a number, or one for each channel of a color."""
+    is_color = len(number.values) > 1
+    names = [number.key]
+    if is_color:
+        names = [f"{number.key}.{channel}" for channel in color.CHANNELS]
+    estimators = number.valid
+    return [_make_parameter(name, estimators) for name in names]

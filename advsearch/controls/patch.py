@@ -1,19 +1,18 @@
-"""The `patch` control: a printed square stuck onto the object, whose pixels, place,
-size and turn may be searched.
+"""The `patch` control: a printed square that is stuck onto the object.
 
-After Brown et al. (2017, "Adversarial Patch", arXiv 1712.09665, section 2): the pixels
-are free, and what is around them stays. There the patch is pasted into pictures; here
-it lies on the surface, under the scene's light, and bends with it. It is part of the
-base colour, so that no outline moves and the adjoint is right.
+Its pixels, position, size and rotation can be searched. In Brown et al. (2017,
+"Adversarial Patch", arXiv 1712.09665, section 2) a patch is pasted into images. Here it
+lies on the surface, under the scene's light, and bends with it. It is part of the base
+color, so that no outline moves and the adjoint is right.
 
     base color = (1 - m) base color + m linear(pixels at (a, b))
     m = soft square in (a, b), on the front of the surface
 
-The patch's center is where a ray from outside towards the middle of the object meets
-the surface; (a, b) are coordinates in the tangent plane there, unrolled along the
-direction in which the surface bends (exact for cylinders and spheres; Schmidt et al.
-2006, "Interactive Decal Compositing with Discrete Exponential Maps"). Only texels that
-are connected with the center and face the same way are painted.
+A ray from outside towards the center of the object hits the surface at the center of the
+patch. (a, b) are coordinates in the tangent plane there, unrolled along the direction in
+which the surface bends (exact for cylinders and spheres; Schmidt et al. 2006,
+"Interactive Decal Compositing with Discrete Exponential Maps"). Only texels that are
+connected with the center and face the same side are painted.
 """
 
 from __future__ import annotations
@@ -47,22 +46,22 @@ from advsearch.extend import (
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
-# smallest and largest side of the base-colour map that is painted into, in texels
+# smallest and largest side of the base-color map that is painted, in texels
 MAP_SIDES = (512, 1024)
 PAINT_RADIUS = 0.75
-"""Radius around the center, in sides of the square, within which the surface is
-painted: the square's corners are at 0.7071.
+"""Radius around the patch's center within which texels are painted, in sides of the
+patch. Its corners are at 0.7071.
 """
-# cosines of the angle between a texel's normal and the patch's: none of the patch is
-# painted at the first, all of it at the second
+# A patch fades out where the surface turns away: its opacity is 0 where the cosine of the
+# angle between the normals of texel and patch is the first, and 1 where it is the second.
 FACING_COSINES = (0.1, 0.3)
 EDGE_TEXELS = 2.0  # width of the soft edge in texels
 
 
 class PatchControl(PictureControl):
-    """A printed square stuck onto the object: its pixels, place, size and turn.
+    """A printed square on the object: its pixels, position, size and rotation.
 
-    Numbers that are not set are fixed, and pixels are searched unless they are a grey
+    Numbers that are not set are fixed. Pixels are searched, unless they are set to a gray
     or an image file.
 
     Attributes:
@@ -79,7 +78,7 @@ class PatchControl(PictureControl):
             0.0,
             1.0,
             "the object's own texture underneath",
-            "Display-referred colours of the patch; a narrower range is a "
+            "Display-referred colours of the patch; a narrower range can stand for a "
             "printer's gamut.",
             search=(0.0, 1.0),
             estimators=("adjoint",),
@@ -101,9 +100,8 @@ class PatchControl(PictureControl):
             0.0,
             1.0,
             "towards the camera",
-            "Where it is from the middle of the underside (0) over the "
-            "sides (0.5) to the middle of the "
-            "top (1).",
+            "Height on the object, from the centre of the underside (0) over the "
+            "sides (0.5) to the centre of the top (1).",
         ),
         Parameter.number(
             Parameter.LIT,
@@ -122,7 +120,7 @@ class PatchControl(PictureControl):
             -180.0,
             180.0,
             0.0,
-            "Turn of the patch on the surface, counter-clockwise; upright at 0.",
+            "Rotation of the patch on the surface, counter-clockwise; upright at 0.",
             periodic=True,
         ),
     )
@@ -133,9 +131,8 @@ class PatchControl(PictureControl):
         Choice(
             "norm",
             "box",
-            "How far pixels may go: box (anywhere), linf (the default with an "
-            "epsilon) or l2 (a ball around what "
-            "is underneath).",
+            "Limit of the pixels: box (none), or the norm of a ball around the texture "
+            "underneath, linf (the default with an epsilon) or l2.",
             "norm",
             "pixels",
             options=NORMS,
@@ -143,7 +140,7 @@ class PatchControl(PictureControl):
         Choice(
             "epsilon",
             None,
-            "Radius of that ball, display-referred; by default 0.1 a pixel value.",
+            "Radius of that ball, display-referred; by default 0.1 for each pixel value.",
             "epsilon",
             "pixels",
             max_value=PictureControl.MAX_EPSILON,
@@ -151,7 +148,7 @@ class PatchControl(PictureControl):
         Choice(
             "picture",
             None,
-            "A picture file to stick on as it is; then pixels are not searched.",
+            "A picture file to use as the patch; pixels are not searched then.",
             fixes="pixels",
         ),
     )
@@ -176,11 +173,11 @@ class PatchControl(PictureControl):
             return
         fixing_setting = "pixels" if self.chosen["picture"] is None else "picture"
         for ball_setting in ("epsilon", "norm"):
-            # "box" is the norm of no ball
+            # None and the norm "box" mean that there is no ball.
             if self.chosen[ball_setting] not in (None, "box"):
                 raise InputError(
-                    f"{self.name}.{ball_setting}: is of the ball that searched pixels "
-                    "stay in, and these are fixed; leave it out, "
+                    f"{self.name}.{ball_setting}: limits searched pixels, and the "
+                    "pixels are fixed; leave it out, "
                     f"or leave out {self.name}.{fixing_setting}"
                 )
 
@@ -195,7 +192,7 @@ class PatchControl(PictureControl):
             return
         if self.chosen["picture"] is not None:
             raise InputError(
-                f"{self.name}.pixels: expected none beside "
+                f"{self.name}.pixels: expected none together with "
                 f"{self.name}.picture; leave one of them out"
             )
         # distributions are subclasses of Range
@@ -209,7 +206,11 @@ class PatchControl(PictureControl):
             )
 
     def check_choices(self) -> None:
-        """Let an epsilon without a norm mean the norm linf, and reject one with box."""
+        """Set the norm linf for an epsilon without a norm, and reject one with box.
+
+        Raises:
+            InputError: `epsilon` is set together with the norm "box".
+        """
         epsilon = self.chosen["epsilon"]
         if "norm" not in self._settings and epsilon is not None:
             self.chosen["norm"] = "linf"
@@ -238,8 +239,8 @@ class PatchControl(PictureControl):
         if not self.groups:
             raise InputError(
                 f"`controls` {self.name}: the pixels are fixed, so there is nothing to "
-                "search; give another parameter "
-                f"a range, such as {self.name}={{azimuth: [0, 360]}}"
+                "search; set a range for another parameter, "
+                f"such as {self.name}={{azimuth: [0, 360]}}"
             )
         side = self.sides[0]
         pixels = self.slots[0]  # the slots have the order of `parameters`
@@ -247,6 +248,7 @@ class PatchControl(PictureControl):
         self._picture = (
             None if picture is None else images.resize_to_square(picture, side)
         )
+        # `values` needs the picture, and the start of the pixels needs the painter.
         start_values = {
             name: float(value)
             for name, value in self.values(self.start).items()
@@ -271,17 +273,22 @@ class PatchControl(PictureControl):
         # (side, side, 3), as fractions of the range
         underneath = (self._painter.sample_underneath() - low) / (high - low)
         start = underneath.clamp(0.0, 1.0)
-        # the pixels' coordinates come first
-        self.start[: start.numel()] = start.reshape(-1)
+        # Pixels are the first parameter, so that their coordinates come first.
+        n_coordinates = start.numel()
+        self.start[:n_coordinates] = start.reshape(-1)
         if not torch.allclose(start, underneath, atol=1e-5):
+            # "the nearest from 0.2 to 0.8": values, in words
             self.record_adjusted_default(
-                parameter, "the texture underneath", f"the nearest {pixel_range}"
+                parameter,
+                scene_value="the texture underneath",
+                used_value=f"the nearest {pixel_range}",
             )
 
     def must_match_scene(
         self, parameter: Parameter, spec: Fixed | Range | OneOf
     ) -> bool:
-        # at the start searched pixels show no patch
+        # Searched pixels start as the texture underneath: then the patch is invisible,
+        # wherever it is.
         return not self.is_searched_image and parameter.name != "pixels"
 
     def scene_inputs(
@@ -322,14 +329,16 @@ def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     """
     center, radius, half_height = _measure_mesh(scene.object.mesh)
     camera = np.append(geometry.camera_to_world(scene)[:3, 3], 1.0)
-    # from the center to the camera, in the coordinates of the object
+    # The offset from the center to the camera, in the coordinates of the object: the
+    # solution is the camera's position there.
     x, y, z = np.linalg.solve(geometry.object_to_world(scene), camera)[:3] - center
-    # at least a tiny distance: a camera straight above is at height 1
+    # A limit above 0, so that the height of a camera straight above is 1.
     level_distance = max(math.hypot(x, y), 1e-12)
-    # The ellipsoid around the object is scaled to a sphere for the elevation.
-    elevation = math.atan2(z * radius, level_distance * half_height)
+    # latitude of the direction after the ellipsoid around the object, with a level radius
+    # and a half height, is scaled to a sphere
+    latitude = math.atan2(z * radius, level_distance * half_height)
     azimuth = math.degrees(math.atan2(y, x)) % 360.0
-    return azimuth, 0.5 + elevation / math.pi
+    return azimuth, 0.5 + latitude / math.pi
 
 
 def _compute_edge_opacity(on_patch: Tensor, size: Tensor, spacing: float) -> Tensor:
@@ -367,7 +376,7 @@ def _sample_pixels(pixels: Tensor, positions: Tensor) -> Tensor:
 def _measure_mesh(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float]:
     """Return the center (3,) of a mesh, its largest half-width and its half-height.
 
-    The sizes are above 0, also of a flat mesh.
+    Both sizes are positive, even for a flat mesh.
     """
     low = mesh.vertices.min(axis=0).astype(np.float64)
     high = mesh.vertices.max(axis=0).astype(np.float64)
@@ -380,11 +389,11 @@ class NearbyTexels:
     """The N texels near the center of a patch, which it may cover.
 
     Attributes:
-        indices: (N,) of the texels in the map, row by row.
-        coordinates: (N, 2) on the unrolled surface, to the right and upwards of the
-            patch's center before it is rotated, in object sizes.
-        opacity: (N,) of the patch there, 1 where the surface faces as the patch does
-            and 0 where it turns away.
+        indices: (N,) indices of the texels in the map, row by row.
+        coordinates: (N, 2) coordinates on the unrolled surface, to the right and upwards
+            of the patch's center before it is rotated, in object sizes.
+        opacity: (N,) opacity of the patch, 1 where the surface faces the same side as
+            the patch and 0 where it turns away.
         spacing: distance between neighbouring texels on the surface, object sizes.
     """
 
@@ -397,20 +406,20 @@ class NearbyTexels:
 class PatchPainter:
     """Paints a patch into the object's base-color map.
 
-    Arrays of texels have one row for each of the T texels that a face of the mesh
-    shows, in object coordinates.
+    Arrays of texels have one row for each of the T texels that lie on a face of the mesh.
+    Their positions and normals are in object coordinates.
 
     Attributes:
         _center_and_sizes: center (3,), largest half-width and half-height of the mesh.
         _start_values: azimuth, height, size and rotation of the patch at the start.
         _side: side of the patch, pixels.
-        _surface: the mesh, for rays and for what is connected.
+        _surface: the mesh, for ray casting and for connected regions.
         _object_color: (n, n, 3) the object's own base color, linear.
         _texels: (T,) indices of the texels in the map, row by row.
         _faces: (T,) face of each texel.
-        _positions: (T, 3) of texels on the surface.
-        _normals: (T, 3) of the surface there.
-        _areas: (T,) of texels on the surface.
+        _positions: (T, 3) positions of texels on the surface.
+        _normals: (T, 3) normals of the surface there.
+        _areas: (T,) areas of texels on the surface.
         _find_texels: `_find_nearby_texels`, cached by azimuth, height and size.
     """
 
@@ -430,9 +439,9 @@ class PatchPainter:
         mesh = scene.object.mesh
         if mesh.repeats:
             raise InputError(
-                "`controls` patch: the object's texture repeats on it, and so would a "
-                "patch that is painted into it; "
-                "leave patch out, or search the whole texture"
+                "`controls` patch: the object's texture repeats on its surface, and a "
+                "patch that is painted into it would repeat too; "
+                "leave patch out, or search the full texture"
             )
         self._center_and_sizes = _measure_mesh(mesh)
         self._start_values = start_values
@@ -441,15 +450,20 @@ class PatchPainter:
         object_color = color.srgb_to_linear(
             torch.from_numpy(scene.object.base_color.copy())
         )
-        pixel_size = start_values["size"] / side
-        charts = _rasterise_finely(mesh, max(object_color.shape[:2]), pixel_size)
-        self._object_color = _resize_to_square(object_color, len(charts.face))
-        is_used = charts.is_readable
-        self._texels = np.flatnonzero(is_used)
-        self._faces = charts.face[is_used]
-        self._positions = charts.compute_positions()[is_used].astype(np.float64)
-        self._normals = charts.compute_normals()[is_used].astype(np.float64)
-        self._areas = charts.compute_areas()[is_used].astype(np.float64)
+        # (n, n) faces, positions, normals and areas of the map's texels
+        charts = _rasterise_finely(
+            mesh,
+            texture_side=max(object_color.shape[:2]),
+            pixel_size=start_values["size"] / side,
+        )
+        map_side = len(charts.face)
+        self._object_color = _resize_to_square(object_color, map_side)
+        is_on_face = charts.is_readable
+        self._texels = np.flatnonzero(is_on_face)
+        self._faces = charts.face[is_on_face]
+        self._positions = charts.compute_positions()[is_on_face].astype(np.float64)
+        self._normals = charts.compute_normals()[is_on_face].astype(np.float64)
+        self._areas = charts.compute_areas()[is_on_face].astype(np.float64)
         # The patch often stays in the same position for many images.
         self._find_texels = lru_cache(maxsize=4)(self._find_nearby_texels)
 
@@ -458,7 +472,8 @@ class PatchPainter:
     ) -> Tensor:
         """Return the base color (n, n, 3), linear, with the patch on it.
 
-        Differentiable in the colors, not in the patch's position, size and rotation.
+        The result is differentiable in the colors, the size and the rotation, but not
+        in the position of the patch.
 
         Args:
             base: (h, w, 3) linear base color by earlier controls; None for the
@@ -496,8 +511,8 @@ class PatchPainter:
         position, size and rotation.
 
         Returns:
-            (n, n, 3) sRGB; a pixel that no texel lies in has the nearest texel's color,
-                and all are grey if no texel lies under the patch.
+            (n, n, 3) sRGB; a pixel that no texel lies in has the nearest texel's color.
+            All pixels are gray if no texel lies under the patch.
         """
         start = self._start_values
         side = self._side
@@ -509,7 +524,7 @@ class PatchPainter:
         if not bool(is_covered.any()):
             return torch.full((side, side, 3), 0.5)
         covered_colors = self._object_color.reshape(-1, 3)[texels.indices[is_covered]]
-        # columns go to the right like the first coordinate, rows down unlike the second
+        # Column and row in [0, 1]: the second coordinate points up, but rows go down.
         positions = on_patch[is_covered] * torch.tensor([1.0, -1.0]) + 0.5
         colors = _average_in_pixels(covered_colors, positions, side)
         return color.linear_to_srgb(colors).reshape(side, side, 3)
@@ -529,14 +544,16 @@ class PatchPainter:
         """
         center, radius, half_height = self._center_and_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
-        # certainly outside of the object
+        # far enough away to be outside of the object
         ray_origin = center + 4.0 * (radius + half_height) * outwards
         face, point = self._surface.find_hit(ray_origin, -outwards)
-        # A face may be seen from its back: then all normals are flipped.
+        # If the ray hits the back of a face, the patch is on the back of the surface,
+        # and normals are flipped.
         is_front = float(self._surface.normals[face] @ outwards) >= 0.0
         sign = 1.0 if is_front else -1.0
         normal = self._compute_mean_normal(face, point)
         frame = _make_frame(sign * normal, _upward_direction(azimuth, outwards))
+        # The third row of the frame is the flipped normal; the mesh needs its own one.
         rows = self._select_texels(face, point, sign * frame[2], PAINT_RADIUS * size)
 
         coordinates, cosine = unroll_surface(
@@ -554,9 +571,9 @@ class PatchPainter:
     ) -> assets.Float64Array:
         """Return the mean normal (3,) of the surface around a point of a face.
 
-        Weights decrease smoothly to 0 at a radius of half the patch's side at the
-        start; this does not change during a search. If no texel is near, the face's own
-        normal is returned.
+        Weights decrease smoothly to 0 at half the side that the patch has at the start.
+        This radius stays the same if a search changes the side. If no texel is near,
+        the normal of the face is returned.
 
         Args:
             face: index of the face.
@@ -564,8 +581,9 @@ class PatchPainter:
         """
         face_normal = self._surface.normals[face]
         radius = 0.5 * self._start_values["size"]
+        # a mask of the mesh's faces, and of the texels on them (T,)
         is_face_near = self._surface.find_region(face, point, face_normal, radius)
-        is_near = is_face_near[self._faces]  # (T,)
+        is_near = is_face_near[self._faces]
         squared_distance = ((self._positions[is_near] - point) ** 2).sum(axis=1)
         weight = np.maximum(1.0 - squared_distance / radius**2, 0.0) ** 2
         area_weight = weight * self._areas[is_near]
@@ -594,23 +612,26 @@ class PatchPainter:
             radius: largest distance from the point, object sizes.
         """
         is_face_near = self._surface.find_region(face, point, normal, radius)
-        # a texel belongs to a face
+        # rows of the texels on these faces
         connected = np.flatnonzero(is_face_near[self._faces])
         offsets = self._positions[connected] - point
         is_close = (offsets**2).sum(axis=1) <= radius**2
         return np.asarray(connected[is_close])
 
     def _measure_texel_spacing(self, rows: assets.IntArray) -> float:
-        """Return the median distance of neighbouring texels on the surface, in object
-        sizes.
+        """Return the median distance of neighboring texels on the surface.
 
-        Texels without an area do not count; if none has one, the distance is that in a
-        map which spans one object size.
+        It is in object sizes. Texels without an area do not count. If none has an area,
+        the distance is that in a map which spans one object size.
+
+        Args:
+            rows: (N,) rows of the texels in the painter's arrays.
         """
         areas = self._areas[rows]
         has_area = areas > 0.0
         if not has_area.any():
-            return 1.0 / len(self._object_color)
+            map_side = len(self._object_color)
+            return 1.0 / map_side
         return math.sqrt(float(np.median(areas[has_area])))
 
 
@@ -644,9 +665,15 @@ def _outward_direction(
 def _upward_direction(
     azimuth: float, outwards: assets.Float64Array
 ) -> assets.Float64Array:
-    """Return the unit vector (3,) across the outward direction that points most
-    upwards.
+    """Return the most upward unit vector (3,) at a right angle to a direction.
+
+    Args:
+        azimuth: azimuth of the direction, degrees. It is needed because it can't be
+            computed from a vertical direction.
+        outwards: (3,) the direction, a unit vector.
     """
+    # The direction is (cos(latitude) cos(azimuth), cos(latitude) sin(azimuth),
+    # sin(latitude)); the result is its derivative by the latitude.
     angle = math.radians(azimuth)
     level = math.hypot(outwards[0], outwards[1])
     return np.array(
@@ -655,8 +682,9 @@ def _upward_direction(
 
 
 def _fade_in(cosine: assets.Float64Array) -> Tensor:
-    """Return the opacity (N,) of a patch by the cosines (N,) of texels' normals with
-    its own.
+    """Return the opacity (N,) of a patch on texels that face towards it or away.
+
+    `cosine` (N,) is that of the angle between the normals of texel and patch.
     """
     low, high = FACING_COSINES
     return _smooth_step(
@@ -706,14 +734,14 @@ def unroll_surface(
     cosine = normals @ frame[2]
     sine = np.linalg.norm(tilt, axis=1)
     turn_direction = tilt / np.maximum(sine, 1e-9)[:, None]
-    # The cosine is limited, so that phi stays below 90 degrees: what is beyond is not
+    # The cosine is limited, so that phi stays below 90 degrees. Texels beyond are not
     # painted (`FACING_COSINES`). The stretch is 1 where the surface is flat.
     phi = np.arctan2(sine, np.maximum(cosine, 0.1))
     stretch = np.where(sine > 1e-4, phi / np.maximum(np.sin(phi), 1e-9), 1.0)
     along_turn = (in_plane * turn_direction).sum(axis=1)
-    # what the stretch adds to the component along the turn
-    added = ((stretch - 1.0) * along_turn)[:, None] * turn_direction
-    return in_plane + added, cosine
+    # by how much the stretch changes the component along the turn
+    extension = ((stretch - 1.0) * along_turn)[:, None] * turn_direction
+    return in_plane + extension, cosine
 
 
 def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
@@ -758,8 +786,8 @@ def _rasterise_finely(
 ) -> images.Charts:
     """Rasterise a mesh into a map whose texels are smaller than pixels of the patch.
 
-    The map starts with the texture's own size, at least the smallest of `MAP_SIDES`,
-    and is doubled as often as needed, as long as it stays within the largest.
+    The side of the map is that of the texture, but at least the smaller one of
+    `MAP_SIDES`. It is doubled as often as needed, up to the larger one of `MAP_SIDES`.
 
     Args:
         mesh: mesh of the object.
@@ -770,7 +798,7 @@ def _rasterise_finely(
     first_side = max(min_side, texture_side)
     charts = images.rasterize_charts(mesh, first_side)
     areas = charts.compute_areas()
-    # side of a usual texel of the first map, in object sizes
+    # side of a median texel of the first map, in object sizes
     spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
     map_side = first_side
     while 2 * map_side <= max_side and spacing * first_side / map_side > pixel_size:
@@ -785,5 +813,5 @@ def _smooth_step(value: Tensor) -> Tensor:
 
 
 def _resize_to_square(base: Tensor, side: int) -> Tensor:
-    """Resize a base colour (h, w, 3) to (side, side, 3); differentiable."""
+    """Resize a base color (h, w, 3) to (side, side, 3); differentiable."""
     return images.resized(base, side, side, antialias=max(base.shape[:2]) > side)

@@ -1,12 +1,11 @@
-"""The `pose` control: where the object or another mesh stands, how it is turned, and
-how large it is.
+"""The `pose` control: position, rotation and size of the object or another mesh.
 
-    world = scale * exp([rotation]) Rz(yaw) Ry(pitch) Rx(roll) (v - middle), then put on
+    world = scale * exp([rotation]) Rz(yaw) Ry(pitch) Rx(roll) (v - center), then put on
     the ground and shifted
 
-A mesh around the object is put back on the height at which it stood, and shifted from
-there. `rotation` is a rotation vector (axis times angle) on top of the angles, which
-lock at a pitch of 90 degrees.
+Another mesh than the object keeps the height of its lowest point. `rotation` is a rotation
+vector (axis times angle), which is applied after the angles. It has no gimbal lock, as
+the angles have at a pitch of 90 degrees.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from advsearch.scene.settings import POSE, Parameter
 
 
 class PoseControl(Control):
-    """Where the object stands, how it is turned, and how large it is."""
+    """Position, rotation and size of the object."""
 
     kind = "pose"
     targets_mesh = True
@@ -43,7 +42,7 @@ class PoseControl(Control):
             -180.0,
             180.0,
             0.0,
-            "Rotation vector on top of the angles.",
+            "Rotation vector that is applied after the angles.",
             moves_silhouettes=True,
             estimators=Parameter.GEOMETRIC,
         ),
@@ -53,8 +52,8 @@ class PoseControl(Control):
         Choice(
             "on_ground",
             "yes",
-            "yes: the lowest point stays at height z however it "
-            "turns; no: its middle stays.",
+            "yes: the lowest point stays at height z in any rotation; no: the centre "
+            "keeps its height.",
         ),
     )
 
@@ -75,51 +74,53 @@ class PoseControl(Control):
         """
         mesh = self.get_mesh(self.scene)
         device = values["scale"].device
-        base, vertices, floor = _get_base_pose(
-            mesh, self.scene.surrounding_meshes.get(mesh.name)
-        )
-        base = base.to(device)
+        # None for the object
+        surrounding_mesh = self.scene.surrounding_meshes.get(mesh.name)
+        base_pose, vertices, floor = _get_base_pose(mesh, surrounding_mesh)
+        base_pose = base_pose.to(device)
         vertices = vertices.to(device)
         center = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
         rotation = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
             values["yaw"], values["pitch"], values["roll"]
         )
         linear = values["scale"] * rotation
-        # height of the lowest point over the center, negative
+        # height of the lowest point relative to the center, so negative
         if self.chosen["on_ground"] in ("yes", True):
-            # that of the turned and scaled mesh: its lowest point is put on the floor
+            # of the turned and scaled mesh, so that its lowest point is on the floor
             lowest = ((vertices - center) @ linear[2]).amin()
         else:
-            # that of the mesh as it was: the center keeps its height
+            # of the mesh before, so that the center keeps its height
             lowest = floor - center[2]
         center_height = floor + values["z"] - lowest
-        # x and y are shifts of the center; its height is absolute.
+        # The new center: x and y are shifts, and the height is absolute.
         shift = torch.stack([values["x"], values["y"], center_height])
         level_center = torch.cat([center[:2], center.new_zeros(1)])
+        # The linear map turns about the origin, and moves the center to linear @ center.
         translation = shift - linear @ center + level_center
-        return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base}
+        return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base_pose}
 
 
 @lru_cache(maxsize=16)
 def _get_base_pose(
-    mesh: MeshPart, surrounding: MeshPart | None
+    mesh: MeshPart, surrounding_mesh: MeshPart | None
 ) -> tuple[Tensor, Tensor, float]:
-    """Return where a mesh is before it is posed.
+    """Return the pose of a mesh before the control moves it.
 
     Args:
         mesh: mesh that is posed.
-        surrounding: the mesh as the scene came with it; None for the object, whose own
-            coordinates are those of the scene.
+        surrounding_mesh: the mesh in the scene as it was described; None for the
+            object. The object's mesh is in the coordinates of the scene, and stands on
+            the height 0.
 
     Returns:
-        The pose (4, 4) from its own coordinates, its vertices (V, 3) in the scene, and
-        their lowest height.
+        The pose (4, 4) from the mesh's coordinates to the scene, its vertices (V, 3) in
+        the scene, and the height of the lowest one.
     """
-    if surrounding is None:
+    if surrounding_mesh is None:
         return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
-    positions = compute_base_vertices(surrounding)
+    positions = compute_base_vertices(surrounding_mesh)
     return (
-        torch.from_numpy(surrounding.to_world).float(),
+        torch.from_numpy(surrounding_mesh.to_world).float(),
         torch.from_numpy(positions).float(),
         float(positions[:, 2].min()),
     )

@@ -1,12 +1,13 @@
-"""What a parameter was set to: fixed, a range to search, or a list of values to choose
-from (docs/controls/README.md).
+"""Specs of parameters: a fixed value, a range to search, or a list of values.
+
+They are parsed from the settings of a control (docs/controls/README.md):
 
     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
 
-Two numbers in a list are a range; three or more, or names, are a choice. `{range: [low,
-high]}` and `{choices: [...]}` say which. Values that are drawn may have weights, or a
-distribution: u is the share of its probability, so that whatever draws u evenly (nets
-of points, banks of light transport) draws values as the distribution has them.
+Two numbers in a list are a range; three or more, or names, are a list of values. `{range:
+[low, high]}` and `{choices: [...]}` state which of both is meant. A list of values may
+have weights, and a parameter may have a distribution. A coordinate u is then a cumulative
+probability: if u is uniform, the values follow the distribution.
 """
 
 from __future__ import annotations
@@ -50,16 +51,16 @@ COMMON_DISTRIBUTIONS = (
     "gamma",
     "vonmises",
 )
-"""Names that a message tells."""
+"""Distributions that the message for an unknown one suggests."""
 
-TAIL_PROBABILITY = 1e-6  # probability of an endless tail that is left out
+TAIL_PROBABILITY = 1e-6  # probability that is cut off an infinite tail
 
-# probability outside of a parameter's bounds, where a distribution is cut off, at most
+# largest probability outside of a parameter's bounds, where a distribution is cut off
 MAX_OUTSIDE_PROBABILITY = 0.01
 
-N_CHECKED_QUANTILES = 257  # shares at which a function from Python is looked at
+N_CHECKED_QUANTILES = 257  # probabilities at which a function from Python is checked
 
-SLOPE_STEP = 1e-4  # half of the step over which the slope of a quantile is taken
+SLOPE_STEP = 1e-4  # half of the step of a finite difference of quantiles
 
 
 @dataclass(frozen=True)
@@ -121,14 +122,14 @@ class Range:
 
 @dataclass(frozen=True)
 class DistributionRange(Range):
-    """Values from `low` to `high` of a distribution, by their quantiles.
+    """Values from `low` to `high` that follow a distribution.
 
     Attributes:
         quantiles: inverse distribution function.
-        lower_probability: lower probability at the coordinate 0; above 0 if the
+        lower_probability: cumulative probability at the coordinate 0; above 0 if the
             distribution is cut off.
-        upper_probability: upper probability at the coordinate 1.
-        label: the distribution, for messages.
+        upper_probability: cumulative probability at the coordinate 1.
+        label: the distribution as messages write it, e.g. "norm(loc=20, scale=5)".
     """
 
     quantiles: Quantiles
@@ -142,7 +143,7 @@ class DistributionRange(Range):
         Args:
             u: coordinates of any shape. The result is differentiable in them; its
                 derivative is the slope of the quantiles, by finite differences.
-            log: has no effect; it is there because a plain range takes it.
+            log: has no effect; only for compatibility with `Range`.
         """
         values = self._compute_values(u.detach())
         if u.requires_grad:
@@ -168,7 +169,7 @@ class DistributionRange(Range):
 
         Args:
             value: value of the parameter.
-            log: has no effect; it is there because a plain range takes it.
+            log: has no effect; only for compatibility with `Range`.
         """
         lower = 0.0
         upper = 1.0
@@ -208,7 +209,7 @@ def list_set_names(settings: object, parameter: str) -> list[str]:
     """Return the names that the settings of a control allow for a parameter.
 
     A parameter may be set to a name, a list of names, or {"choices": [...]}. Values
-    that are no text are left out.
+    that are no strings are left out.
 
     Args:
         settings: settings of a control; if they are no mapping, the result is empty.
@@ -224,24 +225,26 @@ def list_set_names(settings: object, parameter: str) -> list[str]:
 
 
 def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
-    """Parse what a parameter was set to.
+    """Parse the setting of a parameter.
 
-    Two numbers in a list are a range; names, or another count of numbers, are a choice.
+    Two numbers in a list are a range; names, or three numbers or more, are a choice.
 
     Args:
-        label: how messages name it, e.g. "pose.yaw".
-        parameter: says what is allowed.
+        label: name of the parameter in messages, e.g. "pose.yaw".
+        parameter: states the allowed values.
         setting: a number or a name, [low, high], a list of values, {"range": [low,
             high]}, {"choices": [...]}, perhaps with "weights", or a distribution.
 
     Raises:
-        InputError: not such a form, or a value outside the parameter's range.
+        InputError: the setting has another form, or a value is outside of the
+            parameter's range.
     """
     if isinstance(setting, Mapping):
         if DISTRIBUTION in setting and not parameter.options:
             return parse_distribution(label, parameter, setting)
         is_range = set(setting) == {"range"} and _is_list(setting["range"])
         if not is_range or len(setting["range"]) != 2:
+            # choices, or an invalid mapping, for which this raises the error
             return _read_choices(label, parameter, setting)
         setting = setting["range"]
     if not _is_list(setting):
@@ -284,11 +287,13 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
 
     Args:
         where: name of the parameter, for messages.
-        parameter: states whether it is an angle or has a logarithmic scale.
+        parameter: states whether it is an angle, and whether it has a logarithmic
+            scale.
         low, high: bounds of the range.
 
     Raises:
-        InputError: they are equal or reversed, or not over 0 on a logarithmic scale.
+        InputError: the bounds are equal or reversed, or not positive on a logarithmic
+            scale.
     """
     if low == high:
         raise InputError(
@@ -297,6 +302,7 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
         )
     if low > high:
         remedy = f"write [{high:g}, {low:g}]"
+        # A wider range has no shorter form through 0.
         if parameter.periodic and low - high < FULL_TURN:
             remedy = _explain_turn(parameter, low, high)
         raise InputError(
@@ -312,26 +318,29 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
 def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
     """Return the end of a message on a reversed range of angles, such as [350, 10].
 
-    It may mean the 20 degrees through 0 or the 340 degrees between 10 and 350; the user
-    reads how to write both. The former is written as an ascending range, [-10, 10] or
-    [350, 370], within the parameter's bounds.
+    The user may have meant the 20 degrees through 0, or the 340 degrees between 10 and
+    350. The message explains how to write each as an ascending range: "write [-10, 10]
+    for the 20 degrees from 350 through 0 to 10, or [10, 350] for the other 340".
 
     Args:
         parameter: parameter that is an angle, in degrees.
-        low, high: bounds as the user wrote them; `low` is larger.
+        low: first bound as the user wrote it, which is the larger one.
+        high: second bound.
     """
-    # `low` is moved back by a turn, or if the bounds forbid it, `high` on by a turn.
+    # A full turn is subtracted from `low`; if that is below the parameter's bound, it
+    # is added to `high` instead.
     begin = low
     end = high + FULL_TURN
     if low - FULL_TURN >= parameter.low:
         begin = low - FULL_TURN
         end = high
-    # the multiple of a turn inside the range, by which messages name it
-    through = 0 if begin <= 0 else FULL_TURN
+    # the multiple of a full turn between both bounds
+    inner_turn = 0 if begin <= 0 else FULL_TURN
+    inner_width = FULL_TURN - low + high
     return (
-        f"write [{begin:g}, {end:g}] for the {FULL_TURN - low + high:g} "
+        f"write [{begin:g}, {end:g}] for the {inner_width:g} "
         f"degrees from {low:g} through "
-        f"{through:g} to {high:g}, or [{high:g}, {low:g}] "
+        f"{inner_turn:g} to {high:g}, or [{high:g}, {low:g}] "
         f"for the other {low - high:g}"
     )
 
@@ -340,7 +349,7 @@ def _make_choice(where: str, values: Sequence[ParameterValue]) -> OneOf:
     """Return a choice among values.
 
     Raises:
-        InputError: a value is there twice; it would be drawn twice as often.
+        InputError: a value is there twice, so that it would be selected twice as often.
     """
     repeated = [value for value, count in Counter(values).items() if count > 1]
     if repeated:
@@ -365,7 +374,8 @@ def _make_weighted_choice(
     Args:
         where: name of the parameter, for messages.
         values: the values.
-        weights: what the user set; should be one number of at least 0 for each value.
+        weights: value of the setting, which should be a number of at least 0 for each
+            of the values.
 
     Raises:
         InputError: weights are missing or invalid, or one is so small that its value
@@ -437,11 +447,11 @@ def _check_value(label: str, parameter: Parameter, value: object) -> ParameterVa
     Args:
         label: how messages name the parameter, e.g. "pose.yaw".
         parameter: states the options, or the bounds and the unit.
-        value: what the user set.
+        value: the value that the user set.
 
     Raises:
-        UnknownNameError: it is a name, but none of the options.
-        InputError: it is neither a name nor a number within the bounds.
+        UnknownNameError: the value is a name, but none of the options.
+        InputError: the value is neither a name nor a number within the bounds.
     """
     if parameter.options:
         if not isinstance(value, str):
@@ -477,7 +487,7 @@ def is_same_value(
 ) -> bool:
     """Return whether two values are the same, up to a rounding error.
 
-    Angles that turn are the same up to whole turns.
+    Angles that differ by full turns are the same.
     """
     if isinstance(first, str) or isinstance(second, str):
         return first == second
@@ -486,7 +496,7 @@ def is_same_value(
 
 
 def compute_difference(first: float, second: float, *, is_angle: bool = False) -> float:
-    """Return how far two numbers are from each other; angles the shorter way round."""
+    """Return the distance of two numbers; of angles, that in the shorter direction."""
     difference = first - second
     if is_angle:
         difference = math.remainder(difference, FULL_TURN)
@@ -521,11 +531,11 @@ def format_value(value: ParameterValue) -> str:
 
 @dataclass(frozen=True)
 class Slot:
-    """One parameter in a bound control.
+    """One parameter of a bound control, and the position of its coordinates.
 
     Attributes:
-        parameter: as the scene has it.
-        spec: what it is set to.
+        parameter: the parameter, with its default in the scene.
+        spec: its fixed value, range or list of values.
         offset: index of its first coordinate in the control's slice of u.
     """
 
@@ -535,7 +545,7 @@ class Slot:
 
     @property
     def n_values(self) -> int:
-        """How many numbers its value has."""
+        """Number of elements of the parameter's value."""
         return math.prod(side or 1 for side in self.parameter.shape)
 
     @property
@@ -549,13 +559,14 @@ class Slot:
 
     @property
     def is_angle(self) -> bool:
-        """Whether a whole turn changes nothing."""
+        """Whether the values are degrees, of which 0 and 360 are the same."""
         return self.parameter.periodic and self.parameter.unit == "degrees"
 
     @property
     def is_full_turn(self) -> bool:
-        """Whether the range is a whole turn."""
+        """Whether the range is a full turn, so that both its bounds are the same."""
         spec = self.spec
+        # A distribution (a subclass of Range) has other densities at both bounds.
         return (
             self.parameter.periodic
             and type(spec) is Range
@@ -610,14 +621,16 @@ def parse_distribution(
     `TAIL_PROBABILITY`, as the range needs finite bounds.
 
     Args:
-        label: how messages name the parameter.
-        parameter: parameter with the bounds.
-        setting: the setting, or a function that was passed from Python.
+        label: name of the parameter in messages.
+        parameter: states the bounds and the unit.
+        setting: the setting. It is a `PythonQuantiles` if the user passed a function in
+            Python.
 
     Raises:
-        InputError: the distribution has other parameters; it was a function that this
-            session does not have; or more of it than `MAX_OUTSIDE_PROBABILITY` lies
-            outside of the bounds.
+        InputError: the distribution has other parameters; the user passed a function,
+            but in another Python session (a stored setting has only its name); or a
+            larger probability than `MAX_OUTSIDE_PROBABILITY` lies outside of the
+            bounds.
         UnknownNameError: scipy has no distribution of that name.
     """
     if isinstance(setting, PythonQuantiles):
@@ -627,11 +640,13 @@ def parse_distribution(
         raise InputError(
             f"{label}: its values were drawn by {setting.get('name', 'a function')}, "
             "which only the Python session that "
-            "asked has; pass it again in the same call, with `resume=True` to go on"
+            "started the run has; pass it again in the same call, with `resume=True` "
+            "to continue"
         )
     arguments = {key: value for key, value in setting.items() if key != DISTRIBUTION}
     frozen, text = _freeze_distribution(label, name, arguments)
     with np.errstate(all="ignore"):  # far out in the tails, some formulas overflow
+        # continuous distributions only: a single value has the probability 0
         lower_probability = float(frozen.cdf(parameter.low))
         upper_probability = float(frozen.cdf(parameter.high))
         outside = lower_probability + float(frozen.sf(parameter.high))
@@ -653,7 +668,7 @@ def _make_outside_error(
     """Return the error for a distribution that exceeds its parameter's bounds too much.
 
     Args:
-        label: how messages name the parameter.
+        label: name of the parameter in messages.
         parameter: states the bounds and the unit.
         text: the distribution as messages write it, e.g. "norm(loc=20, scale=5)".
         outside: probability of values out of the bounds.
@@ -661,9 +676,9 @@ def _make_outside_error(
     return InputError(
         f"{label}: {100.0 * outside:.3g} % of {text} lies outside of "
         f"{parameter.low:g} to {parameter.high:g} "
-        f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % is "
+        f"({parameter.unit}), and at most {100.0 * MAX_OUTSIDE_PROBABILITY:g} % are "
         "cut off; "
-        "choose a narrower one, or cut it "
+        "choose a narrower distribution, or cut it off "
         "yourself (truncnorm)"
     )
 
@@ -711,29 +726,29 @@ def _freeze_distribution(
 
 
 def _format_arguments(arguments: Mapping[str, Any]) -> str:
-    """Return arguments as ``loc=0, scale=2``; what is no number is cut short."""
-    written = []
+    """Return arguments as "loc=0, scale=2"; values that are no numbers are shortened."""
+    formatted = []
     for key, value in arguments.items():
         is_number = Parameter.is_number(value)
-        written.append(f"{key}={value:g}" if is_number else f"{key}={value!r:.20}")
-    return ", ".join(written)
+        formatted.append(f"{key}={value:g}" if is_number else f"{key}={value!r:.20}")
+    return ", ".join(formatted)
 
 
 def _read_python_quantiles(
     label: str, parameter: Parameter, setting: PythonQuantiles
 ) -> DistributionRange:
-    """Return the range of a parameter whose values a Python function gives.
+    """Return the range of a parameter whose distribution is a Python function.
 
     The function is an inverse CDF, from a probability to a value. It is checked at
     `N_CHECKED_QUANTILES` probabilities.
 
     Args:
-        label: how messages name the parameter.
+        label: name of the parameter in messages.
         parameter: states the bounds and the unit.
         setting: has the function and its name.
 
     Raises:
-        InputError: its values leave the parameter's bounds, or fall.
+        InputError: values are outside of the parameter's bounds, or not ascending.
     """
     name = str(setting["name"])
 
@@ -761,13 +776,13 @@ def _check_quantiles(
     """Check the values (n,) of an inverse CDF at ascending probabilities.
 
     Args:
-        label: how messages name the parameter.
+        label: name of the parameter in messages.
         parameter: states the bounds and the unit.
         name: name of the function.
         values: (n,) its values.
 
     Raises:
-        InputError: values leave the parameter's bounds, or fall.
+        InputError: values are outside of the parameter's bounds, or not ascending.
     """
     is_inside = (values >= parameter.low) & (values <= parameter.high)
     if not is_inside.all():
@@ -780,27 +795,27 @@ def _check_quantiles(
     if falls.any():
         index = int(falls.argmax())
         raise InputError(
-            f"{label}: expected an inverse CDF, whose values rise with the share, got "
-            f"{values[index]:g} and then "
+            f"{label}: expected an inverse CDF, whose values rise with the "
+            f"probability, got {values[index]:g} and then "
             f"{values[index + 1]:g} of {name}"
         )
 
 
 def _make_range(
-    setting_name: str,
+    label: str,
     quantiles: Quantiles,
     lower_probability: float,
     upper_probability: float,
-    label: str,
+    distribution: str,
 ) -> DistributionRange:
-    """Return the range of a distribution between two probabilities.
+    """Return the range of a distribution between two cumulative probabilities.
 
     Args:
-        setting_name: name of the parameter, for messages.
+        label: name of the parameter in messages.
         quantiles: inverse CDF of the distribution.
-        lower_probability, upper_probability: probabilities below the smallest and the
-            largest value of the range.
-        label: the distribution as messages write it.
+        lower_probability: cumulative probability at the lower bound of the range.
+        upper_probability: cumulative probability at the upper bound of the range.
+        distribution: the distribution as messages write it.
 
     Raises:
         InputError: the range has a single value.
@@ -811,8 +826,9 @@ def _make_range(
     )
     if not low < high:
         raise InputError(
-            f"{setting_name}: {label} has only the value {low:g}; write that to fix it"
+            f"{label}: {distribution} has only the value {low:g}; write {low:g} to "
+            "fix it"
         )
     return DistributionRange(
-        low, high, quantiles, lower_probability, upper_probability, label
+        low, high, quantiles, lower_probability, upper_probability, distribution
     )

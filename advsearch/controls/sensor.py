@@ -1,8 +1,7 @@
-"""The `sensor` control: what a camera's sensor and its processing do to the finished
-picture.
+"""The `sensor` control: effects of a camera's sensor and its processing on the image.
 
-    vignetting  light / (1 + a r^2)^2, with r from the middle of the image, 1 in its
-                corners: cos^4 of the angle there
+    vignetting  light / (1 + a r^2)^2, where r is the distance from the center of the
+                image, 1 in its corners: cos^4 of the angle
     aberration  the red and the blue image are a little larger or smaller than the green
                 one (lateral)
     noise       light + sqrt(shot^2 light + read^2) n, with n standard normal, one draw
@@ -30,15 +29,15 @@ from torch import Tensor
 
 from advsearch.extend import Choice, Control, Parameter, Values, color, images
 
-_DARK = 1e-6  # keeps the slope of a square root finite in black
+_DARK = 1e-6  # keeps the derivative of a square root finite in black
 
 
 _image = partial(Parameter.number, ("image",))
 
 
 class SensorControl(Control):
-    """What a camera adds: noise, mosaic, white balance, chromatic aberration,
-    vignetting, JPEG.
+    """Effects of a camera: noise, mosaic, white balance, chromatic aberration,
+    vignetting and JPEG compression.
     """
 
     kind = "sensor"
@@ -49,7 +48,7 @@ class SensorControl(Control):
             0.0,
             0.95,
             0.0,
-            "Share of the light that is missing in the corners.",
+            "Fraction of the light that is missing in the corners.",
         ),
         _image(
             "aberration",
@@ -57,7 +56,8 @@ class SensorControl(Control):
             -0.02,
             0.02,
             0.0,
-            "How much larger the red picture is than the green one; blue smaller.",
+            "By which fraction the red picture is larger than the green one, and the "
+            "blue one smaller.",
             (-0.005, 0.005),
         ),
         _image(
@@ -66,8 +66,8 @@ class SensorControl(Control):
             0.0,
             0.5,
             0.0,
-            "Standard deviation of the noise in white that grows with the root of "
-            "light.",
+            "Standard deviation, in white, of the noise that grows with the square root "
+            "of the light.",
             (0.0, 0.1),
         ),
         _image(
@@ -76,7 +76,7 @@ class SensorControl(Control):
             0.0,
             0.2,
             0.0,
-            "Standard deviation of the noise that is there in the dark.",
+            "Standard deviation of the noise that does not depend on the light.",
             (0.0, 0.02),
         ),
         _image(
@@ -85,8 +85,7 @@ class SensorControl(Control):
             0.0,
             1.0,
             0.0,
-            "Share of the picture that goes through a Bayer mosaic; 1 is a real "
-            "camera.",
+            "Weight of the picture after a Bayer mosaic; 1 is a real camera.",
             (0.0, 1.0),
         ),
         _image(
@@ -95,7 +94,7 @@ class SensorControl(Control):
             -1.0,
             1.0,
             0.0,
-            "White balance: red is this much brighter.",
+            "White balance: gain of red.",
             (-0.5, 0.5),
         ),
         _image(
@@ -104,7 +103,7 @@ class SensorControl(Control):
             -1.0,
             1.0,
             0.0,
-            "White balance: blue is this much brighter.",
+            "White balance: gain of blue.",
             (-0.5, 0.5),
         ),
         Parameter.number(
@@ -114,7 +113,7 @@ class SensorControl(Control):
             0.0,
             95.0,
             0.0,
-            "0 is no file; above, a JPEG file of quality 100 less this.",
+            "0 is no compression; above 0, JPEG quality is 100 minus this.",
             (0.0, 60.0),
         ),
     )
@@ -122,7 +121,7 @@ class SensorControl(Control):
         Choice(
             "seed",
             0,
-            "Which draw of the noise: a whole number from 0.",
+            "Seed of the noise: a whole number from 0.",
             integer_bounds=(0, 2**32 - 1),
         ),
     )
@@ -132,16 +131,16 @@ class SensorControl(Control):
 
 
 def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> Tensor:
-    """Return a picture as a camera would have taken it.
+    """Return an image as a camera would have taken it.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
-        values: values of shape (), as in `SensorControl.parameters`.
-        seed: chooses the noise.
+        values: value () of each parameter in `SensorControl.parameters`, by name.
+        seed: seed of the noise.
 
     Returns:
-        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value but
-        `compression`, past which the derivative is that of the picture before it.
+        (H, W, 3) sRGB in [0, 1]; differentiable in the image and in every value but
+        `compression`. The derivative of the JPEG compression is taken as the identity.
     """
     height, width = image.shape[:2]
     light = color.srgb_to_linear(image) * compute_vignette(
@@ -152,17 +151,17 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     # The square root, shifted so that its derivative at 0 is finite; it is 0 there.
     std = torch.sqrt(variance + _DARK**2) - _DARK
     light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
-    # `mosaic` from 0 to 1: how much of the effect is mixed in
+    # `mosaic` is the weight of the image with the effect.
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
-    # white balance: red and blue in stops, green is the reference
+    # white balance: red and blue in stops, relative to green
     gains = torch.stack(
         [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
     )
     display = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
-    if not compression:
+    if compression == 0:
         return display
-    jpeg_quality = 100 - compression
+    jpeg_quality = 100 - compression  # 5 to 99
     return images.compress_jpeg(display, jpeg_quality).clamp(0.0, 1.0)
 
 

@@ -1,14 +1,14 @@
-"""The `shadow` control: a dark card between the strongest light and the object, out of
-the camera's sight.
+"""The `shadow` control: a dark card between the strongest light and the object.
 
 The card is a polygon around a center, in the plane at a right angle to the light:
 
-    center = middle of the object + distance towards the light + size (x, y)
+    center = center of the object + distance towards the light + (x, y)
     corner k = size radius_k at k / n turns
 
-It is a real card: how soft its shadow is follows from the light's size and its own
-distance. Where the camera would see it, it goes farther from the object, up to
-`MAX_DISTANCE_FACTOR` times as far; where that does not help it is put away.
+The card is part of the scene, so that the size of the light and the distance of the card
+determine how soft its shadow is. If the camera would see the card, it is moved farther
+from the object, up to `MAX_DISTANCE_FACTOR` times as far. If that is not enough, the card
+is hidden behind the camera.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from advsearch.extend import (
     parts,
 )
 
-MIN_SIZE = 0.01  # a smaller card is put away
+MIN_SIZE = 0.01  # a smaller card is hidden
 MAX_DISTANCE_FACTOR = 8.0
 N_DISTANCES = 12
-"""How many times as far it may be so that the camera does not see it, and in how many
-steps that is looked for.
+"""Largest factor of the requested distance with which the card is hidden from the camera,
+and number of distances that are tried.
 """
-MAX_LAMP_FRACTION = 0.7  # where it is at most on the way to a lamp
-# degrees above the ground that light counts from: lower, the card would stand on it
+MAX_LAMP_FRACTION = 0.7  # largest distance, as a fraction of that of the lamp
+# smallest elevation, in degrees, of light and card: a lower card would be in the ground
 MIN_ELEVATION = 5.0
 
 
@@ -49,11 +49,11 @@ _moving = partial(Parameter.moving, ("differences",))
 
 
 class ShadowControl(Control):
-    """A dark card that throws a shadow onto the object, out of the camera's sight."""
+    """A dark card that casts a shadow onto the object, outside of the picture."""
 
     kind = "shadow"
     strength_parameter = "size"
-    # none is changed; but it comes after whatever moves the camera
+    # They are only read: so the control is evaluated after those that move the camera.
     refines = frozenset(geometry.OCCLUDER_INPUTS)
     parameters = (
         _moving(
@@ -80,7 +80,7 @@ class ShadowControl(Control):
             0.0,
             10.0,
             0.0,
-            "Radius of the card; at 0 there is none.",
+            "Radius of the card; at 0 there is no card.",
             (0.0, 0.6),
         ),
         _moving(
@@ -89,7 +89,7 @@ class ShadowControl(Control):
             -3600.0,
             3600.0,
             0.0,
-            "Turn of the card, counter-clockwise.",
+            "Rotation of the card, counter-clockwise.",
             (0.0, 360.0),
             periodic=True,
         ),
@@ -100,7 +100,7 @@ class ShadowControl(Control):
             0.05,
             1.0,
             1.0,
-            "Radius at each corner, as a share of the size.",
+            "Radius at each corner, as a fraction of the size.",
             moves_silhouettes=True,
             search=(0.2, 1.0),
         ),
@@ -127,12 +127,14 @@ class ShadowControl(Control):
             0.1,
             1000.0,
             2.0,
-            "From the object's middle to the card; farther where the camera would "
-            "see it.",
+            "Distance from the object's centre to the card; larger if the camera would "
+            "see the card.",
             log=True,
         ),
     )
-    choices = (Choice("corners", 6, "Corners of the card.", integer_bounds=(3, 64)),)
+    choices = (
+        Choice("corners", 6, "Number of corners of the card.", integer_bounds=(3, 64)),
+    )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with the card, out of sight; `scene_inputs` moves it."""
@@ -190,10 +192,10 @@ class ShadowControl(Control):
                 geometry.get_camera_pose(self.scene, earlier_inputs).to(radii)
             )
         else:
-            pose = self._pose(values, distance)
+            pose = self._compute_pose(values, distance)
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
 
-    def _pose(self, values: Values, distance: float) -> Tensor:
+    def _compute_pose(self, values: Values, distance: float) -> Tensor:
         """Return the card's pose (4, 4) at a distance from the object's center.
 
         The card faces the object. It is shifted by x and y in its plane, and turned
@@ -203,23 +205,24 @@ class ShadowControl(Control):
             values: values of the control by parameter.
             distance: distance in object sizes.
         """
-        right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
+        axes = torch.from_numpy(self._compute_axes(values)).to(values["x"])
+        right, up, outwards = axes
         turn = torch.deg2rad(values["turn"])
         size = values["size"].clamp_min(MIN_SIZE)
         first_axis = torch.cos(turn) * right + torch.sin(turn) * up
         second_axis = torch.cos(turn) * up - torch.sin(turn) * right
-        middle = torch.from_numpy(geometry.compute_center(self.scene)).to(right)
-        center = middle + distance * outwards
+        object_center = torch.from_numpy(geometry.compute_center(self.scene)).to(right)
+        center = object_center + distance * outwards
         center = center + values["x"] * right + values["y"] * up
-        # two signs change, so that the frame stays right-handed and the card faces
-        # inwards
-        axes = torch.stack([first_axis, -second_axis, -outwards], dim=1)
-        return geometry.make_affine(size * axes, center)
+        # The card's third axis, its normal, points to the object. So the second axis
+        # changes its sign too: otherwise the pose would be a reflection.
+        card_axes = torch.stack([first_axis, -second_axis, -outwards], dim=1)
+        return geometry.make_affine(size * card_axes, center)
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return the distance at which the card really is."""
+        """Return the actual distance of the card, which may be larger than requested."""
         distance = self._find_distance(values, earlier_inputs)
         return {
             "true_distance": Value(
@@ -228,8 +231,12 @@ class ShadowControl(Control):
             )
         }
 
-    def _axes(self, values: Values) -> assets.Float64Array:
-        """Rows: to the right and upwards as seen from the light, and towards it."""
+    def _compute_axes(self, values: Values) -> assets.Float64Array:
+        """Return the axes (3, 3) of a viewer at the light who looks at the object.
+
+        Rows are right and up, as that viewer sees them, and the direction from the
+        object to the light.
+        """
         left, up, outwards = geometry.compute_camera_axes(
             float(values["azimuth"].detach()), float(values["elevation"].detach()), 0.0
         )
@@ -240,23 +247,24 @@ class ShadowControl(Control):
     ) -> float | None:
         """Find the smallest distance at which the camera does not see the card.
 
-        It is at least the requested one, and the card stays nearer than the lamp. The
-        camera does not see the card if a ball around it is outside of the cone through
-        the corners of the image.
+        It is at least the requested one, unless that is beyond the largest distance
+        (`_compute_max_distance`). The camera does not see the card if a ball around it,
+        whose radius is the card's size, is outside of the cone through the corners of
+        the image.
 
         Args:
             values: values of the control by parameter.
             earlier_inputs: inputs of earlier controls, which may move the camera.
 
         Returns:
-            The distance in object sizes; None if the card has no size, or is visible at
-            all distances.
+            The distance in object sizes; None if the card has to be hidden, because it
+            has no size or is visible at all distances.
         """
         size = float(values["size"].detach())
         requested = float(values["distance"].detach())
         if size < MIN_SIZE:
             return None
-        right, up, outwards = self._axes(values)
+        right, up, outwards = self._compute_axes(values)
         offset = float(values["x"].detach()) * right + float(values["y"].detach()) * up
         camera = (
             geometry.get_camera_pose(self.scene, earlier_inputs)
@@ -265,14 +273,15 @@ class ShadowControl(Control):
             .cpu()
             .numpy()
         )
-        cone_angle = self._image_cone_angle(earlier_inputs)
+        cone_angle = self._compute_image_cone_angle(earlier_inputs)
         max_distance = self._compute_max_distance()
         for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
+            # Beyond the largest distance all factors give the same one.
             distance = min(requested * factor, max_distance)
             card = geometry.compute_center(self.scene) + distance * outwards + offset
-            # into the camera's axes, the columns of its pose
+            # components along the camera's axes, the columns of its pose
             in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
-            if _is_outside_cone(in_camera, size, cone_angle):
+            if _is_outside_cone(in_camera, radius=size, angle=cone_angle):
                 return float(distance)
         return None
 
@@ -281,23 +290,31 @@ class ShadowControl(Control):
         _, lamp_distance = find_strongest_light(self.scene)
         return MAX_LAMP_FRACTION * lamp_distance
 
-    def _image_cone_angle(self, earlier_inputs: Mapping[str, Tensor]) -> float:
-        """Return the angle of the image's corners from the camera's axis, radians."""
+    def _compute_image_cone_angle(self, earlier_inputs: Mapping[str, Tensor]) -> float:
+        """Return the angle of the image's corners from the camera's axis, radians.
+
+        With a camera model, it is that of the visible rectangle, with a margin. With a
+        shift it is an upper bound.
+        """
         model = self.scene.camera_model
         aspect = self.scene.aspect
-        fov = earlier_inputs.get("camera.fov")
+        fov_input = earlier_inputs.get("camera.fov")
         if model is not None:
-            widest = 2.0 * math.atan(math.hypot(*model.visible_tangents))
-        elif fov is not None:
-            widest = math.radians(float(fov.detach()))
+            # The angle between opposite corners, which is larger than that of the longer
+            # side.
+            fov = 2.0 * math.atan(math.hypot(*model.visible_tangents))
+        elif fov_input is not None:
+            fov = math.radians(float(fov_input.detach()))
         else:
-            widest = math.radians(self.scene.get_number("camera.fov"))
-        # 3.0 radians (172 degrees) at most, as the tangent is infinite at 180 degrees
-        half_tangent = math.tan(min(widest, 3.0) / 2.0)
-        corner = math.atan(half_tangent * math.hypot(1.0, min(aspect, 1.0 / aspect)))
+            fov = math.radians(self.scene.get_number("camera.fov"))
+        # The field of view is along the longer side. At most 3.0 radians (172 degrees),
+        # as the tangent is infinite at 180 degrees.
+        half_tangent = math.tan(min(fov, 3.0) / 2.0)
+        shorter_over_longer = min(aspect, 1.0 / aspect)
+        corner = math.atan(half_tangent * math.hypot(1.0, shorter_over_longer))
         shift = earlier_inputs.get("camera.shift")
         if shift is not None:
-            # a generous bound on the angle by which a shift moves the corners
+            # A shift is in image sizes; two radians for each are more than enough.
             corner += 2.0 * float(shift.detach().abs().max())
         return corner
 
@@ -329,6 +346,8 @@ def find_strongest_light(scene: SceneDescription) -> tuple[assets.Float64Array, 
     strongest_direction = np.array([0.0, 0.0, 1.0])
     strongest_distance = math.inf
     max_irradiance = 0.0
+    # `power` (N, 3) is the radiance of each part of the environment times its solid
+    # angle: the irradiance on a surface that faces it.
     directions, _, power = scene.list_environment_light()
     is_above = directions[:, 2] >= math.sin(math.radians(MIN_ELEVATION))
     if is_above.any():

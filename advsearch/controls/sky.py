@@ -1,17 +1,17 @@
-"""The `sky` control: a clear sky with a sun instead of the environment; where the sun
-stands and how hazy the air is.
+"""The `sky` control: a clear sky with a sun replaces the environment.
 
 The map is a differentiable function in torch: the dome of Hosek and Wilkie (2012, An
-Analytic Model for Full Spectral Sky-Dome Radiance, equation 8), their sun of 2013
+Analytic Model for Full Spectral Sky-Dome Radiance, equation 8) and their sun of 2013
 (Adding a Solar Radiance Function to the Hosek Skylight Model), with the coefficients of
-Mitsuba's `sunsky` plugin. Unlike there, the sun is wider (`SUN_RADIUS`), so that a map
-can hold it, negative radiance is cut off, below is a diffuse ground, and a moving sun
-has a derivative. By default each is metered,
+Mitsuba's `sunsky` plugin. Unlike in that plugin, the sun is wider (`SUN_RADIUS`), so that
+texels of a map can show it; negative radiance is set to 0; the lower half is a diffuse
+ground; and the derivative by the sun's position is defined. By default each map is
+metered,
 
     radiance = map(azimuth, elevation, turbidity) M / m(azimuth, elevation, turbidity),
 
-with m the map's irradiance towards the sun. With `exposure: fixed` the divisor is that
-of the start.
+where m is the irradiance of the map on a surface that faces the sun. With `exposure:
+fixed` the divisor is that of the start.
 """
 
 from __future__ import annotations
@@ -36,25 +36,26 @@ from advsearch.extend import (
     mitsuba_data,
 )
 
-MAP_ROWS = 256  # size of the map
+MAP_ROWS = 256  # size of the map; even, so that half of the rows are above the horizon
 MAP_COLUMNS = 512
 # radius of the sun in the map, radians; half of its light comes from within 0.7 degrees
 SUN_RADIUS = math.radians(1.5)
-# radius of the real sun, radians: the one that the coefficients are made for
+# radius of the real sun, radians, to which the coefficients refer
 REAL_SUN_RADIUS = math.radians(0.5358 / 2.0)
 SUN_UNIT_FACTOR = 467.069280386
 """Factor from the unit of the sun's coefficients to that of the sky's, as in Mitsuba's
 plugin.
 """
-SUN_PIECES = 45  # pieces of the sun's model, by its elevation
-TURBIDITIES = (1.0, 10.0)  # what the coefficients cover
+SUN_PIECES = 45  # number of intervals of elevation, each with its own polynomials
+TURBIDITIES = (1.0, 10.0)  # range of the coefficients
 EPSILON = 1e-12
 
 
 @cache
 def load_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the tables that the two models interpolate, see `read_sunsky_tables`.
+    """Return the tables of the sky's and the sun's model, see `read_sunsky_tables`.
 
+    They are the shape of the dome's radiance, its mean level, and the sun's radiance.
     They are read once per process and device.
     """
     radiance, level, sun = mitsuba_data.read_sunsky_tables()
@@ -112,10 +113,11 @@ def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     """Return the sun's irradiance (3,) on a surface that faces it.
 
     Its unit is that of the sky's radiance times steradian. The range of elevations is
-    divided in `SUN_PIECES` pieces, evenly in the cube root of the elevation. In a piece
-    the radiance is a cubic in the elevation above the lower bound of the piece. There
-    is a cubic for each of 6 powers of cos(psi), which describe how the sun's disk
-    darkens towards its limb.
+    divided into `SUN_PIECES` pieces, evenly in the cube root of the elevation. In each
+    piece the radiance is a cubic polynomial in the elevation above the lower bound of
+    the piece. There is a polynomial for each of 6 powers of cos(psi), where psi is the
+    angle between the sun's surface and the line of sight: they describe how the sun's
+    disk darkens towards its edge.
 
     Args:
         elevation: () elevation of the sun, degrees.
@@ -124,12 +126,14 @@ def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     radians = torch.deg2rad(elevation)
     fraction = float(radians.detach()) / (math.pi / 2.0)
     piece = min(SUN_PIECES - 1, int(SUN_PIECES * max(0.0, fraction) ** (1.0 / 3.0)))
-    above = radians - (math.pi / 2.0) * (piece / SUN_PIECES) ** 3
+    lower_bound = (math.pi / 2.0) * (piece / SUN_PIECES) ** 3
+    above = radians - lower_bound
     _, _, sun_table = load_tables(radians.device)
     # (channel, power of the elevation, power of cos(psi))
     terms = _at_turbidity(sun_table, turbidity)[piece]
     elevation_powers = torch.stack([above**power for power in range(4)])
-    # the means of the powers of cos(psi) over the disk
+    # Means of the powers of cos(psi) over the disk: at the distance r from its center,
+    # cos(psi) is sqrt(1 - r^2), and the mean of (1 - r^2)^(p / 2) is 2 / (p + 2).
     limb_means = torch.tensor(
         [2.0 / (power + 2.0) for power in range(6)], device=radians.device
     )
@@ -139,22 +143,25 @@ def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
 
 
 class Sky:
-    """Sky maps over one ground, after Hosek and Wilkie. Its device is the maps'.
+    """Computes sky maps over a ground, after Hosek and Wilkie.
+
+    Maps are on the device of the ground's reflectance.
 
     Attributes:
-        ground: linear reflectance (3,) in [0, 1].
+        ground: (3,) linear reflectance of the ground, in [0, 1].
         directions: (H, W, 3) unit vectors towards the texels above the horizon.
-        cosines: (H, W, 1) of their angles from the zenith.
-        solid_angles: (H, 1 or W, 1) of the texels.
+        cosines: (H, W, 1) cosines of their angles from the zenith.
+        solid_angles: (H, W, 1) solid angles of the texels.
     """
 
     def __init__(self, ground: Tensor) -> None:
         """Compute the directions and solid angles of the texels above the horizon.
 
         Args:
-            ground: (3,) albedo of the ground, in [0, 1].
+            ground: (3,) linear reflectance of the ground, in [0, 1].
         """
-        # Row 0 of the map is straight up. Only the upper half is above the horizon.
+        # Row 0 of the map is straight up, and its last row straight down. Only the upper
+        # half is above the horizon. Columns are at the centers of texels.
         self.ground = ground
         n_upper_rows = MAP_ROWS // 2
         row = torch.arange(n_upper_rows, device=ground.device)
@@ -167,7 +174,7 @@ class Sky:
         )
         # (H, W) each, of the texels
         elevations, azimuths = torch.meshgrid(elevation, azimuth, indexing="ij")
-        # stored texel by texel, and not as one row that is repeated
+        # `meshgrid` returns a view that repeats one row; the sum is a dense tensor.
         dense_azimuths = elevations * 0.0 + azimuths
         directions = compute_direction(dense_azimuths, elevations)  # (3, H, W)
         self.directions = directions.permute(1, 2, 0).contiguous()
@@ -185,32 +192,33 @@ class Sky:
             turbidity: () turbidity in `TURBIDITIES`.
 
         Returns:
-            (H, W, 3) by the formula of Hosek and Wilkie 2012. The letters are its
-            coefficients, in the order of its tables.
+            (H, W, 3) by equation 8 of Hosek and Wilkie 2012. The letters are its
+            coefficients; `level` is the mean radiance.
         """
         coefficient_table, level_table, _ = load_tables(sun.device)
-        a, b, c, d, e, f, g, i, h = self._interpolated(
+        # The tables have I before H.
+        a, b, c, d, e, f, g, i, h = self._interpolate(
             coefficient_table, elevation, turbidity
         ).unbind(-1)
-        level = self._interpolated(level_table, elevation, turbidity)
-        # cosine of the angle between direction and sun; `self.cosines` are those of the
-        # angle between direction and zenith
+        level = self._interpolate(level_table, elevation, turbidity)
+        # Angles of a direction: `cosine` and `angle` are from the sun, `self.cosines`
+        # from the zenith. 0.01 avoids a division by 0 at the horizon.
         cosine = (self.directions @ sun)[..., None]
         angle = compute_angles(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
         glow = (1.0 + cosine**2) / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(
             1.5
         )
-        rest = (
+        around_sun = (
             c
             + d * torch.exp(e * angle)
             + f * cosine**2
             + g * glow
             + i * self.cosines.sqrt()
         )
-        return (horizon * rest * level).clamp_min(0.0)
+        return (horizon * around_sun * level).clamp_min(0.0)
 
-    def _interpolated(
+    def _interpolate(
         self, table: Tensor, elevation: Tensor, turbidity: Tensor
     ) -> Tensor:
         """Interpolate a table in turbidity, elevation and ground albedo.
@@ -243,13 +251,14 @@ class Sky:
         """Return the sun's shape (ROWS / 2, COLUMNS, 1), with an integral of 1 over
         solid angle.
 
-        Inside its radius it is (1 - r^2)^2. The derivative of that vanishes at the
-        edge, so that an adjoint which samples by radiance sees the sun's whole motion.
+        It is (1 - r^2)^2, where r is the distance from the sun's center in radii, and 0
+        outside. At the edge its value and its derivative are 0. So all texels whose
+        radiance changes when the sun moves have some radiance, and an adjoint that
+        samples texels by their radiance misses none of them.
         """
-        distance = (self.directions - sun).square().sum(
-            -1, keepdim=True
-        ) / SUN_RADIUS**2
-        bump = (1.0 - distance).clamp_min(0.0).square()
+        squared_distance = (self.directions - sun).square().sum(-1, keepdim=True)
+        squared_radii = squared_distance / SUN_RADIUS**2
+        bump = (1.0 - squared_radii).clamp_min(0.0).square()
         return bump / (bump * self.solid_angles).sum().clamp_min(EPSILON)
 
     def __call__(
@@ -267,17 +276,19 @@ class Sky:
             faces the sun, as the mean of the channels.
         """
         sun = compute_direction(azimuth, elevation)
-        upper = self.compute_dome(sun, elevation, turbidity) + self.compute_disk(
-            sun
-        ) * compute_sun_irradiance(elevation, turbidity)
-        arriving = upper * self.solid_angles
-        ground_irradiance = (arriving * self.cosines).sum((0, 1))
-        # a diffuse ground, whose radiance is the same in all directions
+        dome = self.compute_dome(sun, elevation, turbidity)
+        sun_irradiance = compute_sun_irradiance(elevation, turbidity)
+        upper = dome + self.compute_disk(sun) * sun_irradiance
+        # (H, W, 3) irradiance by each texel on a surface that faces it
+        texel_irradiance = upper * self.solid_angles
+        ground_irradiance = (texel_irradiance * self.cosines).sum((0, 1))
+        # The ground is diffuse: its radiance is the same in all directions.
         lower = (self.ground * ground_irradiance / math.pi).expand(
             MAP_ROWS - MAP_ROWS // 2, MAP_COLUMNS, 3
         )
+        # cosines for a surface that faces the sun
         facing = (self.directions @ sun).clamp_min(0.0)[..., None]
-        return torch.cat([upper, lower]), (arriving * facing).sum() / 3.0
+        return torch.cat([upper, lower]), (texel_irradiance * facing).sum() / 3.0
 
 
 def compute_angles(directions: Tensor, reference: Tensor) -> Tensor:
@@ -291,14 +302,12 @@ def compute_angles(directions: Tensor, reference: Tensor) -> Tensor:
 
 
 METERED_IRRADIANCE = 0.9 * math.pi / 0.8
-"""`M`: the irradiance on what faces the sun, the same for every sky that is metered."""
+"""`M`: irradiance on a surface that faces the sun, in each metered sky."""
 _by_differences = partial(Parameter.number, ("differences",))
 
 
 class SkyControl(Control):
-    """A clear sky instead of the environment: where the sun stands, and how hazy the
-    air is.
-    """
+    """A clear sky instead of the environment: position of the sun, and turbidity."""
 
     kind = "sky"
     photograph_refusal = "the photograph was taken in one light, and shows its own sky"
@@ -328,8 +337,7 @@ class SkyControl(Control):
             "1",
             *TURBIDITIES,
             3.0,
-            "How much the air scatters: 2 is very clear, 3 clear, 6 warm "
-            "and moist, 10 hazy.",
+            "Haziness of the air: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.",
             (2.0, 8.0),
         ),
     )
@@ -337,14 +345,14 @@ class SkyControl(Control):
         Choice(
             "exposure",
             "metered",
-            "metered (each sky anew, as an automatic camera does) or fixed "
-            "(at the start).",
+            "metered (for each sky, as by a camera with automatic exposure) or fixed "
+            "(at that of the start).",
             options=("metered", "fixed"),
         ),
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Give the scene the sky at the control's start as its environment."""
+        """Return the scene with the sky at the control's start as its environment."""
         bound = self.bind(scene)
         radiance = (
             bound.compute_radiance(bound.values(bound.start)).numpy().astype(np.float32)
@@ -355,14 +363,12 @@ class SkyControl(Control):
         )
 
     def fit(self) -> None:
-        """Fit the parameters, and store the irradiance towards the sun of the starting
-        sky.
-        """
+        """Fit the parameters, and compute the irradiance towards the sun at the start."""
         super().fit()
         start = self.values(self.start)
         sky = make_sky(self.scene.ground_color, torch.device("cpu"))
-        azimuth = torch.tensor(0.0)  # it does not matter
-        _, self._metered = sky(azimuth, start["elevation"], start["turbidity"])
+        azimuth = torch.tensor(0.0)  # has no effect on the irradiance
+        _, self._start_irradiance = sky(azimuth, start["elevation"], start["turbidity"])
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -372,24 +378,19 @@ class SkyControl(Control):
     def compute_radiance(self, values: Values) -> Tensor:
         """Return the map (H, W, 3) of linear radiance, differentiable in the values.
 
-        The map is scaled as a camera would expose it: to a given irradiance towards the
-        sun. With the choice `exposure=fixed` the factor is that of the clean sky.
+        The map is scaled as a camera would expose it: so that the irradiance towards the
+        sun is `METERED_IRRADIANCE`. With the choice `exposure=fixed` the scale is that
+        of the sky at the start.
         """
-        arguments = values["azimuth"], values["elevation"], values["turbidity"]
-        radiance, metered = make_sky(self.scene.ground_color, arguments[0].device)(
-            *arguments
-        )
-        is_fixed = self.chosen["exposure"] == "fixed"
-        return radiance * (
-            METERED_IRRADIANCE
-            / (self._metered.to(radiance.device) if is_fixed else metered)
-        )
+        azimuth = values["azimuth"]
+        sky = make_sky(self.scene.ground_color, azimuth.device)
+        radiance, irradiance = sky(azimuth, values["elevation"], values["turbidity"])
+        if self.chosen["exposure"] == "fixed":
+            irradiance = self._start_irradiance.to(radiance.device)
+        return radiance * (METERED_IRRADIANCE / irradiance)
 
 
 @lru_cache(maxsize=4)
 def make_sky(ground: tuple[float, ...], device: torch.device) -> Sky:
-    """Return the sky over a ground of an sRGB colour.
-
-    Far away it is made of the same as the ground plane.
-    """
+    """Return the sky over a ground of an sRGB color, that of the ground plane."""
     return Sky(color.srgb_to_linear(torch.tensor(ground)).to(device))

@@ -1,5 +1,6 @@
-"""The space of a run: its controls composed into one unit box, each a contiguous slice
-of u.
+"""The space of a run: its controls, composed into one unit box.
+
+Each control has a contiguous slice of the configuration u.
 """
 
 from __future__ import annotations
@@ -33,31 +34,37 @@ from advsearch.scene.grounds import (
 )
 from advsearch.scene.things import list_camera_remarks
 
-# configurations of a camera, a power of two, by which is found how far it goes
+# number of views by which the range of a camera's positions is found; a power of two
 N_CAMERA_VIEWS = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Bound controls in the order of their slices.
+    """Bound controls in the order of their slices of u.
 
-    InputError: two instances have one name.
+    Attributes:
+        controls: the controls. Without any, the scene is rendered unchanged.
+        scene: the scene, with the parts that the controls need. None if the caller has
+            it.
+        adjusted_defaults: default values of the clean scene that controls exclude. The
+            start has the nearest allowed values instead.
+        environment: name of the environment that replaces that of the scene. None if
+            the scene keeps its own.
+
+    Raises:
+        InputError: two controls have the same name.
     """
 
-    # Controls at least none; an empty space renders the scene as it is.
     controls: tuple[Control, ...]
-    # Scene with everything in it that the controls need; None leaves it to the caller.
     scene: SceneDescription | None = None
-    # values of the clean scene that the start has not, as a control leaves them out
     adjusted_defaults: tuple[AdjustedDefault, ...] = ()
-    # what lights the clean scene in the place of its own environment; None if nothing
     environment: str | None = None
 
     def __post_init__(self) -> None:
         names = [control.name for control in self.controls]
         if len(set(names)) != len(names):
             raise InputError(
-                "controls: every instance needs a name of its own, got "
+                "controls: every control needs a different name, got "
                 f"{', '.join(names)}"
             )
 
@@ -73,8 +80,7 @@ class Space:
         """Groups of coordinates, one for each searched parameter, in the order of u.
 
         A group lists the gradient estimators that are valid for it; one is chosen
-        later. "material", the adjoint in material form, is removed if the scene does
-        not support it.
+        later. The estimator "material" is removed if the scene does not support it.
         """
         lacks_material_form = not self._has_material_form()
         groups = []
@@ -84,6 +90,7 @@ class Space:
                 valid = group.valid
                 if lacks_material_form:
                     valid = tuple(name for name in valid if name != "material")
+                # A control does not know its position in the space.
                 groups.append(
                     replace(group, control=control.name, begin=begin, valid=valid)
                 )
@@ -113,7 +120,7 @@ class Space:
 
     @cached_property
     def sizes(self) -> list[int]:
-        """How many coordinates each control has."""
+        """Number of coordinates of each control."""
         return [len(control.start) for control in self.controls]
 
     def split_by_control(self, u: Tensor) -> list[tuple[Control, Tensor]]:
@@ -124,8 +131,8 @@ class Space:
     def _evaluation_order(self) -> tuple[int, ...]:
         """Indices of the controls in the order in which they are evaluated.
 
-        First those that refine nothing, then those that refine what others set, last
-        those of them that lie on top; within each kind in their order.
+        First come the controls that refine no inputs of others, then those that do;
+        and among both, those with `on_top` come last. Otherwise they keep their order.
         """
         ranks = [(bool(control.refines), control.on_top) for control in self.controls]
         return tuple(sorted(range(len(ranks)), key=lambda index: ranks[index]))
@@ -133,8 +140,8 @@ class Space:
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Map u (d,) to scene inputs by name, by differentiable torch operations.
 
-        Controls that refine the inputs of others come after them, and those with
-        `on_top` last, in whatever order the user listed them.
+        Controls are evaluated in the order of `_evaluation_order`, in whatever order
+        the user listed them.
 
         Raises:
             InputError: two controls set the same input, or one of another package sets
@@ -142,7 +149,7 @@ class Space:
         """
         slices = u.split(self.sizes)
         merged = dict[str, Tensor]()
-        set_by = dict[str, str]()
+        first_setter = dict[str, str]()  # control that set each input first
         for index in self._evaluation_order:
             control = self.controls[index]
             new_inputs = control.inputs(slices[index], merged)
@@ -155,10 +162,10 @@ class Space:
                     if name.endswith(".base_color"):
                         hint = "; one `texture` takes several materials"
                     raise InputError(
-                        f"controls: two controls set {name}, {set_by[name]} and "
+                        f"controls: two controls set {name}, {first_setter[name]} and "
                         f"{control.name}; leave one of them out{hint}"
                     )
-                set_by.setdefault(name, control.name)
+                first_setter.setdefault(name, control.name)
             merged = {**merged, **new_inputs}
         return merged
 
@@ -167,26 +174,28 @@ class Space:
     ) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
         """Return each control with its slice of u and the inputs of earlier controls.
 
-        "Earlier" is meant in the order of evaluation; the result has the order of
-        `controls`. A control that refines nothing gets no inputs. No inputs are
-        computed after the last control that needs some, as they take time.
+        "Earlier" refers to the order of evaluation; the result has the order of
+        `controls`. Only controls that refine inputs get those of earlier controls. So
+        no inputs are computed after the last of these controls, to save time.
 
         Args:
             u: (d,) the configuration.
         """
         slices = u.detach().split(self.sizes)
         order = self._evaluation_order
-        # a rank is a position in the order of evaluation
-        refining_ranks = [
-            rank for rank, index in enumerate(order) if self.controls[index].refines
+        # positions in the order of evaluation
+        refining_positions = [
+            position
+            for position, index in enumerate(order)
+            if self.controls[index].refines
         ]
-        last_refining = max(refining_ranks, default=0)
+        last_refining = max(refining_positions, default=0)
         earlier_inputs = NO_INPUTS
         inputs_before = dict[int, Mapping[str, Tensor]]()
-        for rank, index in enumerate(order):
+        for position, index in enumerate(order):
             control = self.controls[index]
             inputs_before[index] = earlier_inputs if control.refines else NO_INPUTS
-            if rank < last_refining:
+            if position < last_refining:  # a later control needs its inputs
                 earlier_inputs = {
                     **earlier_inputs,
                     **control.inputs(slices[index], earlier_inputs),
@@ -197,12 +206,13 @@ class Space:
         ]
 
     def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
-        """Apply what controls do to the finished image (H, W, 3) sRGB, in their order.
+        """Return the finished image (H, W, 3) sRGB as the controls change it.
 
-        Differentiable in both.
+        They change it one after the other, in the order of `controls`. The result is
+        differentiable in u and the image.
         """
-        for control, part in zip(self.controls, u.split(self.sizes), strict=True):
-            image = control.apply_to_image(part, image)
+        for control, u_slice in self.split_by_control(u):
+            image = control.apply_to_image(u_slice, image)
         return image
 
     def describe(
@@ -221,7 +231,7 @@ class Space:
         return described
 
     def get_printable_colors(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the searched colours that a printer would print, by control.
+        """Return the searched colors that would have to be printed, by control.
 
         See `Control.get_printable_colors`; controls without any are left out.
         """
@@ -245,10 +255,11 @@ class Space:
 
     @property
     def exposure(self) -> tuple[float, float]:
-        """Seconds that the shutter is open, and that reading all rows takes.
+        """Seconds during which the shutter is open, and seconds to read out all rows.
 
-        The second is 0 without a rolling shutter, and negative if rows are read from
-        the bottom. Both are those of the control with the longest exposure.
+        The latter is 0 without a rolling shutter, and negative if rows are read from
+        the bottom. Both are those of the control with the longest exposure. Of equal
+        exposures, the longest readout decides.
         """
         exposures = (control.exposure for control in self.controls)
         return max(
@@ -258,7 +269,10 @@ class Space:
         )
 
     def advance_time(self, seconds: float) -> Space:
-        """Return the space so many seconds later, where a control knows a time."""
+        """Return the space at a time some seconds later.
+
+        Controls that do not depend on time stay the same.
+        """
         return replace(
             self,
             controls=tuple(control.advance_time(seconds) for control in self.controls),
@@ -277,23 +291,24 @@ class Space:
             InputError: no number of controls has k coordinates.
         """
         sizes = self.sizes
-        # A control may have no coordinates, so that several counts fit: take the
-        # smallest.
+        # Several counts may fit, as a control may have no coordinates. The smallest is
+        # used: a control without coordinates is fixed anyway.
         counts = [
             count for count in range(len(sizes) + 1) if sum(sizes[:count]) == len(u)
         ]
         if not counts:
             raise InputError(
-                "controls: expected the coordinates of whole controls, "
-                f"of {sizes} each, got {len(u)}"
+                "controls: expected the coordinates of the first controls, which have "
+                f"{sizes} coordinates, got {len(u)}"
             )
         count = counts[0]
+        first_controls = self.controls[:count]
         slices = u.split(sizes[:count])
         fixed = [
-            _FixedControl(control, part)
-            for control, part in zip(self.controls, slices, strict=False)
+            _FixedControl(control, u_slice)
+            for control, u_slice in zip(first_controls, slices, strict=True)
         ]
-        fixed_space = Space(self.controls[:count], self.scene)
+        fixed_space = Space(first_controls, self.scene)
         chosen_environment = fixed_space.find_environment(fixed_space.describe(u))
         return replace(
             self,
@@ -302,9 +317,13 @@ class Space:
         )
 
     def find_environment(self, values: Mapping[str, Value]) -> str | None:
-        """Return the environment that lights a configuration in place of the scene's.
+        """Return the environment that replaces that of the scene in a configuration.
 
-        None if none does. `values` are those that describe the configuration.
+        Args:
+            values: values that describe the configuration (`describe`).
+
+        Returns:
+            Name of the environment; None if the scene keeps its own.
         """
         for group in self.groups:
             if group.setting == ENVIRONMENT:
@@ -326,14 +345,18 @@ class Space:
             group.setting == "environment.rotation" for group in self.groups
         )
         has_solids = any(part.solids for part in scene.surrounding_meshes.values())
+        has_limited_surroundings = find_surroundings(scene) is not None
+        # Views take time to compute, so only if a note may depend on them.
         views = list[CameraView]()
-        if has_solids or find_surroundings(scene) is not None:
+        if has_solids or has_limited_surroundings:
             views = self._sample_camera_views(scene)
-        eyes = [get_camera_position(view) for view in views] if has_solids else []
+        camera_positions = []
+        if has_solids:
+            camera_positions = [get_camera_position(view) for view in views]
         return (
             *scene.notes,
             *list_view_remarks(scene, views, rotates_map=rotates_map),
-            *list_camera_remarks(scene, eyes),
+            *list_camera_remarks(scene, camera_positions),
         )
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
@@ -343,10 +366,11 @@ class Space:
         pose. If none does, the only view is that of the scene.
         """
         for control, start in self.split_by_control(self.start):
-            # A control without slots, such as a texture, moves no camera. A fixed one
-            # has none of its own, but may hold a control that does.
+            # A control without slots, such as a texture, does not move the camera. A
+            # fixed control has no slots, but the control that it wraps may move it.
             may_move_camera = bool(control.slots) or isinstance(control, _FixedControl)
             if may_move_camera and "camera.to_world" in control.inputs(start):
+                # A single view if the control has no coordinates.
                 return [
                     _view_of_inputs(scene, control.inputs(u))
                     for u in _spread_over_box(len(start))
@@ -354,54 +378,58 @@ class Space:
         return [make_camera_view(scene)]
 
     def get_artifact_images(self, u: Tensor) -> dict[str, Tensor]:
-        """Return the images worth storing with a configuration, by file stem."""
+        """Return the images to store with a configuration, by name without suffix."""
         artifacts = dict[str, Tensor]()
-        for control, part, earlier_inputs in self._with_previous_inputs(u):
-            for name, image in control.get_artifact_images(
-                part, earlier_inputs
-            ).items():
+        for control, u_slice, earlier_inputs in self._with_previous_inputs(u):
+            images = control.get_artifact_images(u_slice, earlier_inputs)
+            for name, image in images.items():
                 artifacts[to_file_name(name)] = image
         return artifacts
 
     def get_artifact_files(self, u: Tensor) -> dict[str, bytes]:
-        """Return the other files worth storing with a configuration, by name."""
-        files = dict[str, bytes]()
-        for control, part, earlier_inputs in self._with_previous_inputs(u):
-            for name, content in control.get_artifact_files(
-                part, earlier_inputs
-            ).items():
-                files[to_file_name(name)] = content
-        return files
+        """Return the other files to store with a configuration, by name."""
+        artifacts = dict[str, bytes]()
+        for control, u_slice, earlier_inputs in self._with_previous_inputs(u):
+            files = control.get_artifact_files(u_slice, earlier_inputs)
+            for name, content in files.items():
+                artifacts[to_file_name(name)] = content
+        return artifacts
 
 
 def _spread_over_box(size: int) -> Tensor:
-    """Return points (n, size) spread over the unit box, and the centers of its faces."""
+    """Return points (n, size) spread over the unit box, and the centers of its faces.
+
+    A box without axes has a single point, (1, 0).
+    """
     spread = SobolEngine(size).draw(N_CAMERA_VIEWS) if size else torch.zeros(1, 0)
-    # Each row is the axis of two faces.
+    # Each row is the axis of two opposite faces.
     is_axis = torch.eye(size) > 0.0
-    face_centers = [torch.where(is_axis, end, 0.5) for end in (0.0, 1.0)]
+    face_centers = [torch.where(is_axis, bound, 0.5) for bound in (0.0, 1.0)]
     return torch.cat([spread, *face_centers])
 
 
 def _view_of_inputs(
     scene: SceneDescription, inputs: Mapping[str, Tensor]
 ) -> CameraView:
-    """Return how a scene is looked at by the camera of scene inputs."""
+    """Return the view of a scene by the camera in scene inputs."""
     to_world = inputs["camera.to_world"].detach().double().numpy()
     fov = float(inputs["camera.fov"]) if "camera.fov" in inputs else None
     return make_camera_view(scene, to_world, fov)
 
 
 class _FixedControl(Control):
-    """A bound control that stays at one configuration, and takes no coordinates."""
+    """Wrap a bound control that is fixed at a configuration, and has no coordinates."""
 
     def __init__(self, control: Control, u: Tensor) -> None:
-        """Fix a bound control at coordinates u (k,).
+        """Fix a bound control.
 
-        This control takes no coordinates itself; it passes u to the one that it wraps.
+        Args:
+            control: control that is wrapped.
+            u: (k,) coordinates of its configuration, which are passed to it.
         """
         self._control = control
         self._u = u
+        # the attributes that a space reads
         self.name = control.name
         self.adjusted_defaults = control.adjusted_defaults
         self.on_top = control.on_top
@@ -450,13 +478,15 @@ EXPECTED_INPUTS: Mapping[str, tuple[tuple[int | None, ...] | None, float, float]
         ("roughness", "metallic", "specular", "clearcoat"), (None, 0.0, 1.0)
     ),
 }
-"""Shape and range of the inputs that a control of another package may set, by the last
-part of their names; None for any number or any shape.
+"""Shape, lower and upper bound of scene inputs, by the last part of their names.
+
+None stands for any size, or for any shape. The inputs of controls of other packages are
+checked against it.
 """
 
-# of inputs of other names, which may have any shape and any values
+# shape and bounds of inputs with other names
 ANY_INPUT = (None, -math.inf, math.inf)
-RANGE_TOLERANCE = 1e-4  # how far past its range rounding may put a colour
+RANGE_TOLERANCE = 1e-4  # by how much rounding errors may exceed a bound
 
 
 def _check_inputs(control: str, inputs: object) -> None:
@@ -482,9 +512,9 @@ def _check_inputs(control: str, inputs: object) -> None:
                 f"`controls` {control}: {name}: expected a tensor of real "
                 f"numbers, got {got}"
             )
-        # "base_color" of "object.base_color"
-        kind = name.rpartition(".")[2]
-        shape, low, high = EXPECTED_INPUTS.get(kind, ANY_INPUT)
+        # "base_color" for "object.base_color"
+        last_part = name.rpartition(".")[2]
+        shape, low, high = EXPECTED_INPUTS.get(last_part, ANY_INPUT)
         if shape is not None and not _has_shape(value, shape):
             sides = ", ".join("N" if side is None else str(side) for side in shape)
             if len(shape) == 1:
@@ -522,13 +552,13 @@ def _check_range(label: str, value: Tensor, low: float, high: float) -> None:
     smallest, largest = (float(bound) for bound in value.detach().aminmax())
     if low - RANGE_TOLERANCE <= smallest and largest <= high + RANGE_TOLERANCE:
         return
+    # Inputs without an upper bound fail if they have NaN or negative light.
     expected = "numbers"
     hint = ""
     if high < math.inf:
         expected = f"values from {low:g} to {high:g}"
         hint = f"; keep it inside, as by .clamp({low:g}, {high:g})"
     raise InputError(
-        f"{label}: expected {expected} (linear, for a "
-        f"colour), got {smallest:.4g} to {largest:.4g}"
-        f"{hint}"
+        f"{label}: expected {expected} (colours are linear), got {smallest:.4g} to "
+        f"{largest:.4g}{hint}"
     )

@@ -1,5 +1,6 @@
-"""The `texture` control: the base-colour map of the object or of another mesh, inside a
-ball around the original.
+"""The `texture` control: the base-color map of a mesh, in a ball around the original.
+
+It has three forms:
 
     texels     u = texel values, display-referred sRGB in [0, 1];   ||u - original||_p <= epsilon
     palette    u = k colors in a ball around those of the original
@@ -7,12 +8,12 @@ ball around the original.
     waves      u = (a + 1) / 2 per wave and channel
                texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
 
-and reflectance = linear(texel). A bounded change of texture is REVAMP's and Athalye et
-al.'s (2018, arXiv 1707.07397, section 3). L2 is the plain Euclidean norm over all texel
-values: `r * sqrt(3 h w)` lets their root-mean-square reach r. The palette follows Chang
-et al. (2015, "Palette-based Photo Recoloring", sections 3.2 and 3.4), in sRGB and
-normalised; the waves are the low-frequency search of Guo et al. (2019, arXiv
-1809.08758, section 3).
+The reflectance is linear(texel). Bounded changes of a texture are from REVAMP and from
+Athalye et al. (2018, arXiv 1707.07397, section 3). The L2 norm is the Euclidean norm of
+all texel values: with a radius of `r * sqrt(3 h w)`, their root mean square can reach r.
+The palette follows Chang et al. (2015, "Palette-based Photo Recoloring", sections 3.2
+and 3.4), in sRGB and normalized. The waves are the low-frequency search of Guo et al.
+(2019, arXiv 1809.08758, section 3).
 """
 
 from __future__ import annotations
@@ -49,33 +50,32 @@ from advsearch.scene.gradients import Budget, Group
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import find_exclusive_texels, rasterize_charts
 
-# smallest and largest side that is taken from the object's own texture when none is
-# asked for
+# limits of the default resolution, which is the side of the object's own texture
 RESOLUTIONS = (256, 512)
 FORMS = ("texels", "palette", "waves")
 MAX_WAVES = 64
 MAX_PALETTE = 64
 LLOYD_STEPS = 30
-# share of the texels of materials that must be theirs alone for them to be painted
+# smallest fraction of the texels of materials that no other material may use
 MIN_EXCLUSIVE_FRACTION = 0.5
 WAVE_REACH = 3.0
-"""Argument of the tanh that the slowest wave alone reaches at its largest amplitude:
-0.995 of the ball's radius.
+"""Argument of the tanh for the constant wave at its largest amplitude. tanh(3) is 0.995,
+so that this wave alone can reach the ball's radius.
 """
 
 
 class TextureControl(Control):
-    """The base-colour map of the object or another mesh, inside a ball around the
-    original.
+    """The base-colour map of the object or another mesh, in a ball around the original.
 
     Attributes:
-        form: one of `FORMS`, what the coordinates are.
-        _mesh_name: mesh name of the mesh that is painted.
+        form: one of `FORMS`, the meaning of the coordinates.
+        _mesh_name: name of the mesh that is painted.
         _materials: names of the materials that are painted; "" for all of the mesh.
         _original: (h, w, 3) sRGB, the original texture at the search's resolution.
-        _painted_mask: (h, w) texels that are painted; None for all.
+        _painted_mask: (h, w) mask of the texels that are painted; None for all.
         _painter: map from u to these texels.
-        _unchanged_texels: (n, 3) of the painter at the start.
+        _unchanged_texels: (n, 3) painted texels at the start, with which `describe`
+            compares others.
     """
 
     kind = "texture"
@@ -110,7 +110,7 @@ class TextureControl(Control):
             -1.0,
             1.0,
             0.0,
-            "Strength of each wave in each colour channel (form waves).",
+            "Amplitude of each wave in each colour channel (form waves).",
             search=(-1.0, 1.0),
             estimators=("adjoint",),
         ),
@@ -236,7 +236,7 @@ class TextureControl(Control):
         return self._find_named_materials(scene) or self.chosen["materials"]
 
     def fit(self) -> None:
-        """Make the painter of the form, and the texels that it paints.
+        """Find the texels that are painted, and make the painter of the control's form.
 
         Raises:
             InputError, UnknownNameError: materials cannot be painted, or are unknown.
@@ -254,6 +254,7 @@ class TextureControl(Control):
         self._mesh_name = part.name
         self._materials = ", ".join(names or ())
         self._painter = self._make_painter(part, mask)
+        # computed, since rounding makes them differ a little from the original
         self._unchanged_texels = self._painter.texels(self._painter.start)
         self.start = self._painter.start
         self.groups = (self._painter.group,)
@@ -263,9 +264,10 @@ class TextureControl(Control):
     ) -> Tensor:
         """Return the original texture (h, w, 3) sRGB at the resolution of the search.
 
-        By default a texture is resized to a square with its longer side, which is
-        limited to `RESOLUTIONS`. If only some materials are painted, a large enough
-        texture is not resized, so that the other materials stay exactly the same.
+        It is resized to a square, whose side the user sets. By default that is the
+        longer side of the texture, within the limits `RESOLUTIONS`. If only some
+        materials are painted, the texture is not resized by default, however large, so
+        that the other materials stay exactly the same. Only a small one is enlarged.
 
         Args:
             part: mesh with the texture.
@@ -300,13 +302,14 @@ class TextureControl(Control):
         if self.form == "waves":
             max_change = self._compute_radius(norm, texels.numel())
             if norm == "l2":
-                # The radius is the norm of all changes: n equal ones of radius /
-                # sqrt(n) reach it.
+                # Waves limit each change. If n changes are at most radius / sqrt(n),
+                # their norm is at most the radius.
                 max_change = max_change / math.sqrt(texels.numel())
             n_waves = int(self.chosen["waves"])
             return make_wave_painter(texels, mask, n_waves, max_change)
         budget = Budget(norm, self._compute_radius(norm, texels.numel()))
         group = Group("texels", texels.numel(), ("adjoint",), budget)
+        # The coordinates are the texel values themselves.
         return Painter(texels.reshape(-1), group, to_texels)
 
     def _compute_radius(self, norm: str, count: int) -> float:
@@ -319,7 +322,7 @@ class TextureControl(Control):
     def _find_painted_texels(
         self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]
     ) -> BoolArray:
-        """Return which texels (h, w) only the painted materials use.
+        """Return a mask (h, w) of the texels that only the painted materials use.
 
         Texels that other materials use as well are not painted.
 
@@ -347,13 +350,15 @@ class TextureControl(Control):
         if fraction < MIN_EXCLUSIVE_FRACTION:
             shared = f"{100 * (1 - fraction):.0f}"
             remedy = ""
+            # Texels of a low resolution may lie in several materials. Without the
+            # setting, the texture has its full resolution.
             if self.chosen["resolution"]:
                 remedy = "take a higher resolution, "
             raise InputError(
-                f"{self.name}.materials: other materials read {shared} % of the texels "
+                f"{self.name}.materials: other materials use {shared} % of the texels "
                 "of "
-                f"{', '.join(names)} too, so that it cannot be painted alone; give "
-                "each material texels of its own in "
+                f"{', '.join(names)} too, so that it cannot be painted separately; "
+                "assign different texels to each material in "
                 f"the file, {remedy}or leave materials out"
             )
         return mask
@@ -406,15 +411,12 @@ class TextureControl(Control):
 
 
 class Painter(NamedTuple):
-    """One form of the control.
+    """A map from coordinates u to the n texels that are painted, row by row."""
 
-    A map from its slice of u to the n texels that it paints, row by row.
-    """
-
-    start: Tensor  # (d,) float32, the slice that gives the original
-    group: Group  # the slice as a group
-    # (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable, and can
-    # be pickled for workers
+    start: Tensor  # (d,) float32, the coordinates of the original texture
+    group: Group  # the group of these coordinates
+    # Function from coordinates (d,) in [0, 1] to texels (n, 3), display-referred sRGB in
+    # [0, 1]. It is differentiable, and can be pickled for worker processes.
     texels: Callable[[Tensor], Tensor]
 
 
@@ -430,7 +432,7 @@ def _compute_texel_areas(part: MeshPart, mask: Tensor) -> Float32Array:
 
 
 def to_texels(u: Tensor) -> Tensor:
-    """Return the texels (n, 3) that coordinates (3 n,) are."""
+    """Return coordinates (3 n,) as texels (n, 3)."""
     return u.reshape(-1, 3)
 
 
@@ -446,15 +448,16 @@ def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> P
         budget: norm ball around the palette.
     """
     squared_distance = (original[..., None, :] - centers).square().sum(dim=-1)  # (n, k)
-    # A color's influence falls off over half the mean distance to the nearest other
-    # color. Without another one, all weights are 1, whatever it is.
-    falloff = 1.0
+    # Weights are Gaussians of the distance between colors, which sum to 1. Their standard
+    # deviation is half the mean distance from a palette color to the nearest other one.
+    # For a single color it does not matter, as its weight is 1.
+    std = 1.0
     if len(centers) > 1:
         # more than any distance, so that no color is its own nearest
         self_distance = torch.diag(torch.full((len(centers),), 10.0))
         distances = torch.cdist(centers, centers) + self_distance
-        falloff = max(0.5 * float(distances.min(dim=1).values.mean()), 1e-3)
-    weights = torch.softmax(-squared_distance / (2.0 * falloff**2), dim=-1)
+        std = max(0.5 * float(distances.min(dim=1).values.mean()), 1e-3)
+    weights = torch.softmax(-squared_distance / (2.0 * std**2), dim=-1)
     group = Group("palette", centers.numel(), ("adjoint", "differences"), budget)
     texels = partial(_paint_palette, original, weights, centers)
     return Painter(centers.reshape(-1), group, texels)
@@ -500,9 +503,7 @@ def make_wave_painter(
 
 
 def _make_cosine_waves(side: int, count: int) -> Tensor:
-    """Return waves (side, count) over the texels of a side; wave m has m half
-    periods.
-    """
+    """Return cosine waves (side, count) along a side; wave m has m half periods."""
     wave_index = torch.arange(count)
     return torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * wave_index / side)
 
@@ -568,10 +569,10 @@ def _quantise_colors(
 ) -> tuple[Float64Array, Float64Array]:
     """Return the different colors (N, 3) of an image, and their mass (N,).
 
-    Colors with the same 5 highest bits in each channel are averaged, by their weights.
-    The mass is the square root of the total weight. With the weight itself, shades of
-    the largest surface would take all centers of the palette. Colors without weight are
-    left out.
+    Colors that are equal after rounding to 5 bits a channel are averaged, by their
+    weights. The mass of such a mean is the square root of their total weight. With the
+    weight itself, all centers of the palette would be shades of the largest surface.
+    Colors without weight are left out.
 
     Args:
         image: (h, w, 3) sRGB in [0, 1].

@@ -1,14 +1,16 @@
-"""The `things` control: where the things beside the object stand, how they are turned,
-and whether they are there.
+"""The `things` control: position, rotation and presence of the things around the object.
 
-    position = initial position + (x, y) + away * t,    t >= 0 the least at which it is free
+A thing is a further mesh of the scene, such as a car next to the object.
 
-`away` points from the object to the thing. Free is what overlaps with no other outline
-on the ground: the object's, the camera's, those of things that stay, and those of
-things before it in the list. Two convex outlines of which one moves straight on overlap
-over one stretch of its way, so that t is exact. A thing that would stand in a solid of
-the place, a house or a lamp post, first goes back towards the object until it is free
-of it.
+    position = initial position + (x, y) + away * t
+
+`away` is the unit vector from the object to the thing, and t >= 0 is the smallest distance
+at which the thing is free. It is free if its outline on the ground overlaps with no other
+one: that of the object, the camera, the things that do not move, and the things before it
+in the list. A convex outline that moves along a line overlaps with another one in a single
+interval of t, so that t is exact. If a thing would stand in a solid of the surroundings,
+such as a house or a lamp post, it is first moved back towards the object until it is out
+of the solid.
 """
 
 from __future__ import annotations
@@ -38,34 +40,41 @@ from advsearch.extend import (
     parts,
 )
 
-# metres between a thing that was moved away and what it would have stood in
+# distance between a thing that was pushed away and the obstacle, metres
 MIN_GAP = 0.01
 CAMERA_CLEARANCE = 0.3
 CAMERA_CLEARANCE_FRACTION = 0.05
-"""Metres around the camera that stay free of what is as high as it; at most this
-fraction of its distance to the object.
+"""Radius around the camera, in metres, in which nothing of its height may stand; and its
+limit as a fraction of the camera's distance from the object.
 """
-EIGHTHS = np.arange(8) * np.pi / 4.0
-# An absent thing is scaled to this size, and lies this many metres under the ground.
+EIGHT_ANGLES = np.arange(8) * np.pi / 4.0  # corners of the camera's outline
+# An absent thing is scaled by this factor, and lies this many metres under the ground.
 ABSENT_SCALE = 1e-5
 ABSENT_DEPTH = 0.01
 _moving = partial(Parameter.moving, Parameter.ORBIT)
 
 
 class Stand(NamedTuple):
-    """Where a thing stands, in the coordinates of the scene."""
+    """The position of a thing, in the coordinates of the scene.
 
-    position: assets.Float64Array  # (2,) of its center
-    height: float  # height of its lowest point
-    push_distance: float  # how far it was moved away from the object
+    Attributes:
+        position: (2,) x and y of its center.
+        height: height of its lowest point.
+        push_distance: how far it was pushed away from the object to be free; negative
+            if it was moved towards the object.
+    """
+
+    position: assets.Float64Array
+    height: float
+    push_distance: float
 
 
 class ThingsControl(Control):
-    """Where the things beside the object stand, how they are turned, and whether they
-    are there.
+    """Position, rotation and presence of the things around the object.
 
-    `_moved_things` holds the names of the things that it moves, in the scene's order:
-    those with a searched parameter, or one that the user set.
+    Attributes:
+        _moved_things: names of the things that it moves, in the scene's order: those
+            with a searched parameter, or one that the user set.
     """
 
     kind = "things"
@@ -76,7 +85,7 @@ class ThingsControl(Control):
             -1000.0,
             1000.0,
             0.0,
-            "Forwards from where it was put.",
+            "Shift forwards from its position in the scene.",
             (-2.0, 2.0),
         ),
         _moving(
@@ -85,7 +94,7 @@ class ThingsControl(Control):
             -1000.0,
             1000.0,
             0.0,
-            "To the left of where it was put.",
+            "Shift to the left from its position in the scene.",
             (-2.0, 2.0),
         ),
         _moving(
@@ -94,7 +103,7 @@ class ThingsControl(Control):
             -3600.0,
             3600.0,
             0.0,
-            "Turn from how it was put, counter-clockwise.",
+            "Rotation from its pose in the scene, counter-clockwise.",
             (-180.0, 180.0),
             periodic=True,
         ),
@@ -123,8 +132,6 @@ class ThingsControl(Control):
     def fit(self) -> None:
         """Find which things this control moves, and check that they stand free.
 
-        A thing is a further mesh of the scene, such as a car next to the object.
-
         Raises:
             InputError: the scene has no things, or one overlaps with something.
             UnknownNameError: a parameter names a thing that the scene does not have.
@@ -132,17 +139,18 @@ class ThingsControl(Control):
         things = self.scene.things
         if not things:
             raise InputError(
-                f"`controls` {self.name}: nothing stands beside the "
+                f"`controls` {self.name}: there is no thing around the "
                 "object; add `things`, such as car@6,3"
             )
         for parameter_name in self.specs:
+            # "car" for "car.x", and empty for "x"
             thing = parameter_name.rpartition(".")[0]
             if thing and thing not in things:
                 raise errors.UnknownNameError(
-                    f"`controls` {self.name}: thing beside the object", thing, things
+                    f"`controls` {self.name}: thing around the object", thing, things
                 )
         super().fit()
-        # The rest stay where they are, or another control moves them.
+        # Other things keep their positions, unless another control moves them.
         moved = self._find_moved_things()
         self._moved_things = tuple(name for name in things if name in moved)
         self._check_things_stand_free()
@@ -163,20 +171,21 @@ class ThingsControl(Control):
         Raises:
             InputError: one overlaps with something else.
         """
-        # with all parameters 0, things stand where the scene has them
+        # With all parameters 0, things are present, and stand as in the scene.
         unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
         for name, stand in self._compute_stands(unmoved, {}).items():
             is_pushed = bool(stand.push_distance)
             if is_pushed:
                 raise InputError(
-                    f"`controls` {self.name}: {name} stands in something "
-                    "else; put it elsewhere"
+                    f"`controls` {self.name}: {name} overlaps with something "
+                    "else; put it in another position"
                 )
 
     def list_parameter_specs(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
         """Yield the parameters of each thing, named `<thing>.<parameter>`.
 
-        The setting of a parameter of one thing wins over that for all things.
+        A setting for one thing, such as `car.x`, takes precedence over that for all
+        things, `x`.
         """
         for thing in self.scene.things:
             for parameter in map(self.resolve_parameter, self.parameters):
@@ -185,21 +194,24 @@ class ThingsControl(Control):
                 yield replace(parameter, name=name), spec
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter; x and y go as far as the object is large, at most 2
-        metres.
+        """Return a parameter; x and y are searched within the object's size.
+
+        That is at most 2 metres.
         """
         if parameter.name not in ("x", "y"):
             return parameter
-        # The object is one unit large. Two metres beside a small one are off its table.
+        # With 2 metres around a small object, things would stand beside its table.
         object_size = self.scene.size_in_metres
         reach = min(2.0, object_size)
         return replace(parameter, search=(-reach, reach))
 
     @property
     def refines(self) -> frozenset[str]:
-        """Inputs of the scene that this control reads and does not change.
+        """Scene inputs that this control only reads.
 
-        They make it come after the controls that move an obstacle, or bend a mesh.
+        So it is evaluated after the controls that move an obstacle or deform a mesh. It
+        sets the poses of the things that it moves itself, but other controls may deform
+        them.
         """
         fixed = [name for name in self.scene.things if name not in self._moved_things]
         poses = [f"{name}.to_world" for name in ("object", "camera", *fixed)]
@@ -213,7 +225,8 @@ class ThingsControl(Control):
 
         A thing is turned about its foot and moved to its free position. An absent one
         is made tiny and put under the ground, so that the scene keeps all its meshes.
-        The heading has a derivative, the position has none.
+        The result is differentiable in the heading, but not in x and y, since the free
+        position is found without derivatives.
 
         Args:
             values: values of the control, such as "car.x" and "car.heading".
@@ -224,15 +237,13 @@ class ThingsControl(Control):
             part = self.scene.meshes[name]
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_find_foot(part)).to(base)
-            # a heading, without pitch and roll
-            turn = geometry.make_euler_rotation(
-                values[f"{name}.heading"], *base.new_zeros(2)
-            )
-            # () the index of the choice: 0 is present, 1 is absent
+            pitch, roll = base.new_zeros(2)
+            turn = geometry.make_euler_rotation(values[f"{name}.heading"], pitch, roll)
+            # () index of the option: 0 for "there", 1 for "away"
             absence = values[f"{name}.presence"]
             if bool(absence):
                 turn = ABSENT_SCALE * turn
-            # without derivative
+            # without derivatives
             position = base.new_tensor([*stand.position, stand.height])
             absent_depth = base.new_tensor(
                 [0.0, 0.0, ABSENT_DEPTH / self.scene.size_in_metres]
@@ -245,7 +256,10 @@ class ThingsControl(Control):
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return where each thing stands in the end, as the setting `things` has it."""
+        """Return the final position of each thing, as in the setting `things`.
+
+        That is in metres from the object's center.
+        """
         origin = geometry.compute_center(self.scene)[:2]
         measurements = {}
         for name, stand in self._compute_stands(values, earlier_inputs).items():
@@ -292,9 +306,10 @@ class ThingsControl(Control):
     ) -> list[parts.Footprint]:
         """List the footprints that a thing must not overlap with.
 
-        The object's is first, then the camera's, then those of things that this control
-        does not move. The camera's is a circle around it that keeps the view free; its
-        height, upwards from the camera, is its radius.
+        The first is that of the object, the second that of the camera, and the others
+        are those of things that this control does not move. The camera's footprint is
+        an octagon, which keeps the view free. It reaches upwards from the camera by its
+        radius.
 
         Args:
             earlier_inputs: inputs of earlier controls, which may have moved object and
@@ -305,15 +320,18 @@ class ThingsControl(Control):
         outline = object_footprint.outline
         object_center = (outline.min(axis=0) + outline.max(axis=0)) / 2.0
         camera = geometry.get_camera_pose(scene, earlier_inputs)
-        eye = camera[:3, 3].detach().double().cpu().numpy()
-        object_distance = float(np.linalg.norm(eye[:2] - object_center))
+        camera_position = camera[:3, 3].detach().double().cpu().numpy()
+        object_distance = float(np.linalg.norm(camera_position[:2] - object_center))
         clearance = min(
             CAMERA_CLEARANCE / scene.size_in_metres,
             CAMERA_CLEARANCE_FRACTION * object_distance,
         )
-        circle = np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
+        octagon = np.stack([np.cos(EIGHT_ANGLES), np.sin(EIGHT_ANGLES)], axis=1)
+        camera_height = camera_position[2]
         around_camera = parts.Footprint(
-            eye[:2] + clearance * circle, eye[2], eye[2] + clearance
+            outline=camera_position[:2] + clearance * octagon,
+            lower=camera_height,
+            upper=camera_height + clearance,
         )
         fixed_things = [name for name in scene.things if name not in self._moved_things]
         return [
@@ -323,7 +341,10 @@ class ThingsControl(Control):
         ]
 
     def _read_numbers(self, name: str, values: Values) -> list[float]:
-        """Return x, y, heading and presence (1 if absent) of a thing."""
+        """Return x, y, heading and presence (1 if absent) of a thing.
+
+        They are in the order of `parameters`.
+        """
         return [
             float(values[f"{name}.{parameter.name}"].detach())
             for parameter in self.parameters
@@ -341,7 +362,8 @@ class ThingsControl(Control):
         """Find the free position of one thing, and its outline (K, 2) there.
 
         A thing that would overlap with something is pushed along the line from the
-        object's center through its requested position. An absent one is not pushed.
+        object's center through its requested position, see `_find_free_shift`. An
+        absent one is not pushed.
 
         Args:
             name: name of the thing.
@@ -349,8 +371,7 @@ class ThingsControl(Control):
             initial_footprint: footprint of the thing in the scene, before it is moved.
             object_center: (2,) the object's center.
             obstacles: footprints that it must not overlap with.
-            solids: solids of the surroundings, such as walls. If it overlaps with one,
-                it is first pushed towards the object.
+            solids: solids of the surroundings, such as walls.
         """
         scene = self.scene
         x, y, heading, is_absent = self._read_numbers(name, values)
@@ -404,21 +425,22 @@ def _find_free_shift(
 ) -> float:
     """Find how far a thing has to be shifted along a direction to stand free.
 
-    If it overlaps with solids (e.g. walls), it first moves backwards, to the object,
-    out of all of them. From there it moves forwards past each solid or obstacle that it
-    overlaps with, in their order along the direction.
+    If it overlaps with solids (e.g. walls) at its requested position, it is first moved
+    backwards, towards the object, out of all these. There it may overlap with others.
+    From there it is moved forwards past each solid or obstacle that it overlaps with, in
+    their order along the direction.
 
     Args:
         footprint: footprint of the thing at the requested position.
         direction: (2,) unit vector away from the object.
         obstacles: footprints that it must not overlap with.
         solids: solids of the surroundings, which it must not overlap with either.
-        gap: distance from obstacles that is left free.
+        gap: distance from obstacles and solids that is left free.
 
     Returns:
         The shift, in scene units; negative if it is backwards.
     """
-    # (begin, end) of the shifts at which it overlaps with each
+    # (begin, end) of the interval of shifts at which it overlaps with each
     solid_intervals = [
         geometry.find_overlap_interval(footprint, solid.footprint, direction)
         for solid in solids
@@ -428,11 +450,12 @@ def _find_free_shift(
         for obstacle in obstacles
     ]
     shift = 0.0
-    # where the intervals begin that contain the shift 0
+    # begins of the solids that it overlaps with at the shift 0
     solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
     if solid_begins:
         shift = min(solid_begins) - gap
-    # sorted by their begins: after a shift past one, those that begin later are tested
+    # In ascending order of their begins: after a shift past an obstacle, the thing can
+    # only overlap with those that begin later.
     for begin, end in sorted(obstacle_intervals + solid_intervals):
         if begin < shift < end:
             shift = end + gap
@@ -478,8 +501,8 @@ def _compute_footprint(
         scene: the scene.
         name: name of the mesh.
         earlier_inputs: inputs of earlier controls. They may have the mesh's pose
-            `<name>.to_world` (4, 4) and offsets of its vertices (N, 3); what is missing
-            is as in the scene.
+            `<name>.to_world` (4, 4) and offsets of its vertices (N, 3). Those of the
+            scene replace missing ones.
     """
     part = scene.meshes[name]
     pose = earlier_inputs.get(f"{name}.to_world")

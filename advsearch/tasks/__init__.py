@@ -1,6 +1,4 @@
-"""Tasks: what a model predicts, and how its output is judged against the ground
-truth.
-"""
+"""Tasks, which evaluate the output of a model against the ground truth."""
 
 from __future__ import annotations
 
@@ -99,10 +97,10 @@ class FunctionTask(Task):
             got = f"{losses.dtype} {tuple(losses.shape)}"
         plural = "" if n_outputs == 1 else "s"
         raise InputError(
-            f"task {self.name}: expected how wrong each output is, a tensor of "
-            f"{n_outputs} floating-point number{plural}, over 0 where it is wrong, got "
-            f"{got}; a distance less what is allowed does, or a wrong logit less the "
-            "right one"
+            f"task {self.name}: expected the loss of each output, a tensor of "
+            f"{n_outputs} floating-point number{plural}, over 0 for a wrong output, got "
+            f"{got}; for example a distance minus a tolerance, or a wrong logit minus "
+            "the right one"
         )
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
@@ -164,7 +162,7 @@ TASKS: Registry[type[Task]] = Registry(
         isinstance(entry, type) and issubclass(entry, Task) and entry.name == name
     ),
 )
-"""Every task that has a name."""
+"""Classes of tasks by name."""
 
 
 AnyTask = str | Mapping[str, object] | Task | Callable[[Any, Facts], Tensor]

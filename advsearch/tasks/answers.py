@@ -1,4 +1,4 @@
-"""Judge free answers: whether the text of a model contains one of the right words."""
+"""Task for free answers: does the text of a model contain one of the right words?"""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_COUNT = 256  # maximum of `tokens` and of `times`
 
 
 class AnswersWithoutLogits(TypedDict):
-    """The answers of a model without logits about one image, one per request."""
+    """The answers of a model without logits about one image, one for each request."""
 
     texts: list[str]
 
@@ -31,9 +31,9 @@ class AnswerWithLogits(TypedDict):
 
     Attributes:
         text: the answer.
-        logits: (T, tokens) float32, of all tokens at each of T steps; the largest was
-            chosen.
-        begins: returns the tokens that may begin a word.
+        logits: (T, tokens) float32, logits of all tokens at each of T steps. The token
+            with the largest one was selected.
+        begins: function from a word to the tokens with which it may begin.
     """
 
     text: str
@@ -93,18 +93,16 @@ class FreeAnswer(Task):
             minimise: whether a right answer is sought.
 
         Raises:
-            InputError: the model was loaded for its logits, or there are both a target
+            InputError: the model was loaded as a classifier, or there are both a target
                 and `minimise`.
         """
-        if model.read is None:  # its outputs are logits, as of a classifier
+        if model.read is None:  # its outputs are logits, as those of a classifier
             raise InputError(
                 f"model {model.name}: it was loaded for its logits; load "
                 f'it with task="{self.name}"'
             )
         if target is not None and minimise:
-            raise InputError(
-                "minimise: makes the right answer easier to give; leave `target` out"
-            )
+            raise InputError("minimise: seeks the right answer; leave `target` out")
         return replace(
             self,
             target=None if target is None else _parse_words("target", target),
@@ -174,8 +172,8 @@ class FreeAnswer(Task):
                 losses.append(1.0 - 2.0 * torch.tensor(is_right).mean())
                 continue
             margin = _compute_token_margin(answer["logits"], answer["begins"], truth)
-            # The text decides the sign, the margin only the size: below 0 if the answer
-            # has a right word, over 0 if not.
+            # With p = sigmoid(margin), log(1 - p) is negative and -log(p) is positive:
+            # the text decides the sign of the loss, and the margin only its size.
             if has_word(answer["text"], truth):
                 loss = functional.logsigmoid(-margin)  # log(1 - p)
             else:
@@ -255,7 +253,7 @@ def _compute_token_margin(
     if not begin_tokens:
         raise InputError(
             "label: the model has no token that begins one of "
-            f"{', '.join(words)}; name others"
+            f"{', '.join(words)}; state other words"
         )
     is_begin = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
     is_begin[begin_tokens] = True
@@ -265,7 +263,7 @@ def _compute_token_margin(
 
 
 def _list_texts(answer: AnswerWithLogits | AnswersWithoutLogits) -> list[str]:
-    """Return all texts about an image: several requests' or the only one."""
+    """Return all texts about an image: those of several requests, or the only one."""
     if "texts" in answer:
         return answer["texts"]  # type: ignore[typeddict-item]
     return [answer["text"]]
@@ -290,8 +288,9 @@ def _parse_words(setting: str, text: str) -> Words:
 
 
 def has_word(text: str, words: Words) -> bool:
-    """Whether a text contains one of the words or terms in any case; "mug" is no word
-    of "smug".
+    """Return whether a text contains one of the words, in upper or lower case.
+
+    Only full words count: "smug" does not contain "mug".
     """
     text = " ".join(text.split()).casefold()
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)

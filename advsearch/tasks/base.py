@@ -1,8 +1,8 @@
-"""Define the contract of a task: how a model's output is evaluated.
+"""The base class of tasks, which evaluate a model's output.
 
-A task is the only place that knows what a model's output means. The search maximises a
-number that the task computes, verification counts its judgements, and results and
-reports print its labels; none of these knows of classes.
+Only a task knows the meaning of a model's output. The search maximizes a number that the
+task computes, verification counts its judgements, and results and reports print its
+labels. None of these depends on classes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Prediction:
     Attributes:
         label: label in words.
         index: index of the class; None if there are no classes.
-        probability: probability in [0, 1]; None if the model gives none.
+        probability: probability in [0, 1]; None if the model states none.
     """
 
     label: str
@@ -57,14 +57,16 @@ class Judgement:
     """The evaluation of a model's output for one image.
 
     Attributes:
-        score: score over 0 if the output is a success of the search. NaN is no success.
-        margin: the task's loss with its sign reversed, whatever is sought: below 0
-            exactly if the prediction is not right.
-        right: whether the prediction is right. NaN is not right.
+        score: number over 0 if the output is a success of the search. NaN is no
+            success.
+        margin: minus the loss of the task, whatever the search seeks. It is negative
+            if and only if the prediction is wrong.
+        right: whether the prediction is right. False if the margin is NaN.
         prediction: prediction of the model.
-        payload: what else is stored in the run's rows, as JSON values (boxes, masks);
-            None if there is nothing.
-        objective: what the search maximises for this image; None without a search.
+        payload: further values to store in the run's rows, as JSON values (boxes,
+            masks). None if there are none.
+        objective: value that the search maximizes for this image; None without a
+            search.
         metrics: values of the run's metrics for this image by name, None for one that
             is not a number; None if there are no metrics.
     """
@@ -108,7 +110,7 @@ class Judgement:
 
     @property
     def outcome(self) -> Outcome | None:
-        """What becomes of the object; None if the task does not state it."""
+        """Outcome for the object, such as "missed"; None if the task does not state it."""
         return get_outcome(self.payload)
 
     @property
@@ -117,7 +119,7 @@ class Judgement:
         return self.prediction.label == NOT_A_NUMBER
 
 
-# The prediction about an image, and its payload: what else is stored of it.
+# The prediction about an image, and its payload: further values that are stored.
 PredictionWithPayload = tuple[Prediction, JsonValue]
 
 
@@ -142,11 +144,13 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the camera sees first through the center of each pixel, without noise.
+    """The first surface that the camera sees through the center of each pixel.
+
+    It is computed without noise.
 
     Attributes:
-        mask: (H, W) bool, where it is the object.
-        depth: (H, W) float, its distance, see `Facts.depth`.
+        mask: (H, W) bool, whether the surface is that of the object.
+        depth: (H, W) float, distance of the surface, see `Facts.depth`.
         z_depth: (H, W) float, see `Facts.z_depth`.
         size_in_metres: size in metres of the object's longest side; None if it is
             unknown, and distances are in object sizes.
@@ -160,23 +164,23 @@ class Sight:
 
 @dataclass(frozen=True)
 class Facts:
-    """The ground truth of a scene in one configuration, from which a task takes its
-    own.
+    """The ground truth of a scene in one configuration.
+
+    A task computes its own truth from it, such as the right classes.
 
     Attributes:
-        object: its name, for messages.
-        label: the right label by the setting `label`; None without it.
-        object_label: the label that the object's file states; None if it states none.
-        describe_values: returns the values of the configuration by parameter
-            ("pose.yaw"), in the units that rows have.
-        compute_sight: computes what is visible in the image, see `mask` and `depth`;
-            None if the facts belong to no configuration.
-        facts_of_thing: the facts of each evaluated thing by name, the object first; empty if only
-            the object is evaluated.
-        others: the facts of every other thing in the scene, the object included if
-            another thing is evaluated.
-        views: the facts in the image of each camera of a rig; empty for a single
-            camera.
+        object: name of the object, for messages.
+        label: right label, as the setting `label` states it. None without that.
+        object_label: label that the object's file states. None if it states none.
+        describe_values: function that returns the values of the configuration by
+            parameter ("pose.yaw"), in the units of a run's rows.
+        compute_sight: function that computes what is visible in the image, see `mask`
+            and `depth`. None if the facts are those of a scene without a configuration.
+        facts_of_thing: facts of each evaluated thing by name, the object first. Empty
+            if only one thing is evaluated.
+        others: facts of every other thing in the scene, including the object if another
+            thing is evaluated.
+        views: facts for the image of each camera of a rig. Empty for a single camera.
     """
 
     object: str
@@ -198,18 +202,21 @@ class Facts:
         """
         if self.compute_sight is None:
             raise InputError(
-                f"the task needs to see {self.object}, which depends on the "
-                "configuration; set `varies = True` on it"
+                f"the task needs the view of {self.object}, which depends on the "
+                "configuration; set `varies = True` in the class of the task"
             )
         return self.compute_sight()
 
     @property
     def mask(self) -> Tensor:
-        """The pixels in which the object is the first thing that the camera sees, (H,
-        W) bool.
+        """The pixels in which the object is visible, (H, W) bool.
 
-        A pixel is probed at its center. Where something occludes the object the mask is
-        false; an image corruption leaves it as it is. Raises InputError as `sight`.
+        That is, the object is the first surface on the ray through the pixel's center.
+        The mask is false where something occludes the object. Image corruptions do not
+        change it.
+
+        Raises:
+            InputError: these are facts of the scene, and not of a single configuration.
         """
         return self.sight.mask.clone()
 
@@ -217,16 +224,22 @@ class Facts:
     def depth(self) -> Tensor:
         """The distance from the camera along the ray of each pixel, (H, W) float32.
 
-        In metres; in object sizes if the size of the object is unknown. Infinite where
-        there is only the environment. Probed as the mask is. Raises InputError as
-        `sight`.
+        It is in metres, or in object sizes if the size of the object is unknown. It is
+        infinite where only the environment is visible.
+
+        Raises:
+            InputError: these are facts of the scene, and not of a single configuration.
         """
         return self.sight.depth.clone()
 
     @property
     def z_depth(self) -> Tensor:
-        """The component of `depth` along the camera's axis, (H, W) float32: what a
-        depth camera measures. Raises InputError as `sight`.
+        """The component of `depth` along the camera's axis, (H, W) float32.
+
+        That is what a depth camera measures.
+
+        Raises:
+            InputError: these are facts of the scene, and not of a single configuration.
         """
         return self.sight.z_depth.clone()
 
@@ -263,7 +276,7 @@ class Facts:
         if name not in self.numbers:
             known = ", ".join(sorted(self.numbers)) or "none"
             raise InputError(
-                f"the task needs {name}, and the scene has numbers for {known}; add "
+                f"the task needs {name}, and the scene has values of {known}; add "
                 "its control or `set` it"
             )
         return self.numbers[name]
@@ -271,28 +284,29 @@ class Facts:
 
 @dataclass(frozen=True, kw_only=True)
 class Task(ABC):
-    """Evaluate a model's output against the ground truth of the scene.
+    """Base class for all tasks, which evaluate a model's output against the truth.
 
-    Define one by the three abstract methods. A task is a dataclass; its fields are its
-    options, except for those with the metadata `FROM_RUN`, which `on` sets for a run.
+    Your tasks should subclass this class and define `truth`, `loss` and `predictions`.
+    A task is a dataclass. Its fields are its options, except for those with the metadata
+    `FROM_RUN`, which `on` sets for a run.
 
     Attributes:
-        minimise: a right prediction is sought: the object is to be made easier to
-            recognise.
-        target: what is sought instead of any wrong prediction, in the form of a truth;
-            None for any.
-        name: name on the command line.
-        objective: name of the default objective; "score" is the task's own score.
-        reads_logits: whether its models return logits (N, classes). Then their outputs
-            are checked as such, and the objectives of classification accept them.
-        labelled: whether it takes a label. In a joint task, a label goes to the tasks
-            that take one.
-        names_source: where its names come from, if neither from the model nor from the
-            setting `labels`.
-        varies: whether the truth depends on the configuration; it is computed for each
-            one then.
-        judges_rig: whether it evaluates the images of several cameras together.
-        needs_all_images: whether a single output is made from all images of a rig.
+        minimise: whether the search seeks a right prediction, so that the object is
+            easier to recognize.
+        target: prediction that the search seeks, in the form of a truth. None for any
+            wrong prediction.
+        name: name of the task on the command line.
+        objective: name of the default objective; "score" is the score of the task.
+        reads_logits: whether the models return logits (N, classes). Then their outputs
+            are checked as logits, and the objectives of classification accept them.
+        labelled: whether the task takes a label. In a joint task, a label is passed to
+            the tasks that take one.
+        names_source: source of the names of classes, in words, if it is neither the
+            model nor the setting `labels`.
+        varies: whether the truth depends on the configuration. Then it is computed for
+            each one.
+        judges_rig: whether the task evaluates the images of several cameras together.
+        needs_all_images: whether all images of a rig have a single output.
     """
 
     name: ClassVar[str]
@@ -310,10 +324,11 @@ class Task(ABC):
     def __init_subclass__(cls, **keywords: Any) -> None:
         """Make methods of a user's class get copies of their arguments.
 
-        So a method may change its arguments in place without changing the search. The
-        list below has the methods that get outputs or the truth.
+        So a method may change its arguments in place without changing the search.
+        Classes of this package are not changed (`hand_copies`).
         """
         super().__init_subclass__(**keywords)
+        # the methods that get outputs or the truth
         receive_copies: tuple[Callable[..., Any], ...] = (
             Task.truth_names,
             Task.loss,
@@ -374,7 +389,7 @@ class Task(ABC):
     def predictions(
         self, output: Output, count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return at most `count` predictions for each of N images, the likeliest
+        """Return at most `count` predictions for each of N images, the most probable
         first.
         """
 
@@ -393,22 +408,25 @@ class Task(ABC):
         raise ValueError(f"expected a tensor with {count} rows, one for each picture")
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a network that takes images alone; it is the same one unless the task
-        passes further inputs to it.
+        """Return a network that takes only images.
+
+        It is the given network by default. A task can pass further inputs to it.
         """
         return network
 
     @property
     def calibrates(self) -> bool:
-        """Whether the task needs the output for a clean image of the scene before it
-        judges (`after_calibration`).
+        """Whether the task needs a calibration before it can judge outputs.
+
+        That is a call of `after_calibration` with the output for a clean image of the
+        scene.
         """
         return False
 
     def after_calibration(
         self: TaskType, output: Output, truth: Truth | None
     ) -> TaskType:
-        """Return the task with what the output for a clean image of the scene shows.
+        """Return the task after it has read the output for a clean image of the scene.
 
         Args:
             output: output for one image.
@@ -418,21 +436,20 @@ class Task(ABC):
 
     @property
     def ambiguities(self) -> str:
-        """What the user must state for outputs to be readable, as a message; empty if
-        nothing.
+        """Message about an option that the user must state before outputs can be read.
+
+        It is empty if nothing is missing.
         """
         return ""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader has to know about how outputs are read, as sentences."""
+        """Sentences for the user about how outputs are read."""
         return ()
 
     @property
     def reader(self) -> Callable[[Any, int], Output] | None:
-        """The function that reads the outputs of its models; None if these are
-        logits.
-        """
+        """Function that reads the outputs of the models; None if they are logits."""
         return None if self.reads_logits else self.read
 
     def on(
@@ -442,7 +459,7 @@ class Task(ABC):
         target: str | None = None,
         minimise: bool = False,
     ) -> TaskType:
-        """Return the task for one model, with what is sought.
+        """Return the task for one model and a goal of the search.
 
         Args:
             model: model whose outputs the task will evaluate.
@@ -457,8 +474,9 @@ class Task(ABC):
         return replace(self, minimise=minimise)
 
     def with_objective(self: TaskType, objective: str) -> TaskType:
-        """Return the task with one of its objectives, which may define what counts as
-        success.
+        """Return the task with one of its objectives.
+
+        An objective may define what counts as a success.
         """
         return self
 
@@ -468,8 +486,9 @@ class Task(ABC):
         Raises:
             InputError: as for `truth`.
         """
+        # A truth that depends on the configuration needs a rendered image.
         if not self.varies:
-            self.truth(facts)
+            self.truth(facts)  # raises if there is none
 
     def score(self, output: Output, truth: Truth) -> Tensor:
         """Compute how near each output is to a success, (N,); differentiable.
@@ -484,20 +503,23 @@ class Task(ABC):
         return -loss if self.minimise else loss
 
     def as_logits(self, output: Output, truth: Truth) -> Output:
-        """Return the output as objectives of logits take it, without classes that are
-        no predictions.
+        """Return the output as logits, for the objectives of classification.
+
+        Classes that do not count as predictions, such as "background", are excluded.
         """
         return output
 
     def payloads(self, output: Output) -> Sequence[Any]:
-        """Return what is stored of each of N outputs beyond its label, as JSON
-        values.
+        """Return further values to store for each of N outputs, as JSON values.
+
+        By default only the label is stored.
         """
         return [None] * len(output)
 
     def marks(self, output: Output, truth: Truth) -> list[list[Mark]]:
-        """Return what to draw on each of N images to show the prediction; empty if its
-        label says it all.
+        """Return the marks to draw on each of N images, such as boxes.
+
+        By default there are none, as the label describes the prediction.
         """
         return [[] for _ in range(len(output))]
 
@@ -505,17 +527,19 @@ class Task(ABC):
         """Average the outputs of several images of a configuration.
 
         Args:
-            outputs: each of one image.
+            outputs: outputs for one image each.
 
         Returns:
-            The output of one image.
+            An output for one image.
         """
         return torch.stack(list(outputs)).mean(dim=0)
 
     @property
     def single_image_task(self) -> Task:
-        """The task of a single image: for a rig of cameras that of each of its images,
-        otherwise the task itself.
+        """The task for a single image.
+
+        That is the task itself, except for the task of a rig of cameras: then it is the
+        task for each image of the rig.
         """
         return self
 
@@ -566,6 +590,8 @@ class Task(ABC):
     ) -> list[PredictionWithPayload]:
         """Return the prediction about each of N images and its payload.
 
+        Subclasses override it if a prediction depends on the truth.
+
         Args:
             output: output for N images.
             truth: truth of the scene.
@@ -579,7 +605,8 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
     """Return a judgement with the most frequent of several predictions.
 
     Of equally frequent predictions it is the one with the lowest class index. Score,
-    margin and probability are means over the judgements with this prediction.
+    margin and probability are means over the judgements with this prediction. Whether it
+    is right, and the payload, are those of the first of these judgements.
 
     Args:
         judgements: judgements of several images of the same configuration, at least
@@ -591,7 +618,9 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
     def sort_key(candidate: tuple[str, int | None]) -> tuple[int, int]:
         """Return a key by which the most frequent comes first, then a low index."""
         _, class_index = candidate
-        return -counts[candidate], class_index or 0  # None if there are no classes
+        if class_index is None:  # a task without classes
+            class_index = 0
+        return -counts[candidate], class_index
 
     most_frequent = min(counts, key=sort_key)
     matching = [

@@ -1,5 +1,6 @@
-"""Compute with boxes (x0, y0, x1, y1 from the top left): overlap, suppression,
-formats.
+"""Functions of boxes: overlap, suppression and formats.
+
+A box is x0, y0, x1, y1, from the top left, unless a format is stated.
 """
 
 from __future__ import annotations
@@ -20,18 +21,19 @@ FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
 height; two corners with y first.
 """
 
-# Probabilities are clamped to [SMALLEST, 1 - SMALLEST], that is to log-odds of 13.8.
+# Probabilities are clamped to [MIN_PROBABILITY, 1 - MIN_PROBABILITY], so that log-odds
+# are between -13.8 and 13.8.
 MIN_PROBABILITY = 1e-6
 MIN_OVERLAP = 0.1
-"""Minimum intersection over union of a box that is on the object at all (TIDE's
+"""Minimum intersection over union of a box that is on the object, however loosely (TIDE's
 threshold of the background).
 """
 
-MAX_CANDIDATES = 500  # how many of the best scores are considered for the list of boxes
+MAX_CANDIDATES = 500  # number of best scores that are considered for the list of boxes
 
 MAX_SUPPRESSED = 2000
-"""Maximum number of boxes of a class that take part in suppression, the best ones: a
-trained network has fewer.
+"""Maximum number of boxes of a class that take part in suppression, those with the best
+scores. A trained network has fewer.
 """
 
 
@@ -120,7 +122,7 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
 
 @dataclass(frozen=True)
 class DetectionTruth:
-    """What a detector has to find in an image: the truth of detection.
+    """The truth of detection: the object that a detector has to find in an image.
 
     Attributes:
         labels: indices of the right classes.
@@ -227,7 +229,7 @@ def _top_scores(detections: Detections) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def compute_log_odds(probabilities: Tensor) -> Tensor:
-    """Compute log(p / (1 - p)), with p clamped to [SMALLEST, 1 - SMALLEST]."""
+    """Compute log(p / (1 - p)), with p clamped as for `MIN_PROBABILITY`."""
     clamped = probabilities.clamp(MIN_PROBABILITY, 1.0 - MIN_PROBABILITY)
     return clamped.log() - torch.log1p(-clamped)
 
@@ -244,22 +246,28 @@ def max_or_zero(values: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def are_invalid(boxes: Tensor) -> Tensor:
-    """Whether boxes (D, 4) of any format are invalid, (D,) bool: four equal numbers, or
-    one that is not finite.
+    """Return whether boxes (D, 4) of any format are invalid, (D,) bool.
+
+    A box is invalid if its four numbers are equal, or one is not finite.
     """
     return (boxes == boxes[:, :1]).all(dim=1) | ~boxes.isfinite().all(dim=1)
 
 
 def are_counted(detections: Detections) -> Tensor:
-    """Which rows count, (D,) bool: they have a valid box and a number over 0 with
-    it.
+    """Return which rows count as boxes, (D,) bool.
+
+    A row counts if it has a valid box and any number over 0 that is or may be a score.
     """
     has_number = (get_box_numbers(detections) > 0.0).any(dim=1)
     return ~are_invalid(detections["boxes"]) & has_number
 
 
 def get_box_numbers(detections: Detections) -> Tensor:
-    """Return the numbers of each box that are scores, or may be, detached, (D, K)."""
+    """Return the numbers of each box that are or may be scores, detached, (D, K).
+
+    K is the number of classes, 1 for boxes with labels, or 2 if it is unknown which of
+    two numbers is the score.
+    """
     if "score_or_label" in detections:
         values = detections["score_or_label"].detach()
     else:
@@ -275,41 +283,41 @@ def format_option(options: str) -> str:
 UNITS = ("fractions", "pixels")
 
 DECLARED_FORMAT_ATTRIBUTE = "boxes_are_corners_in_pixels"
-"""Attribute by which a network declares the format of its boxes, which is not inferred
-then.
+"""Attribute by which a network declares the format of its boxes. Then the format is not
+inferred.
 """
 
-# How many of the best boxes of an image the format is inferred from.
+# number of best boxes of an image from which the format is inferred
 MAX_FORMAT_BOXES = 100
 
 MAX_FRACTION = 1.5
 MIN_PIXELS = 4.0
-"""Limits of the median of the boxes' largest coordinates: up to the first these are
-fractions of the image, from the second on pixels.
+"""Limits of the median of the boxes' largest coordinates: up to `MAX_FRACTION` they are
+taken as fractions of the image, from `MIN_PIXELS` on as pixels.
 """
 
-# How far outside the image a box's center may lie, as a fraction of its width or
-# height.
+# largest distance of a box's center from the image, as a fraction of the image's width or
+# height
 MAX_CENTER_OVERSHOOT = 0.25
 
 DOUBTFUL_FRACTION = 0.5
 PLAUSIBLE_FRACTION = 0.8
-"""Fractions of plausible boxes: a format with less than the first is doubted, one with
-at least the second is suggested instead.
+"""Fractions of plausible boxes: a format with less than the first is doubtful, and one
+with at least the second is suggested instead.
 """
 
-# By how much the best overlap with the object must grow for a format to be suggested.
+# increase of the best overlap with the object from which another format is suggested
 MIN_IOU_GAIN = 0.1
 
 
 @dataclass(frozen=True)
 class BoxFormat:
-    """How the four numbers of a box are read.
+    """The format of a box: the meaning of its four numbers.
 
     Attributes:
         form: one of `FORMS`.
         unit: one of `UNITS`.
-        input_size: input size of the model's input, (height, width) in pixels.
+        input_size: (height, width) of the model's input, in pixels.
     """
 
     form: str
@@ -381,7 +389,9 @@ class BoxFormat:
             BoxFormat(form, unit, self.input_size)
             for unit in UNITS
             for form in FORMS
-            if form != "yxyx"  # with swapped axes a box is as plausible as before
+            # A box with swapped axes is as plausible as before, so that "yxyx" can't be
+            # told from "xyxy".
+            if form != "yxyx"
         ]
         plausible = [
             alternative
@@ -451,16 +461,18 @@ def select_best_boxes(images: Sequence[Detections]) -> Tensor:
     boxes_of_images = []
     for detections in images:
         rows = are_counted(detections).nonzero().flatten()
-        scores = get_box_numbers(detections)
-        # `amax` needs a column; without any, the sum gives each box a score of 0
-        score = scores.amax(dim=1) if scores.shape[1] else scores.sum(dim=1)
-        best_rows = rows[score[rows].argsort(descending=True)[:MAX_FORMAT_BOXES]]
+        numbers = get_box_numbers(detections)
+        # Without classes there are no scores, and `amax` would fail: the sum is 0.
+        has_scores = numbers.shape[1] > 0
+        best_score = numbers.amax(dim=1) if has_scores else numbers.sum(dim=1)
+        by_score = best_score[rows].argsort(descending=True)
+        best_rows = rows[by_score[:MAX_FORMAT_BOXES]]
         boxes_of_images.append(detections["boxes"].detach()[best_rows])
     return torch.cat(boxes_of_images) if boxes_of_images else torch.zeros(0, 4)
 
 
 def infer_unit(boxes: Tensor) -> str:
-    """Infer which of `UNITS` boxes (D, 4) of any format have; "" if it is open."""
+    """Infer the unit of boxes (D, 4) in any format, one of `UNITS`; "" if unclear."""
     if not len(boxes):
         return ""
     typical_coordinate = float(boxes.abs().amax(dim=1).median())

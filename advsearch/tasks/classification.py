@@ -1,8 +1,4 @@
-"""Judge classification, and define the base of tasks whose models know classes by
-index.
-
-Names of classes, softmax, argmax and leads of logits are defined here.
-"""
+"""The task of classification, and the base class of tasks with classes."""
 
 from __future__ import annotations
 
@@ -29,23 +25,24 @@ MISSED_PREFIX = "no "  # prefix of the label of an object that is not found
 
 @dataclass(frozen=True, kw_only=True)
 class ClassTask(Task):
-    """A task whose model knows classes by index.
+    """Base class for tasks whose models predict classes by index.
+
+    Attributes:
+        labels: name of each class, or a placeholder such as "class 0".
+        named: whether the labels are names, and no placeholders.
+        target: indices of the classes that the search seeks. None for any wrong class.
 
     Raises:
-        InputError: there is a target to minimise.
+        InputError: there are both a target and `minimise`.
     """
 
-    # One name per class, or a placeholder.
     labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
     named: bool = field(default=True, metadata=FROM_RUN)
-    # If there are targets, only these are a success.
     target: Labels | None = field(default=None, metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
         if self.target is not None and self.minimise:
-            raise InputError(
-                "minimise: makes the right answer easier to give; leave `target` out"
-            )
+            raise InputError("minimise: seeks the right answer; leave `target` out")
 
     def on(
         self: ClassTaskType,
@@ -67,7 +64,7 @@ class ClassTask(Task):
                 task reads.
         """
         self._check_output_kind(model)
-        if self.reads_logits:
+        if self.reads_logits:  # a classifier, whose labels were checked when loaded
             labels = model.labels
             named = model.named
         else:
@@ -88,12 +85,13 @@ class ClassTask(Task):
         Raises:
             InputError: it was loaded for a task of the other kind.
         """
-        returns_logits = model.read is None  # nothing reads them for a task
+        # A model that was loaded for another task has a function that reads its output.
+        returns_logits = model.read is None
         if returns_logits == self.reads_logits:
             return
         if self.reads_logits:
             advice = (
-                "it was loaded for another task than classification; give the same "
+                "it was loaded for another task than classification; set the same "
                 "`task` here"
             )
         else:
@@ -103,20 +101,25 @@ class ClassTask(Task):
     def _get_model_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
         """Return the names of a model's classes, and whether they are real names.
 
-        If the model has no labels, placeholders are returned. To count its classes, the
-        model is run on a gray image.
+        If the model has no labels, placeholders such as "class 0" are returned. To count
+        its classes, the model is run on a gray image.
+
+        Raises:
+            InputError: the number of labels is not that of the classes; or there are no
+                labels, and the output does not show the number of classes.
         """
         gray_image = torch.full((1, *model.input_size, 3), 0.5)
         with torch.no_grad():
             n_classes = self.count_classes(model(gray_image))
-        if n_classes is None:  # the output does not show it
+        # Boxes with labels, for example, do not show the number of classes.
+        if n_classes is None:
             if not model.labels:
                 raise InputError(
                     "labels: expected a file with the names of the classes "
                     f"of model {model.name}, got none"
                 )
             return model.labels, True
-        # placeholders if the model has no labels
+        # raises if the numbers differ; returns placeholders for None
         labels = fit_labels(n_classes, model.labels or None, LabelsOrigin(), model.name)
         return labels, bool(model.labels)
 
@@ -144,10 +147,10 @@ class ClassTask(Task):
         try:
             right_classes = find_label_set(text, self.labels, named=self.named).indices
         except InputError as error:
-            if facts.label is not None:  # the user's own
+            if facts.label is not None:  # from the user
                 raise InputError(f"label: {error}") from None
             raise InputError(
-                f"label: the label of {facts.object} itself does not fit "
+                f"label: the label in the file of {facts.object} does not fit "
                 f"the model ({error})"
             ) from None
         common_classes = sorted(set(right_classes) & set(self.target or ()))
@@ -205,10 +208,10 @@ class Classification(ClassTask):
         return self.find_right_classes(facts)
 
     def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
-        """Return logits in which classes such as "background" cannot win.
+        """Return logits in which classes such as "background" can't be predicted.
 
-        Their logits become minus infinity, unless such a class is right or there is no
-        other wrong class.
+        Their logits become minus infinity, unless such a class is right, or no other
+        class could be wrong.
 
         Args:
             output: logits (N, classes).
@@ -216,9 +219,9 @@ class Classification(ClassTask):
         """
         excluded = set(self.nothing_classes) - set(truth)
         n_classes = output.shape[1]
-        n_right = max(1, len(truth))  # `truth` is empty where it is not known
-        has_other_wrong_class = len(excluded) + n_right < n_classes
-        if not excluded or not has_other_wrong_class:
+        n_right = max(1, len(truth))  # if the truth is unknown, at least one is right
+        n_other_wrong_classes = n_classes - n_right - len(excluded)
+        if not excluded or n_other_wrong_classes <= 0:
             return output
         indices = torch.tensor(sorted(excluded), device=output.device)
         return output.index_fill(1, indices, -math.inf)
@@ -234,8 +237,10 @@ class Classification(ClassTask):
     def predictions(
         self, output: Tensor, count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        """Return the likeliest classes of each image; with a count of 1, the one with
-        the lowest index of equally likely ones.
+        """Return the `count` most probable classes of each image.
+
+        With a count of 1, of equally probable classes it is the one with the lowest
+        index.
         """
         return self._rank_classes(self.as_logits(output, ()), count)
 
@@ -245,7 +250,8 @@ class Classification(ClassTask):
         A row with NaN has the only prediction `NOT_A_NUMBER`.
         """
         probabilities = logits.detach().softmax(dim=1)
-        if count == 1:  # of equal ones `argmax` returns the first, `topk` any
+        # Of several largest values `argmax` returns the first, but `topk` any of them.
+        if count == 1:
             top_classes = probabilities.argmax(dim=1, keepdim=True)
             top_probabilities = probabilities.gather(1, top_classes)
         else:
@@ -264,7 +270,8 @@ class Classification(ClassTask):
                 for class_id, probability in zip(
                     classes, class_probabilities, strict=True
                 )
-                # excluded classes (`as_logits`) have a probability of 0
+                # Classes that `as_logits` excludes have a probability of 0. A single
+                # prediction is always returned.
                 if probability > 0.0 or count == 1
             )
             predictions_of_images.append(predictions)
@@ -274,25 +281,28 @@ class Classification(ClassTask):
         """Judge each of N outputs.
 
         The result is that of `Task.judge`, but the logits are computed only once. If a
-        subclass defines `loss` or `score`, these methods are called instead.
+        subclass overrides `loss` or `score`, these methods are called.
 
         Args:
             output: logits (N, classes).
             truth: indices of the right classes.
         """
         logits = self.as_logits(output, truth)
-        defines_loss = type(self).loss is not Classification.loss
-        if defines_loss:
+        overrides_loss = type(self).loss is not Classification.loss
+        if overrides_loss:
             losses = self.loss(output, truth)
         else:
             losses = compute_misclassification_margin(logits, truth)
-        defines_score = type(self).score is not Classification.score
-        if defines_score or self.target is not None:
+        overrides_score = type(self).score is not Classification.score
+        if overrides_score or self.target is not None:
             scores = self.score(output, truth)
         else:  # as `Task.score`
             scores = -losses if self.minimise else losses
         margins = 0.0 - losses  # not `-losses`, which would be -0.0 for 0
-        top_predictions = [top for (top,) in self._rank_classes(logits, count=1)]
+        # one prediction for each image
+        top_predictions = [
+            prediction for (prediction,) in self._rank_classes(logits, count=1)
+        ]
         return [
             Judgement.from_margin(score, margin, prediction)
             for score, margin, prediction in zip(
@@ -311,7 +321,9 @@ def compute_misclassification_margin(logits: Tensor, right: Labels) -> Tensor:
     """Compute the largest wrong logit minus the largest right one, (N,).
 
     It is over 0 if the prediction is wrong, and below 0 if it is right; 0 at a tie.
-    Raises InputError as `make_class_mask`.
+
+    Raises:
+        InputError: as for `make_class_mask`.
     """
     is_right = make_class_mask(logits, right)
     return compute_largest_logit(logits, ~is_right) - compute_largest_logit(
@@ -322,8 +334,10 @@ def compute_misclassification_margin(logits: Tensor, right: Labels) -> Tensor:
 def compute_target_margin(logits: Tensor, targets: Labels) -> Tensor:
     """Compute the largest logit of the targets minus the largest other one, (N,).
 
-    It is over 0 if a target is predicted, and below 0 if not; 0 at a tie. Raises
-    InputError as `make_class_mask`.
+    It is over 0 if a target is predicted, and below 0 if not; 0 at a tie.
+
+    Raises:
+        InputError: as for `make_class_mask`.
     """
     is_target = make_class_mask(logits, targets, "target")
     return compute_largest_logit(logits, is_target) - compute_largest_logit(
@@ -364,7 +378,7 @@ def make_class_mask(
         if setting == "label":
             consequence = "no prediction could be wrong"
         else:
-            consequence = "every prediction would be a hit"
+            consequence = "every prediction would be a success"
         raise InputError(
             f"{setting}: the label set holds all {n_classes} classes, so {consequence}"
         )

@@ -1,5 +1,6 @@
-"""Judge commands: how far a policy's action leaves an envelope around its clean
-action.
+"""Task for the actions of a policy, such as the commands of a robot.
+
+An action is right if it is within an envelope around the action for the clean scene.
 """
 
 from __future__ import annotations
@@ -26,24 +27,25 @@ from advsearch.extend import (
 
 Numbers = tuple[float, ...]
 
-MAX_NUMBERS = 4096  # maximum of numbers of a state, and of elements of an action
-MAX_STATE_BYTES = 1 << 20  # maximum size of a file with a state, in bytes
+MAX_NUMBERS = 4096  # maximum count of numbers in a state, and of elements in an action
+MAX_STATE_BYTES = 1 << 20  # maximum size of a file with a state
 
 INSIDE = "action within its envelope"
 REACHED = "action within the envelope of the target"
 """Labels of actions; others are outside their envelope."""
 
-MAX_FORMATTED_ELEMENTS = 4  # how many elements of an action its text has
+MAX_FORMATTED_ELEMENTS = 4  # maximum number of elements in the text of an action
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Task):
-    """Judge the action of a policy by the one in the clean scene.
+    """Compare the action of a policy with its action in the clean scene.
 
-    It is open loop: one image, one action. The output is actions (N, A), in the units
-    of the policy. The truth is the clean action c (A,), from one image of the clean
-    scene. With the envelope e the loss is max |a - c| / e over the elements, minus 1.
-    With a target t, a success is max |a - t| / e of at most 1.
+    The loop is open: each action is for a single image, and has no effect on later
+    images. The output is actions (N, A), in the units of the policy. The truth is the
+    clean action c (A,), for one image of the clean scene. With the envelope e the loss is
+    max |a - c| / e over the elements, minus 1. With a target t, a success is max |a - t|
+    / e of at most 1.
 
     Args:
         state: inputs of the policy other than images: numbers, or lists of numbers, by
@@ -97,8 +99,9 @@ class Command(Task):
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
         """Wrap a policy so that it gets the state of the robot together with images.
 
-        Without a state the network is returned unchanged. An exception is a policy of
-        LeRobot: it has a method `select_action`, which `WithState` calls.
+        Without a state the network is returned unchanged, with one exception. A policy
+        of LeRobot has a method `select_action`, which only `WithState` calls: so it is
+        wrapped with an empty state.
         """
         if isinstance(network, models.AllAtOnce):
             # `AllAtOnce` passes the images of all cameras to a policy. The policy inside
@@ -107,7 +110,7 @@ class Command(Task):
             return models.AllAtOnce(policy_with_state, network.cameras, network.layout)
         policy = network
         if isinstance(network, models.WithState):
-            # wrapped for another task already, whose state is replaced
+            # It was wrapped for another task, whose state is replaced.
             policy = network.network
         if self.state or hasattr(policy, "select_action"):
             return models.WithState(policy, self.state)
@@ -176,28 +179,27 @@ class Command(Task):
 
         Raises:
             InputError: there is no envelope, the model was loaded for another task or
-                with names of classes, the target is no action, or the clean action is
-                sought.
+                with names of classes, the target is no action, or `minimise` is set.
         """
-        if model.read is None:  # its outputs are logits, as of a classifier
+        if model.read is None:  # its outputs are logits, as those of a classifier
             raise InputError(
                 f"model {model.name}: it was loaded for its logits; load "
                 'it with task="command"'
             )
         if model.labels:
             raise InputError(
-                "labels: task command has no classes; this is a classifier: give a "
-                "policy as `model`"
+                "labels: task command has no classes, and this model is a classifier; "
+                "set a policy as `model`"
             )
         if self.envelope is None:
             raise InputError(
-                "task command: envelope: expected how far an action may be off, in its "
-                "unit, or a list with a number for each element, got none; write "
+                "task command: envelope: expected the allowed deviation of an action, "
+                "in its unit, or a list with a number for each element, got none; write "
                 "`task='command={envelope: 0.2}'`"
             )
         if minimise:
             raise InputError(
-                "minimise: the clean action is within its envelope already; leave it "
+                "minimise: the clean action is already within its envelope; leave it "
                 "out"
             )
         return replace(
@@ -219,7 +221,7 @@ class Command(Task):
             return values
         unknown = [name for name in element_names if name not in self.names]
         if unknown:
-            known = ", ".join(self.names) or "none; give `names`"
+            known = ", ".join(self.names) or "none; set `names`"
             raise InputError(
                 f"target: expected elements that `names` has ({known}), "
                 f"got {unknown[0]!r}"
@@ -233,7 +235,7 @@ class Command(Task):
         return self.clean is None
 
     def after_calibration(self, output: Tensor, truth: Tensor | None) -> Command:
-        """Store the clean action, by which all other actions are judged.
+        """Store the clean action, with which all other actions are compared.
 
         Args:
             output: action (1, A) for the clean image.
@@ -241,15 +243,15 @@ class Command(Task):
 
         Raises:
             InputError: the clean action is not finite, or the target has another size
-                or is too near to it.
+                or is too near to it (`_check_target`).
         """
-        if not self.calibrates:
+        if not self.calibrates:  # the clean action is stored already
             return self
         clean_action = output[0].detach().float()
         if not bool(clean_action.isfinite().all()):
             raise InputError(
-                "task command: the clean action has NaN or infinity, and "
-                "nothing can be judged by it"
+                "task command: the clean action has NaN or infinity, so that no action "
+                "can be compared with it"
             )
         if self.target is not None:
             self._check_target(clean_action)
@@ -266,10 +268,11 @@ class Command(Task):
                 f"target: expected an action of {len(clean_action)} elements, got "
                 f"{len(self.target)}"
             )
-        # The loss is the distance in envelopes, minus 1. Within a distance of 2, an action
-        # could be in both envelopes: right, and a success.
-        do_envelopes_overlap = float(self.loss(clean_action[None], self.target)) <= 1.0
-        if do_envelopes_overlap:
+        # The distance in envelopes; elements that the target does not state count 0. If it
+        # is at most 2, both envelopes overlap, and an action in both of them would be
+        # right and a success as well.
+        distance = float(self.loss(clean_action[None], self.target)) + 1.0
+        if distance <= 2.0:
             raise InputError(
                 "target: expected an action more than two envelopes from the clean "
                 f"one, which is {self._format_action(clean_action.tolist())}"
@@ -287,8 +290,8 @@ class Command(Task):
         return (
             f"The clean action is {self._format_action(clean_action)}, from one picture of "
             f"the clean scene; its envelope is {self._format_action(envelope, sign='± ')}. "
-            "An action is judged by itself: nothing moves, and no later picture follows "
-            "from it.",
+            "Each action is judged by itself: it moves nothing, and has no effect on "
+            "later pictures.",
         )
 
     @property
@@ -300,8 +303,8 @@ class Command(Task):
     def check(self, facts: tasks.Facts) -> None:
         if facts.label is not None:
             raise InputError(
-                "label: task command has no classes, the clean action is "
-                "what is right; leave it out"
+                "label: task command has no classes; the clean action is the truth; "
+                "leave it out"
             )
 
     def truth(self, facts: tasks.Facts) -> Tensor | None:
@@ -323,14 +326,14 @@ class Command(Task):
                 judged, so that their deviation is 0.
 
         Raises:
-            InputError: there is no center, since no clean image came first.
+            InputError: there is no center, since the task has not been calibrated.
         """
         if center is None:
             raise InputError(
-                "task command: expected a clean picture that it was shown first"
+                "task command: expected a clean picture before other pictures"
             )
         is_known = ~center.isnan().to(output.device)
-        # an element that is not judged is compared with itself
+        # An element that is not judged is compared with itself.
         center_of_action = center.to(output).where(is_known, output.detach())
         return (output - center_of_action) / output.new_tensor(self.envelope)
 
@@ -351,15 +354,15 @@ class Command(Task):
     ) -> list[tasks.PredictionWithPayload]:
         """Return for each action whether it left its envelope, and by which element.
 
-        The payload has the action and the clean one, also as text, and the number of
-        envelopes between them.
+        The payload has the action and the clean one, also as text, and the largest
+        deviation of an element ("envelopes"): 1 is the edge of the envelope.
 
         Args:
             output: actions (N, A).
             truth: the clean action (A,).
             margins: margin of each action: 1 minus its largest deviation in envelopes.
         """
-        assert truth is not None
+        assert truth is not None  # the task has been calibrated
         results: list[tasks.PredictionWithPayload] = []
         reaches_target = [False] * len(output)
         if self.target is not None:
@@ -379,7 +382,6 @@ class Command(Task):
             payload: tasks.JsonValue = {
                 "action": action,
                 "clean": clean_action,
-                # the margin is 1 less the largest deviation in envelopes
                 "envelopes": 1.0 - margin,
                 "text": f"{self._format_action(action)}, clean {clean_text}",
             }
@@ -387,8 +389,10 @@ class Command(Task):
         return results
 
     def _make_outside_label(self, deviation: Tensor) -> str:
-        """Return the label of an action outside its envelope, with its deviation
-        (A,).
+        """Return the label of an action outside its envelope.
+
+        Args:
+            deviation: (A,) deviation of each element from the clean action.
         """
         furthest = int(deviation.abs().argmax())
         direction = "above" if deviation[furthest] > 0.0 else "below"
@@ -437,7 +441,7 @@ def _parse_names(option: str, value: Any) -> tuple[str, ...]:
     )
     if len(names) > MAX_NUMBERS or not are_names:
         raise InputError(
-            f"task command: {option}: expected texts, or one with commas between "
+            f"task command: {option}: expected strings, or one with commas between "
             f"them, got {value!r:.80}"
         )
     return tuple(names)
@@ -451,7 +455,7 @@ def _parse_numbers(option: str, value: Any) -> Numbers:
     """
     items = value.tolist() if hasattr(value, "tolist") else value
     items = list(items) if isinstance(items, (list, tuple)) else [items]
-    numbers: Numbers = ()  # remains if an item is no number: then it is refused below
+    numbers: Numbers = ()  # stays empty if an item is no number, and is rejected below
     if not any(isinstance(item, bool) for item in items):
         with suppress(TypeError, ValueError, OverflowError):
             numbers = tuple(float(item) for item in items)
@@ -492,7 +496,7 @@ def _load_state(value: Any) -> dict[str, Numbers]:
     }
     if sum(map(len, state.values())) > MAX_NUMBERS:
         raise InputError(
-            f"task command: state: expected at most {MAX_NUMBERS:,} numbers in all"
+            f"task command: state: expected at most {MAX_NUMBERS:,} numbers in total"
         )
     return state
 

@@ -1,10 +1,10 @@
-"""Judge depth: whether a model predicts the object at its true distance.
+"""Task for depth: does a model predict the object at its true distance?
 
-Models predict z-depth, the distance along the camera's axis, and are compared with it.
-Relative ones predict it, or its inverse (disparity), up to a scale and a shift, which
-are fitted by least squares (Ranftl et al. 2020, "Towards robust monocular depth
-estimation", arXiv 1907.01341, sections 5 and 6). The fit uses the pixels outside the
-object, so that the object does not affect how it is judged.
+Models predict z-depth, the distance along the camera's axis. Relative models predict it,
+or its inverse (disparity), up to a scale and a shift. These are fitted by least squares
+(Ranftl et al. 2020, "Towards robust monocular depth estimation", arXiv 1907.01341,
+sections 5 and 6). The fit uses the pixels outside the object, so that a wrong prediction
+about the object does not change it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ KINDS = {
     RELATIVE: "the distance, up to a scale and a shift",
     METRIC: "the distance in metres",
 }
-"""What the values of a model may be."""
+"""Kinds of values that a model may predict, with a description."""
 
 AS_FAR = "as far as it is"
 OUT_OF_SHAPE = "out of shape"
@@ -45,30 +45,32 @@ GOALS = {
     "farther": f"the object is judged {FARTHER}",
     "gone": f"the object is judged to be {AS_BACKGROUND}",
 }
-"""What an attack may seek, by the name of the objective."""
+"""Goals of an attack, by the name of the objective."""
 
 MIN_FIT_PIXELS = 16
 MIN_DISTANCE_RATIO = 1.1
 """Minimum number of pixels outside the object for the fit of scale and shift, and
-minimum ratio of their farthest to their nearest distance.
+minimum ratio of their largest to their smallest distance.
 """
 MAX_FACTOR = 100.0  # maximum factor by which a pixel counts as too near or too far
+# smallest distance that is drawn: a predicted distance may be 0 or negative
+MIN_MAP_DISTANCE = 1.0 / MAX_FACTOR
 
 DepthMap = Mapping[str, Tensor]
-"""What a model returns for one image: (h, w), by one of `KINDS`, or "" if it does not
-state which.
+"""The output for one image: a single map (h, w). Its key is the kind of its values, one of
+`KINDS`, or "" if the network does not state the kind.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class DepthTruth:
-    """The true distances in an image: the truth of depth.
+    """The truth of depth: the true distances in an image.
 
     Attributes:
         mask: (H, W) bool, the pixels in which the object is visible.
-        z: (H, W) z-depth of everything, infinite where there is nothing; in metres, or
-            in object sizes if `size_in_metres` is None.
-        size_in_metres: size of the object.
+        z: (H, W) z-depth of the visible surfaces, infinite where there is none; in
+            metres, or in object sizes if `size_in_metres` is None.
+        size_in_metres: size of the object's longest side; None if it is unknown.
     """
 
     mask: Tensor
@@ -109,34 +111,56 @@ class DepthTruth:
 
         Disparity is the inverse of z-depth, 0 at an infinite distance. It is
         interpolated linearly between the nearest pixels left and right of the object in
-        the same row, which is exact for a plane.
+        the same row, which is exact for a plane. If the object reaches one edge of the
+        image, the pixel on its other side is used. If it fills the row, the background
+        is unknown.
         """
-        height, width = self.mask.shape
+        width = self.mask.shape[1]
         disparity = self.z.reciprocal()
-        column = torch.arange(width).expand(height, width)
-        # The nearest column outside the object to the left of each pixel, and to the
-        # right; -1 and `width` if there is none. A running maximum from the left, and a
-        # running minimum from the right, carry the last such column on over the object.
-        left = torch.where(self.mask, -1, column).cummax(dim=1).values
-        right_edges = torch.where(self.mask, width, column).flip(1)
-        right = right_edges.cummin(dim=1).values.flip(1)
+        column = torch.arange(width).expand(self.mask.shape)
+        left = self._find_left_neighbors(column)
+        right = self._find_right_neighbors(column)
+        has_left = left >= 0
+        has_right = right < width
+        # Clamped for `gather`: values without a neighbor are replaced below.
         left_disparity = disparity.gather(1, left.clamp_min(0))
         right_disparity = disparity.gather(1, right.clamp_max(width - 1))
+        # Outside of the object both neighbors are the pixel itself: the width is 0.
         weight = (column - left) / (right - left).clamp_min(1)
-        result = left_disparity + weight * (right_disparity - left_disparity)
-        # If the object reaches one edge of the image, the value on its other side is
-        # taken.
-        has_left = left >= 0
-        has_right = right != width
-        result = torch.where(has_right, result, left_disparity)
+        interpolated = left_disparity + weight * (right_disparity - left_disparity)
+        result = torch.where(has_right, interpolated, left_disparity)
         result = torch.where(has_left, result, right_disparity)
         return torch.where(has_left | has_right, result, math.nan)
+
+    def _find_left_neighbors(self, column: Tensor) -> Tensor:
+        """Return the nearest column outside the object at or left of each pixel.
+
+        It is -1 if there is none.
+
+        Args:
+            column: (H, W) column of each pixel.
+        """
+        # The running maximum over a row is the last column outside the object.
+        columns_outside = torch.where(self.mask, -1, column)
+        return columns_outside.cummax(dim=1).values
+
+    def _find_right_neighbors(self, column: Tensor) -> Tensor:
+        """Return the nearest column outside the object at or right of each pixel.
+
+        It is the width of the image if there is none.
+
+        Args:
+            column: (H, W) column of each pixel.
+        """
+        # The running minimum from the right is the first column outside the object.
+        width = self.mask.shape[1]
+        columns_outside = torch.where(self.mask, width, column)
+        return columns_outside.flip(1).cummin(dim=1).values.flip(1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Depth(Task):
-    """Judge whether a model predicts the object's distance within a factor of 1 +
-    `tolerance`.
+    """Judge whether the object's distance is right within a factor of 1 + `tolerance`.
 
     The factor is the geometric mean over the object's pixels. If nothing of the object
     is visible, every prediction is right.
@@ -144,14 +168,14 @@ class Depth(Task):
     Args:
         tolerance: 0.25 for a factor of 1.25, the first threshold of Eigen et al. 2014
             (arXiv 1406.2283).
-        kind: kind of the model's values, one of `KINDS`; "" for what the network
-            states.
-        size: size of the real object, its longest side in metres, for a model that
-            predicts metres; without it the scene's.
-        seek: what an attack seeks, one of `GOALS`; "" for any wrong distance.
+        kind: kind of the model's values, one of `KINDS`; "" for the kind that the
+            network states.
+        size: longest side of the real object in metres, for a model that predicts
+            metres; 0 for that of the scene.
+        seek: goal of an attack, one of `GOALS`; "" for any wrong distance.
 
     Raises:
-        InputError: a value that is none of these.
+        InputError: an option has another value.
     """
 
     name = "depth"
@@ -174,7 +198,7 @@ class Depth(Task):
             "a number over 0, under 100",
             "tolerance",
         )
-        # 0, the default, means that there is none: the lower bound lets it pass
+        # The lower bound is a little below 0, because 0 means that no size is set.
         self.check_numbers(
             lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size"
         )
@@ -227,15 +251,15 @@ class Depth(Task):
             InputError: the model was loaded for another task or with names of classes,
                 or there is a target.
         """
-        if model.read is None:  # its outputs are logits, as of a classifier
+        if model.read is None:  # its outputs are logits, as those of a classifier
             raise InputError(
                 f"model {model.name}: it was loaded for its logits; load "
                 'it with task="depth"'
             )
         if model.labels:
             raise InputError(
-                "labels: task depth has no classes; leave them out, or give a network "
-                "without classes of its own"
+                "labels: task depth has no classes; leave them out, or use a network "
+                "without classes"
             )
         return super().on(model, target=target, minimise=minimise)
 
@@ -249,16 +273,20 @@ class Depth(Task):
     def after_calibration(
         self, output: Sequence[DepthMap], truth: DepthTruth | None
     ) -> Depth:
-        """See `Task.after_calibration`: find out what the values are, by the options or
-        by what the network states in the map of a clean image.
+        """Return the task with the kind of the values in the map of a clean image.
+
+        The kind is that of the options, or that which the network states. If it is
+        unknown, or predictions can't be judged, the message about it is stored in
+        `missing`, which `ambiguities` returns.
         """
         kind = self._get_kind(output[0])
         missing = self._describe_missing_option(kind, truth)
         return replace(self, resolved_kind=kind, missing=missing)
 
     def _get_kind(self, depth_map: DepthMap) -> str:
-        """Return which of `KINDS` the values of a map are, by the option or else by the
-        network; "" if neither states it.
+        """Return the kind of the values of a map, one of `KINDS`.
+
+        The option `kind` decides, or else the network. It is "" if neither states it.
         """
         (stated_kind,) = depth_map  # its only key
         return self.kind or stated_kind
@@ -266,7 +294,8 @@ class Depth(Task):
     def _describe_missing_option(self, kind: str, truth: DepthTruth | None) -> str:
         """Return a message if predictions cannot be judged yet; "" if they can.
 
-        The message says what the user has to state or change.
+        The message says which option the user has to state, or what has to change in
+        the scene.
 
         Args:
             kind: kind of the model's values, one of `KINDS`, or "" if it is unknown.
@@ -274,25 +303,26 @@ class Depth(Task):
         """
         if not kind:
             return (
-                f"kind: expected what its numbers are, one of {', '.join(KINDS)}, and "
-                "its network does not say it; give `task='depth={kind: "
-                f"{DISPARITY}}}'`, say"
+                f"kind: expected the kind of its numbers, one of {', '.join(KINDS)}, "
+                "which its network does not state; set, for example, "
+                f"`task='depth={{kind: {DISPARITY}}}'`"
             )
         if kind == METRIC:
             has_scene_size = truth is not None and truth.size_in_metres is not None
             if self.size or has_scene_size:
                 return ""
             return (
-                "size: it predicts metres, and how large the object is is not known; "
-                "give its longest side in metres, such as `size=0.1`"
+                "size: it predicts metres, and the size of the object is unknown; "
+                "set its longest side in metres, such as `size=0.1`"
             )
+        # If the object is out of view, every prediction is right.
         if truth is None or not truth.is_visible or truth.determines_scale:
             return ""
         return (
-            "it predicts up to a scale and a shift, which are found on what is seen "
-            f"beside the object: expected {MIN_FIT_PIXELS} pixels at distances that "
-            f"differ by a factor of {MIN_DISTANCE_RATIO:g}, got "
-            f"{int(truth.outside_object.sum())}; give a scene with a ground or a room, "
+            "it predicts distances up to a scale and a shift, which are fitted to the "
+            f"pixels outside the object: expected {MIN_FIT_PIXELS} pixels at distances "
+            f"that differ by a factor of {MIN_DISTANCE_RATIO:g}, got "
+            f"{int(truth.outside_object.sum())}; use a scene with a ground or a room, "
             "and a camera that sees it from the side"
         )
 
@@ -302,7 +332,11 @@ class Depth(Task):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Say how the model's numbers are read, once that is known."""
+        """Return a sentence about the meaning of the model's numbers, once it is known.
+
+        For example "The model's numbers are read as metric depth: the distance in
+        metres."
+        """
         if not self.resolved_kind:
             return ()
         text = (
@@ -310,8 +344,9 @@ class Depth(Task):
             f"{KINDS[self.resolved_kind]}"
         )
         if self.resolved_kind != METRIC:
+            # the text ends with "up to a scale and a shift"
             return (
-                f"{text}, which are found by least squares on what is seen beside the "
+                f"{text}, which are fitted by least squares to the pixels outside the "
                 "object.",
             )
         if self.size:
@@ -319,24 +354,25 @@ class Depth(Task):
         return (f"{text}.",)
 
     def check(self, facts: tasks.Facts) -> None:
-        """See `Task.check`. Raises InputError: there is a label."""
+        """Raise InputError if there is a label."""
         if facts.label is not None:
             raise InputError("label: task depth has no classes; leave it out")
 
     def truth(self, facts: tasks.Facts) -> DepthTruth:
-        """Return where the object is visible, and the distance of everything.
+        """Return the pixels in which the object is visible, and all distances.
 
         Raises:
             InputError: the lens sees so far from its axis that z-depth is no distance.
         """
-        # z-depth is the distance times the cosine of the angle to the camera's axis
-        sees_far_from_axis = facts.z_depth < MIN_AXIS_COSINE * facts.depth
-        if bool(sees_far_from_axis.any()):
+        # z-depth is the distance times the cosine of the angle to the camera's axis.
+        # Where both are infinite, the comparison is false.
+        is_far_from_axis = facts.z_depth < MIN_AXIS_COSINE * facts.depth
+        if bool(is_far_from_axis.any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, "
                 "and this lens sees things more than "
                 f"{math.degrees(math.acos(MIN_AXIS_COSINE)):.0f} degrees from its "
-                "axis; take a lens that sees less"
+                "axis; use a lens with a smaller field of view"
             )
         return DepthTruth(facts.mask, facts.z_depth, facts.sight.size_in_metres)
 
@@ -346,10 +382,10 @@ class Depth(Task):
     # ---- loss and score ----
 
     def loss(self, output: Sequence[DepthMap], truth: DepthTruth) -> Tensor:
-        """Compute how much the object's distance is off beyond the tolerance, (N,).
+        """Compute by how much the error of the object's distance exceeds the tolerance.
 
         That is the mean over its pixels of |log(predicted / true)|, minus log(1 +
-        tolerance).
+        tolerance), (N,).
         """
         return self._map_images(
             output,
@@ -370,7 +406,7 @@ class Depth(Task):
             return super().score(output, truth)
 
         def score_gone(log_factors: Tensor) -> Tensor:
-            """Return by how much the object is as far as what is behind it, ()."""
+            """Return how near the object is to being as far as the background, ()."""
             excess = log_factors.abs().mean() - self._log_limit
             lost_relief = 0.5 - self._compute_relief_fraction(log_factors, truth)
             return torch.minimum(excess, lost_relief)
@@ -429,7 +465,7 @@ class Depth(Task):
             ratio = predicted[mask] * z[mask]
         else:
             ratio = predicted[mask] / z[mask]
-        # clamped first, since a predicted disparity may be 0 or negative
+        # Clamped first, since a prediction may be 0 or negative.
         log_ratio = ratio.clamp(1.0 / MAX_FACTOR, MAX_FACTOR).log()
         log_factors = -log_ratio if is_inverse else log_ratio
         # 0, or NaN if the map has a NaN anywhere, also outside the object
@@ -446,8 +482,8 @@ class Depth(Task):
         as `post_process_depth_estimation` of transformers does it.
 
         Returns:
-            The predicted z-depth of every pixel, (H, W), and False; for a map of
-            disparity the inverse of z-depth, and True.
+            The predicted z-depth of every pixel, (H, W), or for a map of disparity the
+            inverse of z-depth; and whether it is the inverse.
         """
         kind = self._get_kind(depth_map)
         (values,) = depth_map.values()  # the only map
@@ -459,8 +495,10 @@ class Depth(Task):
         if kind == METRIC:
             scale = 1.0
             if self.size:
-                # from metres of the real object to metres in the scene, or object sizes
-                scale = (truth.size_in_metres or 1.0) / self.size
+                # The option `size` is the real size of the object. The scene has it at
+                # another size, in metres or, if that is unknown, as 1 object size.
+                scene_size = truth.size_in_metres or 1.0
+                scale = scene_size / self.size
             return values * scale, False
         z = truth.z.to(values.device)
         fit_mask = truth.fit_mask.to(values.device)
@@ -520,9 +558,9 @@ class Depth(Task):
     ) -> list[tasks.PredictionWithPayload]:
         """Return whether the object's distance is right in each image, and a payload.
 
-        The payload has the true and the predicted distance, the mean factor between
-        them, the remaining fraction of the relief, and where scale and shift were
-        fitted.
+        The payload has the true and the predicted distance (geometric means over the
+        object's pixels), the mean factor of an error in either direction, the remaining
+        fraction of the relief, and the pixels on which scale and shift were fitted.
 
         Args:
             output: maps of N images.
@@ -532,7 +570,7 @@ class Depth(Task):
         if not truth.is_visible:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
         results: list[tasks.PredictionWithPayload] = []
-        # the geometric mean over the object's pixels, since factors are averaged so
+        # a geometric mean, like that of the factors
         distance = float(truth.z[truth.mask].double().log().mean().exp())
         for depth_map, margin in zip(output, margins, strict=True):
             log_factors = self._compute_log_factors(depth_map, truth)
@@ -556,8 +594,9 @@ class Depth(Task):
         return results
 
     def _choose_error_label(self, mean_log_factor: float, relief: float) -> str:
-        """Return the label of a wrong distance; of several that fit, the one that the
-        search seeks.
+        """Return the label of a wrong distance.
+
+        If several labels fit, that of the search's goal is returned.
 
         Args:
             mean_log_factor: mean of log(predicted / true) over the object's pixels.
@@ -589,10 +628,11 @@ class Depth(Task):
         for depth_map in output:
             marks = [true_mark]
             kind = self._get_kind(depth_map)
-            # A map that is fitted to the truth is drawn even if the fit is unreliable:
-            # without the truth that is no reason.
-            truth_of_size = truth if kind == METRIC else None
-            missing = self._describe_missing_option(kind, truth_of_size)
+            # An option must not be missing. A map of relative values is drawn even if
+            # the pixels outside the object do not determine scale and shift: that is
+            # only checked with the truth, which is left out.
+            truth_with_size = truth if kind == METRIC else None
+            missing = self._describe_missing_option(kind, truth_with_size)
             if truth.is_visible and not missing:
                 marks.append(self._make_predicted_mark(depth_map, truth))
             marks_of_images.append(marks)
@@ -603,15 +643,14 @@ class Depth(Task):
     ) -> tasks.Mark:
         """Return the predicted disparity, with the object's pixels that are right."""
         log_factors = self._compute_log_factors(depth_map, truth).detach()
-        is_right_pixel = log_factors.abs() <= self._log_limit  # (P,) of the object's
+        is_right_pixel = log_factors.abs() <= self._log_limit  # (P,) object's pixels
         right_mask = torch.zeros_like(truth.mask)
         right_mask[truth.mask] = is_right_pixel.to(right_mask.device)
         predicted, is_inverse = self._align_to_truth(depth_map, truth)
         if is_inverse:  # the inverse of a distance is the disparity
             disparity = predicted
         else:
-            # a predicted distance may be 0 or negative
-            disparity = predicted.clamp_min(1.0 / MAX_FACTOR).reciprocal()
+            disparity = predicted.clamp_min(MIN_MAP_DISTANCE).reciprocal()
         return tasks.Mark(
             "disparity", true=False, mask=right_mask, map=disparity.detach().cpu()
         )
@@ -621,8 +660,9 @@ def _find_maps(returned: Any) -> tuple[str, Any]:
     """Find the maps in what a network returned.
 
     Returns:
-        Which of `KINDS` the network states for its values, "" if it states none; and the
-        maps, unchecked: None or something else if there are none.
+        The kind of the values that the network states, one of `KINDS`, or "" if it
+        states none; and the maps. These are not checked: they may be None or something
+        else.
     """
     if isinstance(returned, Mapping):
         kind = next((kind for kind in KINDS if kind in returned), "")

@@ -1,10 +1,10 @@
-"""Judge object detection: a box at the object with a right class counts as found.
+"""Task for object detection: is there a box with a right class at the object?
 
-Dense outputs (a score of every class per box) go through greedy non-maximum
-suppression per class first. The object is found by a right box that survives it, and
-has vanished where there was none before suppression either; a box that makes an attack
-a success must survive too. Boxes that come with labels count as they are. Scores p are
-compared as log-odds, log(p / (1 - p)).
+If an output has a score of every class for each box, greedy non-maximum suppression is
+applied to each class first. The object is found if a right box survives suppression. It
+has vanished only if there is no right box before suppression either. A box that makes an
+attack a success must survive too. Boxes with labels are not suppressed, as networks
+return them after suppression. Scores p are compared as log-odds, log(p / (1 - p)).
 """
 
 from __future__ import annotations
@@ -62,15 +62,13 @@ GOALS = {
     "object: they are loose or elsewhere",
     "create": "a box is found where nothing is",
 }
-"""What an attack may seek, by the name of the objective."""
+"""Goals of an attack, by the name of the objective."""
 
-MAX_STORED_BOXES = 8
-MIN_SCORE = 0.1
-"""Maximum number of boxes stored per image; minimum score of a box that is stored or
-takes part in suppression.
-"""
+MAX_STORED_BOXES = 8  # maximum number of boxes that are stored for each image
+MIN_SCORE = 0.1  # minimum score of a box that is stored or takes part in suppression
 
-# A box of which this fraction lies on the object is on it, whatever its overlap.
+# A box is on the object if this fraction of it lies inside of the true box, even if the
+# intersection over union is small.
 MIN_FRACTION_INSIDE = 0.5
 
 LABELS = {
@@ -78,15 +76,16 @@ LABELS = {
     Outcome.PHANTOM: "{} elsewhere",
     Outcome.MISSED: f"{MISSED_PREFIX}{{}}",
 }
-"""Label of a prediction by its outcome; other outcomes are labelled by their class."""
+"""Label of a prediction by its outcome. For other outcomes the label is the class."""
 
 
 @dataclass(frozen=True)
 class ObjectMatch:
-    """What becomes of the object in the detections of one image.
+    """The outcome for the object in the detections of one image.
 
     Attributes:
-        outcome: None if the object is out of view and nothing is detected.
+        outcome: outcome, such as found or missed. None if the object is out of view and
+            nothing is detected.
         index: class of the deciding box, or the first right class if there is none.
         score: score of the deciding box; None if it is not finite.
         iou: intersection over union of that box with the true one; None if there is
@@ -103,16 +102,17 @@ class ObjectMatch:
 class Detection(ClassTask):
     """Judge whether a model detects the object.
 
-    It does if one of its boxes has a right class, a score of `confidence` or more, and
-    overlaps the true box. If the object is out of view there is nothing to detect, and
-    every prediction is right.
+    The object is detected if a box has a right class, a score of at least `confidence`,
+    and an intersection over union of at least `iou` with the true box. If the object is
+    out of view, there is nothing to detect, and every prediction is right.
 
     Args:
         iou: minimum intersection over union with the true box.
         confidence: minimum score of a box that counts.
-        boxes: format of a box, one of `FORMS`; "" for xyxy, or cxcywh for YOLO heads.
+        boxes: format of a box, one of `FORMS`; "" for xyxy, or for cxcywh if the output
+            is that of a YOLO head or a DETR.
         suppression: intersection over union from which two boxes of a class are
-            duplicates, of which the better one stays; 1 disables suppression.
+            duplicates, of which only the better one is used; 1 disables suppression.
         unit: unit of box coordinates: "fractions" of the image's width and height, or
             "pixels" of the model's input; "" to infer it from the boxes in an image of
             noise, or in a clean image of the scene if none are found in noise.
@@ -122,10 +122,27 @@ class Detection(ClassTask):
             first" or "channels last"; for DETR "boxes logits", or "boxes logits
             nothing" if the last class means no object; "" to infer it from types and
             values.
-        seek: what an attack seeks, one of `GOALS`.
+        seek: goal of an attack, one of `GOALS`.
+
+    Attributes:
+        input_size: input size of the model, (height, width) in pixels.
+        inferred_unit: unit that was inferred from the model's outputs; "" if they do
+            not show it.
+        inferred_order: order that was inferred from the model's outputs; "" if they do
+            not show it.
+        is_order_ambiguous: whether only the values of the outputs distinguish scores
+            from classes.
+        head_shape: (A, B) of an output that is read as a YOLO head; None for others.
+        ignores_masks: whether the outputs have mask coefficients, which are not read.
+        has_declared_format: whether the network declares the format of its boxes, see
+            `DECLARED_FORMAT_ATTRIBUTE`.
+        fills_with_nan: whether the model fills unused rows of its output with NaN. Then
+            an output with nothing but such rows means that nothing is detected.
+        doubts: reason why the boxes may be read wrongly, for a message; "" if there is
+            none.
 
     Raises:
-        InputError: a value that is none of these.
+        InputError: an option has another value.
     """
 
     name = "detection"
@@ -138,22 +155,14 @@ class Detection(ClassTask):
     unit: str = ""
     order: str = ""
     seek: str = "vanish"
-    # Input size of the model, (height, width) in pixels.
     input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)
-    # Inferred from the model's outputs; "" as long as they leave it open.
     inferred_unit: str = field(default="", metadata=FROM_RUN)
     inferred_order: str = field(default="", metadata=FROM_RUN)
-    # Only the values distinguish scores from classes in the outputs.
     is_order_ambiguous: bool = field(default=False, metadata=FROM_RUN)
-    # (A, B) of an output that is read as a YOLO head.
     head_shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
-    # The outputs contain mask coefficients, which are ignored.
     ignores_masks: bool = field(default=False, metadata=FROM_RUN)
-    # The network declares the format of its boxes, see `DECLARED_FORMAT_ATTRIBUTE`.
     has_declared_format: bool = field(default=False, metadata=FROM_RUN)
-    # The model fills its output with rows of NaN when it detects nothing.
     fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
-    # Why the boxes may be read wrongly; "" if nothing is odd.
     doubts: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
@@ -168,21 +177,24 @@ class Detection(ClassTask):
         self.check_numbers(
             lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "suppression"
         )
-        try:
-            outputs.parse_order(self.order or outputs.ORDERS[0])
-        except ValueError as error:
-            raise InputError(f"task detection: order: {error}") from None
+        if self.order:
+            try:
+                outputs.parse_order(self.order)
+            except ValueError as error:
+                raise InputError(f"task detection: order: {error}") from None
         self._check_choice("boxes", ("", *FORMS))
         self._check_choice("unit", ("", *UNITS))
         self._check_choice("seek", tuple(GOALS))
+        # The option `seek` is set by the setting `objective` of a run.
         if self.target is not None and self.seek not in ("mislabel", "create"):
             raise InputError(
-                f"target: {self.seek} has none; add `objective` mislabel or create"
+                f"target: the objective {self.seek} has none; set `objective` to "
+                "mislabel or create"
             )
         if self.minimise and self.seek != "vanish":
             raise InputError(
-                "minimise: expected `objective` vanish, whose opposite "
-                f"is to be found, got {self.seek}"
+                f"minimise: expected the objective vanish, got {self.seek}; with vanish "
+                "it seeks that the object is found"
             )
 
     def _check_choice(self, option: str, choices: Sequence[str]) -> None:
@@ -205,15 +217,16 @@ class Detection(ClassTask):
         Args:
             model: the detector.
             target: name of the class that the attack seeks; None for any wrong one.
-            minimise: whether the opposite of an error is sought.
+            minimise: whether a right prediction is sought.
         """
         task = super().on(model, target=target, minimise=minimise)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             noise = torch.rand((1, *model.input_size, 3), generator=generator)
             output = model(noise)
+        # Rows of NaN in the output for noise are unused rows, and no error.
         fills_with_nan = any("n_nan_rows" in detections for detections in output)
-        # options of the user override what the network declares
+        # Options of the user take precedence over the network's declaration.
         has_format_options = bool(self.boxes or self.unit)
         is_declared = not has_format_options and getattr(
             model.module, DECLARED_FORMAT_ATTRIBUTE, False
@@ -235,7 +248,7 @@ class Detection(ClassTask):
     def after_calibration(
         self, output: Sequence[Detections], truth: DetectionTruth | None
     ) -> Detection:
-        """Infer the format of the boxes from the clean image, and note doubts about it.
+        """Infer the format of the boxes from the clean image, and store doubts about it.
 
         If there are boxes of right classes and a true box, the format in which one of
         them fits best is compared with the one in use. Otherwise the boxes with the best
@@ -246,7 +259,7 @@ class Detection(ClassTask):
             truth: truth of that image; None if it is unknown.
 
         Returns:
-            The task whose `doubts` say why its format may be wrong; "" for no doubt.
+            The task with its `doubts`: why its format may be wrong, or "".
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)
@@ -263,9 +276,11 @@ class Detection(ClassTask):
         return replace(task, doubts=doubts)
 
     def _compare_with_truth(self, boxes: Tensor, true_box: Tensor) -> str:
-        """Return what is odd about boxes (D, 4) of the right classes; "" if nothing.
+        """Return doubts about the format of boxes of the right classes; "" if none.
 
-        `true_box` is (4,), in fractions of width and height.
+        Args:
+            boxes: (D, 4) boxes in the format of the output.
+            true_box: (4,) true box, in fractions of width and height.
         """
         box_format = self._box_format
         better_format = box_format.suggest_better_format(boxes, true_box, self.iou)
@@ -295,26 +310,27 @@ class Detection(ClassTask):
         grids = [detections["grid"] for detections in output if "grid" in detections]
         has_pairs = any("score_or_label" in detections for detections in output)
         has_masks = self.ignores_masks or self._has_mask_coefficients(output, order)
-        task = replace(
+        # The order is needed to read the boxes below.
+        task_with_order = replace(
             self,
             inferred_order=order or self.inferred_order,
             is_order_ambiguous=self.is_order_ambiguous or has_pairs,
             head_shape=tuple(grids[0].shape) if grids else self.head_shape,
             ignores_masks=has_masks,
         )
-        resolved = task._resolve_grids(output)
+        resolved = task_with_order._resolve_grids(output)
         if self.has_declared_format:
-            unit = "pixels"  # as `DECLARED_FORMAT_ATTRIBUTE` says
+            unit = "pixels"  # the meaning of `DECLARED_FORMAT_ATTRIBUTE`
         else:
             unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
-        # If an output has boxes and rows of NaN, the rows only fill it up to a fixed
-        # length. So a later output with nothing but such rows is not broken.
+        # An output with boxes and rows of NaN shows that the model fills unused rows with
+        # NaN.
         has_nan_rows = any(
             "n_nan_rows" in detections and len(detections["boxes"])
             for detections in resolved
         )
         return replace(
-            task,
+            task_with_order,
             inferred_unit=unit,
             fills_with_nan=self.fills_with_nan or has_nan_rows,
         )
@@ -322,8 +338,9 @@ class Detection(ClassTask):
     def _infer_order(self, output: Sequence[Detections]) -> str:
         """Return the order of components that an output shows; "" if it shows none.
 
-        A DETR output is read with a class for "no object" if the user states no order
-        and the name of the model's last class means "no object".
+        The logits, grids or pairs of numbers in the output show its order. In a DETR
+        output the last logit means "no object" if the user states no order and the name
+        of the model's last class has that meaning.
 
         Raises:
             InputError: the output contradicts the options or the number of classes.
@@ -333,6 +350,7 @@ class Detection(ClassTask):
         is_last_nothing = self.named and is_nothing_name(self.labels[-1])
         if not stated_order and has_logits and is_last_nothing:
             stated_order = SOFTMAX_QUERIES
+        # Only names show the number of classes; it counts a last one for nothing, too.
         n_classes = len(self.labels) if self.named else None
         try:
             return outputs.infer_order(output, n_classes, stated_order)
@@ -364,15 +382,17 @@ class Detection(ClassTask):
             return False
         channel_axis = 0 if order.endswith(CHANNELS_FIRST) else 1
         n_channels = grids[0].shape[channel_axis]
-        # Channel of the first score: the numbers of the box come before it.
-        first_score = next(
-            start for head, start in HEADS.items() if order.startswith(head)
+        # The first score has as many channels before it: those of the box, and perhaps
+        # objectness. No head is the beginning of another one.
+        n_channels_before_scores = next(
+            first_score for head, first_score in HEADS.items() if order.startswith(head)
         )
-        return n_channels > len(self.labels) + first_score
+        return n_channels > n_channels_before_scores + len(self.labels)
 
     def _resolve_grids(self, output: Sequence[Detections]) -> Sequence[Detections]:
-        """Return an output with YOLO grids ("grid") split into boxes and scores, and DETR
-        logits turned into scores; any other as it is.
+        """Return an output whose YOLO grids or DETR logits are boxes and scores.
+
+        Other outputs are returned unchanged.
         """
         if any("grid" in detections or "logits" in detections for detections in output):
             return self._resolve_labels(output)
@@ -386,13 +406,13 @@ class Detection(ClassTask):
         """
         if self.is_order_ambiguous and not (self.order or self.inferred_order):
             return (
-                "order: expected what tells scores from classes, and no output of "
-                f"the model does; {ORDER_ADVICE}"
+                "order: expected the order of scores and classes, which no output of "
+                f"the model shows; {ORDER_ADVICE}"
             )
         if not (self.unit or self.inferred_unit):
             return (
-                "unit: expected the unit of the model's boxes, and it finds nothing in "
-                "noise and in the clean scene that shows it; say "
+                "unit: expected the unit of the model's boxes, and it finds no boxes in "
+                "noise and in the clean scene that show it; set "
                 f"{format_option('unit: fractions')} or "
                 f"{format_option('unit: pixels')}, and `boxes` too unless they are x0, "
                 "y0, x1, y1"
@@ -403,27 +423,30 @@ class Detection(ClassTask):
     def remarks(self) -> tuple[str, ...]:
         """Return sentences about how the model's output is read.
 
-        They report the order that was inferred, masks that are not read, and doubts
-        about the format of boxes.
+        They report the order that was inferred, if the user states none, masks that are
+        not read, and doubts about the format of boxes.
         """
         remarks = []
-        order = format_option(f"order: {self.inferred_order}")
-        if not self.order:
-            if self.head_shape:
-                remarks.append(
-                    f"The detector's output of {self.head_shape} is read as a YOLO's: "
-                    f"{order}."
-                )
-            if self.inferred_order in QUERIES:
-                remarks.append(f"The detector's output is read as a DETR's: {order}.")
+        is_order_inferred = not self.order and bool(self.inferred_order)
+        # the option that states the inferred order
+        order_option = format_option(f"order: {self.inferred_order}")
+        if not self.order and self.head_shape:
+            remarks.append(
+                f"The detector's output of {self.head_shape} is read as a YOLO's: "
+                f"{order_option}."
+            )
+        if is_order_inferred and self.inferred_order in QUERIES:
+            remarks.append(
+                f"The detector's output is read as a DETR's: {order_option}."
+            )
         if self.ignores_masks:
             remarks.append(
-                "The detector's masks are left out: its boxes and scores are read."
+                "The detector's masks are not used: only its boxes and scores are read."
             )
-        if not self.order and self.is_order_ambiguous and self.inferred_order:
+        if is_order_inferred and self.is_order_ambiguous:
             remarks.append(
-                "Scores and classes of the detector's boxes are told apart by their "
-                f"values: they are read as {order}."
+                "Scores and classes of the detector's boxes are distinguished by their "
+                f"values: they are read as {order_option}."
             )
         if self.doubts:
             remarks.append(f"The detector's boxes may be read wrongly: {self.doubts}.")
@@ -431,7 +454,7 @@ class Detection(ClassTask):
 
     @property
     def _box_format(self) -> BoxFormat:
-        """How the model's boxes are read: by the options, else as inferred."""
+        """The format of the model's boxes: that of the options, or the inferred one."""
         order = self._stated_network_order or self.inferred_order
         # YOLO heads and DETR networks have centers and sizes
         default_form = "cxcywh" if order in CLASS_COUNT_ORDERS else "xyxy"
@@ -440,14 +463,14 @@ class Detection(ClassTask):
 
     @property
     def _stated_network_order(self) -> str:
-        """The option `order` with single blanks, if it names the output of a network
-        (`CLASS_COUNT_ORDERS`: a YOLO head, with or without a layout, or a DETR output);
-        else "".
+        """The option `order`, if it states that the output is that of a YOLO or a DETR.
 
-        Other values of the option name the components or columns of an output.
+        It is one of `CLASS_COUNT_ORDERS`, or "". Other values of the option name the
+        components or columns of an output.
         """
         if not self.order:
             return ""
+        # The user may write commas or several blanks between the words.
         order = " ".join(outputs.parse_order(self.order))
         return order if order in CLASS_COUNT_ORDERS else ""
 
@@ -474,7 +497,7 @@ class Detection(ClassTask):
         )
 
     def _has_class(self, facts: Facts, classes: Labels) -> bool:
-        """Whether a thing's own label is one of these classes of the model."""
+        """Return whether a thing's label is one of these classes of the model."""
         try:
             return not set(classes).isdisjoint(self.find_right_classes(facts))
         except InputError:  # it has no label, or none that the model knows
@@ -509,8 +532,10 @@ class Detection(ClassTask):
         """Compute how near each output is to what is sought, (N,), in log-odds.
 
         It is over 0 if the output is a success. The loss reads only boxes that survive
-        suppression; the score also reads the suppressed ones, unless they alone would
-        make the output a success.
+        suppression. A score also reads suppressed boxes with a right class, so that the
+        object has not vanished if only suppressed boxes are at it. A box that has to
+        exist for a success, with a wrong class or where nothing is, has to survive
+        suppression.
         """
         # `__post_init__` allows `minimise` for the goal "vanish" only.
         if self.minimise:
@@ -535,10 +560,9 @@ class Detection(ClassTask):
         """Apply a function to the detections of each image, (N,).
 
         The value is NaN if the detections cannot be judged, as with a box that is not
-        finite (`_is_broken`). If the object is out of view, the value is -1: losses
-        below 0 stand for right predictions, and nobody can miss what is not visible.
-        The goal "create" is an exception. It seeks boxes at spots without an object, so
-        that the object need not be visible.
+        finite (`_is_broken`). If the object is out of view, the value is -1, which
+        stands for a right prediction. The goal "create" is an exception: it seeks boxes
+        at positions without an object, so that the object need not be visible.
 
         Args:
             output: output of N images.
@@ -568,10 +592,15 @@ class Detection(ClassTask):
         return self._min_log_odds - compute_log_odds(best_score)
 
     def _score_mislabel(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Compute the lesser of two: that the object vanishes, and that a box at it has
-        a wrong class.
+        """Compute how near the object is to being mislabeled.
+
+        It is mislabeled if it has vanished, and a box at the object has a wrong class. So
+        the score is the smaller of two numbers: that of the goal "vanish", and by how
+        much the best wrong box at the object exceeds `confidence`. Only the wrong box
+        has to survive suppression.
         """
         wrong_score = self._find_rival_scores(self._suppress(detections), truth.labels)
+        # suppression changes scores only, so that boxes are the same
         best_score = max_or_zero(wrong_score, self._is_at_object(detections, truth))
         wrong_excess = compute_log_odds(best_score) - self._min_log_odds
         return torch.minimum(self._score_vanish(detections, truth), wrong_excess)
@@ -581,31 +610,35 @@ class Detection(ClassTask):
 
         Boxes are displaced if some box of a right class counts, but none overlaps the
         object by `iou`. So the score is the smaller of two numbers. The first is by how
-        much the best overlap of a box that counts falls short of `iou`, scaled so that
-        a small step from `iou` is as long as one in log-odds. The second is by how much
-        the best score of a right class exceeds `confidence`, in log-odds.
+        much the best overlap of a box that counts falls short of `iou`. It is scaled
+        like log-odds: near `iou`, both have the same derivative by the overlap. The
+        second is by how much the best score of a right class exceeds `confidence`, in
+        log-odds.
         """
         scores = self._find_best_scores(detections, truth.labels)
         score_excess = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
-        best_overlap = max_or_zero(
-            compute_iou_with_truth(detections, truth), scores >= self.confidence
-        )
-        # the slope of log-odds at `iou` is 1 / (iou (1 - iou))
+        counts = scores >= self.confidence
+        overlaps = compute_iou_with_truth(detections, truth)
+        best_overlap = max_or_zero(overlaps, counts)
+        # The derivative of log-odds at `iou` is 1 / (iou (1 - iou)).
         overlap_shortfall = (self.iou - best_overlap) / (self.iou * (1.0 - self.iou))
         return torch.minimum(overlap_shortfall, score_excess)
 
     def _score_create(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Compute by how much the best box where nothing is exceeds `confidence`."""
+        """Compute by how much the best phantom exceeds `confidence`, in log-odds.
+
+        A phantom is a box at a position without an object of its class.
+        """
         phantom_score = self._find_phantom_scores(self._suppress(detections), truth)
         return compute_log_odds(max_or_zero(phantom_score)) - self._min_log_odds
 
     def _is_at_object(self, detections: Detections, truth: DetectionTruth) -> Tensor:
-        """Which boxes fit the true box, (D,) bool."""
+        """Return which boxes fit the true box, (D,) bool."""
         return compute_iou_with_truth(detections, truth) >= self.iou
 
     @property
     def _min_log_odds(self) -> float:
-        """`confidence` as log-odds."""
+        """The log-odds of `confidence`, from which a box counts."""
         return math.log(self.confidence / (1.0 - self.confidence))
 
     # ---- boxes and scores of one image ----
@@ -631,8 +664,9 @@ class Detection(ClassTask):
         """Return the detections of each image with boxes as fractions of the image.
 
         Classes such as "no object" get a score of 0. A box that is not finite makes the
-        output broken (`_is_broken`). It is dropped first if all its scores are too low
-        to count, since networks leave such boxes in unused rows.
+        output broken (`_is_broken`). But it is removed here if all its scores are too
+        low to be stored, since networks leave such boxes in unused rows. A score of NaN
+        does not count as low.
         """
         images = list[Detections]()
         box_format = self._box_format
@@ -641,12 +675,12 @@ class Detection(ClassTask):
             scores = self._clear_nothing_classes(detections)
             resolved = {**detections, "boxes": boxes, "scores": scores}
             is_finite = boxes.detach().isfinite().all(dim=1)
-            is_weak = (get_box_numbers(resolved) < self._min_score).all(dim=1)
-            stays = is_finite | ~is_weak
-            if not bool(stays.all()):
+            has_low_scores = (get_box_numbers(resolved) < self._min_score).all(dim=1)
+            is_used = is_finite | ~has_low_scores
+            if not bool(is_used.all()):
                 resolved = {
-                    # a count, while everything else has a row for each box
-                    name: values if name == "n_nan_rows" else values[stays]
+                    # "n_nan_rows" is a count; the others have a row for each box
+                    name: values if name == "n_nan_rows" else values[is_used]
                     for name, values in resolved.items()
                 }
             images.append(resolved)
@@ -734,8 +768,9 @@ class Detection(ClassTask):
     def _is_on_nothing(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Return which boxes are on no object of the right classes, (D,) bool.
 
-        These are the object itself, if it is in view, and the other objects in the
-        image that have one of its classes.
+        Objects of the right classes are the object itself, if it is in view, and other
+        things in the image that have one of its classes. See `_are_on` for when a box is
+        on an object.
         """
         boxes = detections["boxes"]
         true_boxes = list(truth.others)
@@ -752,10 +787,12 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Return the score of each box as a phantom, (D,); 0 if the box is none.
 
-        A phantom is a box at a spot without an object of its class. A box of a right
-        class is a phantom if it is on no object of these classes, however loosely. A
-        box of another class is a phantom if it is elsewhere than the object. If there
-        is a target, only the scores of target classes count.
+        A phantom is a box at a position without an object of its class. A box of a
+        right class is a phantom if it is on no object of these classes, however loosely.
+        The true boxes of other classes are unknown. So a box of another class is a
+        phantom only if it is elsewhere than the object: at the object, it would be a
+        wrong class for the object. If there is a target, only the scores of target
+        classes count.
         """
         if self.target is None:
             right_score = self._find_best_scores(detections, truth.labels)
@@ -831,7 +868,7 @@ class Detection(ClassTask):
         truth: DetectionTruth,
         margins: Sequence[float],
     ) -> list[PredictionWithPayload]:
-        """Return what becomes of the object in each image, with a payload for its row.
+        """Return the prediction about the object in each image, with its payload.
 
         The payload has the object's box and the best detected boxes, in pixels, and the
         outcome (such as "missed") with the class and the overlap of the deciding box.
@@ -884,13 +921,14 @@ class Detection(ClassTask):
     def _match_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> ObjectMatch:
-        """Decide what becomes of the object in the boxes that survived suppression.
+        """Return the outcome for the object, from the boxes that survived suppression.
 
-        A phantom is a box at a spot without an object of its class. If phantoms are
-        sought (`seek` is "create"), one of them decides before any other box.
+        If the goal is "create" and a phantom (a box at a position without an object of
+        its class) reaches `confidence`, the best phantom decides.
         """
         if self.seek == "create" and float(self._score_create(detections, truth)) > 0.0:
             phantom_score = self._find_phantom_scores(detections, truth)
+            # The best of these exceeds `confidence`, as the score is positive.
             is_phantom = phantom_score > 0.0
             return self._match_best_box(
                 Outcome.PHANTOM, detections, phantom_score, is_phantom, truth
@@ -902,11 +940,11 @@ class Detection(ClassTask):
     def _match_phantom(
         self, detections: Detections, truth: DetectionTruth
     ) -> ObjectMatch:
-        """Decide what is detected in an image in which the object is out of view.
+        """Return the outcome for an image in which the object is out of view.
 
-        It is a phantom if a box of a right class where nothing is reaches `confidence`.
-        Otherwise there is no outcome. There is none either if phantoms are sought:
-        `_match_object` has looked for them already.
+        It is a phantom if a box of a right class reaches `confidence` and is on no
+        object of these classes. Otherwise there is no outcome. With the goal "create",
+        `_match_object` has found no phantom, so that there is none here.
         """
         right_score = self._find_best_scores(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
@@ -915,15 +953,16 @@ class Detection(ClassTask):
             return self._match_best_box(
                 Outcome.PHANTOM, detections, right_score, is_on_nothing, truth
             )
-        return ObjectMatch(None, truth.labels[0])
+        return ObjectMatch(outcome=None, index=truth.labels[0])
 
     def _match_visible_object(
         self, detections: Detections, truth: DetectionTruth
     ) -> ObjectMatch:
-        """Decide what becomes of an object that is in view.
+        """Return the outcome for an object that is in view.
 
-        The outcomes are tried in order, the best for the model first; the first one
-        whose best box reaches `confidence` is returned with that box.
+        The outcomes are tried in order, the best one for the model first. The first one
+        whose best box reaches `confidence` is returned with that box. If there is none,
+        the object is missed.
         """
         right_score = self._find_best_scores(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
@@ -956,21 +995,22 @@ class Detection(ClassTask):
         is_candidate: Tensor,
         truth: DetectionTruth,
     ) -> ObjectMatch:
-        """Return an outcome with the best box among the candidates.
+        """Return an outcome with the class, score and overlap of the best candidate.
 
         Args:
-            outcome: outcome that the candidates stand for.
+            outcome: the outcome, if the best candidate decides.
             detections: detections of the image.
-            scores: (D,) of each box for this outcome.
-            is_candidate: (D,) bool.
+            scores: (D,) score of each box for this outcome: one of the scores of the
+                box in `detections`.
+            is_candidate: (D,) bool, which boxes may decide.
             truth: truth of the scene.
         """
-        # Scores are at least 0. So -1 puts all boxes that are no candidates last.
+        # Scores are at least 0. So with -1, boxes that are no candidates come last.
         row = int(torch.where(is_candidate, scores, -1.0).argmax())
         score = float(scores[row])
         if "labels" in detections:
             class_id = int(detections["labels"][row])
-        else:  # the first class that has this score in the row
+        else:  # the first class that has this score
             class_id = int((detections["scores"][row] == score).nonzero()[0])
         iou = None
         if truth.box is not None:
@@ -978,8 +1018,10 @@ class Detection(ClassTask):
         return ObjectMatch(outcome, class_id, score, iou)
 
     def _describe_match(self, match: ObjectMatch, truth: DetectionTruth) -> Prediction:
-        """Return the prediction about the object, with the score of the deciding
-        box.
+        """Return the prediction about the object, with the score of the deciding box.
+
+        If the object is out of view, that is the prediction, whatever is detected. But
+        with the goal "create" a detected phantom is the prediction.
         """
         class_name = self.get_class_name(match.index)
         is_out_of_view = truth.box is None and self.seek != "create"
@@ -993,7 +1035,7 @@ class Detection(ClassTask):
     def marks(
         self, output: Sequence[Detections], truth: DetectionTruth
     ) -> list[list[Mark]]:
-        """Return what is drawn over each image: the true box and the detected boxes.
+        """Return the marks to draw on each image: the true box and the detected boxes.
 
         A detected box is drawn if its score is at least `confidence`.
         """
@@ -1009,7 +1051,7 @@ class Detection(ClassTask):
     def _make_predicted_marks(
         self, detections: Detections, truth: DetectionTruth
     ) -> list[Mark]:
-        """Return a mark for every box of an image with a score of `confidence`."""
+        """Return a mark for each box of an image with a score of at least `confidence`."""
         if self._is_broken(detections):
             return []
         height, width = truth.size

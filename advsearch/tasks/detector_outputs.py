@@ -1,21 +1,23 @@
-"""Read what a detector returns: which outputs are boxes, scores and classes, and which
-rows are padding.
+"""Functions that read the output of a detector.
 
-The detections of one image are a mapping with
+They find out which tensors are boxes, scores and classes, and which rows are padding.
+The detections of an image are a mapping with
 
-* `boxes` (D, 4), as they came, and
-* `scores`: (D, C) of every class, or (D,) with `labels` (D,), the class of each box.
+* `boxes` (D, 4), in the format of the network, and
+* `scores`: (D, C) for every class, or (D,) with `labels` (D,), the class of each box.
 
-Instead of these it may have, as long as the outputs leave it open:
+Instead of these it may have, as long as the output does not show what they are:
 
-* `score_or_label` (D, 2) for scores and labels: two numbers per box, of which types,
-  names and shapes do not show which is the score and which the class;
-* `grid` (A, B) for everything: one tensor that only the number of classes explains, with
-  `map_channels` (K,), the channels of feature maps that came with it;
-* `logits` (D, K) for scores: only the number of classes explains them, see `QUERIES`.
+* `score_or_label` (D, 2) instead of scores and labels: two numbers for each box. Types,
+  names and shapes do not show which one is the score and which one the class;
+* `grid` (A, B) instead of everything: a single tensor, which can be read only with the
+  number of classes. `map_channels` (K,) are the numbers of channels of feature maps that
+  the network returned with it;
+* `logits` (D, K) instead of scores: they can be read only with the number of classes, see
+  `QUERIES`.
 
-Rows of padding are removed. `n_nan_rows` (1,) counts those that were NaN throughout, if
-there were any.
+Rows of padding are removed. If some of these have only NaN, `n_nan_rows` (1,) is their
+count.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ EXPECTED = (
     "mapping with boxes (D, 4), labels (D,) and scores (D,)"
 )
 
-# What the two numbers beside a box may be.
+# The two numbers after a box: a score and a label, or the other way round.
 SCORES_FIRST = "boxes scores labels"
 LABELS_FIRST = "boxes labels scores"
 ORDERS = (SCORES_FIRST, LABELS_FIRST)
@@ -47,9 +49,9 @@ ORDERS = (SCORES_FIRST, LABELS_FIRST)
 SIGMOID_QUERIES = "boxes logits"
 SOFTMAX_QUERIES = "boxes logits nothing"
 QUERIES = (SIGMOID_QUERIES, SOFTMAX_QUERIES)
-"""What DETR networks return: logits of independent classes, for a sigmoid (Zhu et al.
-2021, section 4), or logits of exclusive classes, for a softmax, of which the last
-means no object (Carion et al. 2020, section 3.1).
+"""Outputs of DETR networks: logits of independent classes, for a sigmoid (Zhu et al. 2021,
+section 4); or logits of exclusive classes, for a softmax, where the last class means no
+object (Carion et al. 2020, section 3.1).
 """
 
 # Names of the logits in an output whose boxes are named `pred_boxes`.
@@ -58,7 +60,7 @@ QUERY_LOGITS = ("pred_logits", "logits")
 PLAIN_HEAD = "boxes scores"
 OBJECTNESS_HEAD = "boxes objectness scores"
 HEADS = {PLAIN_HEAD: 4, OBJECTNESS_HEAD: 5}
-"""Channels of a YOLO head, and the index of the first score among them."""
+"""Index of the channel with the first score, by the order of a YOLO head's channels."""
 
 CHANNELS_FIRST = "channels first"
 CHANNELS_LAST = "channels last"
@@ -67,15 +69,17 @@ HEAD_ORDERS = frozenset(
     [*HEADS, *(f"{head} {layout}" for head in HEADS for layout in LAYOUTS)]
 )
 CLASS_COUNT_ORDERS = HEAD_ORDERS | frozenset(QUERIES)
-"""Orders that the number of classes explains; their boxes are center, width, height."""
-
-TOLERANCE = 1e-3  # how far outside [0, 1] a score may lie
-_WITH_ANGLE = f"{OBJECTNESS_HEAD} {CHANNELS_FIRST}"
-"""Order that an oriented-box (OBB) head looks like: an angle after the scores makes as
-many channels as objectness before them.
+"""Orders of outputs that can be read only with the number of classes. Their boxes are
+center, width and height.
 """
 
-_UNREAD = "which are not read"
+TOLERANCE = 1e-3  # by how much a score may be outside of [0, 1]
+_OBB_LIKE_ORDER = f"{OBJECTNESS_HEAD} {CHANNELS_FIRST}"
+"""Order with as many channels as a head with oriented boxes (OBB), which has an angle after
+the scores instead of objectness before them.
+"""
+
+_UNREAD = "which are not read"  # end of messages about outputs of other kinds
 
 NAMES = {
     "boxes": (
@@ -107,14 +111,14 @@ NAMES = {
         "label",
     ),
 }
-"""Names of the components of an output, the usual name first."""
+"""Known names of each component of an output; the first is the usual one."""
 
 WORDS = {
     "boxes": ("box",),
     "scores": ("score", "conf", "prob", "logit"),
     "labels": ("label", "class", "cls", "categ"),
 }
-"""Substrings that identify a component whose name is none of `NAMES`."""
+"""Substrings that identify a component whose name is not in `NAMES`."""
 
 ORDER_ADVICE = (
     f"say {' or '.join(format_option(f'order: {order}') for order in ORDERS)}"
@@ -138,9 +142,11 @@ def parse_order(text: str) -> tuple[str, ...]:
         ValueError: it is none of these.
     """
     names = tuple(text.replace(",", " ").split())
-    if " ".join(names) in CLASS_COUNT_ORDERS:
+    is_head_or_query = " ".join(names) in CLASS_COUNT_ORDERS
+    if is_head_or_query:
         return names
-    if sorted(names) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
+    components = list(NAMES)  # boxes, scores and labels
+    if sorted(names) not in (sorted(components), sorted([*components, "batch"])):
         raise ValueError(
             f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', "
             f"of a YOLO's head {' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or "
@@ -176,27 +182,22 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
 
     predictions, channels = _split_off_maps(returned)
     map_channels = torch.tensor(sorted(channels), dtype=torch.long)
-    is_batch = (
+    is_single_tensor = (
         isinstance(predictions, Tensor)
         and predictions.ndim == 3
         and predictions.shape[0] == count
         and predictions.shape[2] != 4  # boxes without scores, as of a DETR
     )
-    has_mask_rows = is_batch and _has_mask_rows(predictions, channels)
-    # The rows of a tensor (N, D, 6) are a box, a score and a class.
-    has_six_columns = is_batch and predictions.shape[2] == 6
-    is_rows = bool(order_names) or has_mask_rows or has_six_columns
-    # A tensor of another width is the output of a YOLO head, whose columns are known
-    # only when the number of classes is.
-    if is_batch and (order in HEAD_ORDERS or not is_rows):
+    has_mask_rows = is_single_tensor and _has_mask_rows(predictions, channels)
+    if is_single_tensor and _is_grid(predictions, order, has_mask_rows=has_mask_rows):
         return [
             {"grid": grid.float(), "map_channels": map_channels} for grid in predictions
         ]
     if has_mask_rows:
+        # The mask coefficients after the first six columns are not read.
         rows = read_detections(predictions[..., :6], count, order)
         return [{**detections, "map_channels": map_channels} for detections in rows]
-    # The order is that of a YOLO head, but the output is not a grid as such heads
-    # return it.
+    # The user states the order of a YOLO head, but the output is no grid.
     if "objectness" in order_names or "channels" in order_names:
         raise ValueError(EXPECTED)
     return [
@@ -205,25 +206,45 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
     ]
 
 
+def _is_grid(predictions: Tensor, order: str, *, has_mask_rows: bool) -> bool:
+    """Return whether a tensor (N, A, B) is the output of a YOLO head.
+
+    Its channels can be read only with the number of classes. Other tensors have rows: a
+    box, a score and a class, and perhaps mask coefficients.
+
+    Args:
+        predictions: the tensor.
+        order: order that the user stated; "" for none.
+        has_mask_rows: whether it has rows with mask coefficients.
+    """
+    if order:
+        return order in HEAD_ORDERS
+    has_six_columns = predictions.shape[2] == 6
+    return not has_six_columns and not has_mask_rows
+
+
 def _check_no_head_maps(returned: Any) -> None:
-    """Raise ValueError if all that a detector returned are maps (N, K, h, w): those of
-    a head in training, from which boxes are still to be made.
+    """Raise ValueError if a detector returned only maps (N, K, h, w).
+
+    They are the output of a head in training mode, without boxes.
     """
     is_sequence = isinstance(returned, (list, tuple)) and len(returned) > 0
     if is_sequence and all(isinstance(x, Tensor) and x.ndim > 3 for x in returned):
         raise ValueError(
-            "expected boxes, and not the maps of a head from which they "
-            "are made: export it in .eval()"
+            "expected boxes, got the maps of a head from which they "
+            "are computed: export it in .eval()"
         )
 
 
 def _has_mask_rows(grid: Tensor, channels: Collection[int]) -> bool:
     """Return whether rows (N, D, k) are a box, a score, a class and mask coefficients.
 
-    `channels` are the numbers of channels of the feature maps that came with them, one
-    of which is the number of coefficients.
+    Args:
+        grid: the rows.
+        channels: numbers of channels of the feature maps that came with them. One of
+            these has a channel for each coefficient.
     """
-    n_coefficients = grid.shape[2] - 6
+    n_coefficients = grid.shape[2] - 6  # without four numbers of a box and two others
     if n_coefficients not in channels:
         return False
     class_column = grid[..., 5]
@@ -297,7 +318,8 @@ def _split_batch_rows(
     the column that the order calls "batch". A row with the index -1 is padding.
 
     Args:
-        rows: rows of all images: four numbers of a box, two more, and the index.
+        rows: rows of all images: four numbers of a box, a score and a label in any
+            order, and the index.
         count: number of images.
         order_names: names of the components in the order that the user stated; empty
             without one.
@@ -308,10 +330,8 @@ def _split_batch_rows(
     names_before: Sequence[str] = ()
     if "batch" in order_names:
         names_before = order_names[: order_names.index("batch")]
-    # each name takes one column, but boxes take four
-    batch_column = len(names_before)
-    if "boxes" in names_before:
-        batch_column += 4 - 1
+    # A name has one column, but "boxes" has four.
+    batch_column = sum(4 if name == "boxes" else 1 for name in names_before)
     image_index = rows.detach()[:, batch_column]
     is_index = (
         (image_index == image_index.round())
@@ -333,8 +353,8 @@ def _split_batch_rows(
 def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
     """Find the boxes and logits of a DETR output; None if it is no such output.
 
-    A sequence of tensors is a DETR output if the user says so. A mapping or an object
-    is one if it has "pred_boxes" and a component with a usual name of logits.
+    A sequence of tensors is a DETR output if the user states that order. A mapping or an
+    object is one if it has "pred_boxes" and a component with a usual name of logits.
 
     Args:
         returned: what the network returned.
@@ -342,9 +362,10 @@ def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
     """
     if order in QUERIES and isinstance(returned, (list, tuple)):
         return _find_query_tensors(returned)
-    if order not in ("", *QUERIES):  # the user stated another form
+    is_other_form_stated = order not in ("", *QUERIES)
+    if is_other_form_stated:
         return None
-    # items of a mapping, or attributes of an object
+    # a function of a name and a default: items of a mapping, or attributes of an object
     get = returned.get if isinstance(returned, Mapping) else partial(getattr, returned)
     boxes = get("pred_boxes", None)
     if not isinstance(boxes, Tensor):
@@ -370,16 +391,15 @@ def _find_query_tensors(returned: Sequence[Any]) -> tuple[Tensor, Tensor] | None
 
 
 def _are_fraction_boxes(tensor: Tensor) -> bool:
-    """Whether a tensor may hold boxes (..., 4) in fractions of the image."""
+    """Return whether a tensor may be boxes (..., 4) in fractions of the image."""
     return tensor.shape[-1] == 4 and bool(((tensor >= 0.0) & (tensor <= 1.0)).all())
 
 
 def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
-    """Split a YOLO output in training form into its predictions and feature maps.
+    """Split the tuple that a YOLO network returns into predictions and feature maps.
 
-    In that form the network returns a tuple. The predictions (N, A, B) come first;
-    feature maps (N, K, h, w) and prototypes of masks follow, also nested in lists and
-    mappings.
+    The predictions (N, A, B) come first. Feature maps (N, K, h, w) and prototypes of
+    masks follow, also nested in lists and mappings.
 
     Returns:
         The predictions, and the numbers of channels K of the maps. An output of any
@@ -391,9 +411,10 @@ def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
     predictions = returned[0]
     rest = returned[1:]
     is_boxes = predictions.ndim == 3 and predictions.shape[2] == 4
-    # Boxes that other tensors follow are a tuple of boxes, scores and labels.
-    has_other_tensors = any(isinstance(x, Tensor) and x.ndim < 4 for x in rest)
-    if predictions.ndim != 3 or is_boxes or has_other_tensors:
+    # Feature maps have four axes. Tensors with fewer are scores or labels: then the tuple
+    # is not that of a YOLO network.
+    has_scores_or_labels = any(isinstance(x, Tensor) and x.ndim < 4 for x in rest)
+    if predictions.ndim != 3 or is_boxes or has_scores_or_labels:
         return returned, set()
     channels = {
         tensor.shape[1]
@@ -404,15 +425,18 @@ def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
 
 
 def _is_image_output(value: Any) -> bool:
-    """Return whether a value may be the output for one image, and not the boxes or the
-    scores of all images; None stands for an image without detections.
+    """Return whether an element of a list may be the output for one image.
+
+    Otherwise it is e.g. the boxes or the scores of all images. None stands for an image
+    without detections.
     """
     if isinstance(value, Tensor):
         return value.ndim == 2 and value.shape[1] == 6  # a box, a score and a class
+    is_object_with_boxes = _find_named(value) is not None
     return (
         value is None
         or isinstance(value, (Mapping, list, tuple))
-        or _find_named(value) is not None
+        or is_object_with_boxes
     )
 
 
@@ -439,10 +463,13 @@ def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Ten
     named = _find_named(returned)
     if named is not None and "boxes" in named and "scores" in named:
         return named
-    # without such names: by the order that is stated, or else by their shapes
+    # Without known names, the stated order identifies the tensors, or else their shapes.
     tensors = _list_tensors_in_order(returned)
     if order_names and len(tensors) == len(order_names):
-        components = dict(zip(order_names, tensors, strict=True))
+        components = dict(
+            zip(order_names, tensors, strict=True)
+        )  # each order has boxes
+        # (D,) or (N, D); scores and labels may have a further axis of one
         shape = components["boxes"].shape[:-1]
         return {
             name: _squeeze_last(tensor, shape) for name, tensor in components.items()
@@ -481,7 +508,7 @@ def _split_columns(rows: Tensor, order_names: Sequence[str]) -> dict[str, Tensor
 
 
 def _squeeze_last(tensor: Tensor, shape: Sequence[int]) -> Tensor:
-    """Remove a last dimension of one from a tensor that is (*shape, 1)."""
+    """Remove the last axis of a tensor (*shape, 1); return other tensors unchanged."""
     return tensor[..., 0] if tensor.shape == (*shape, 1) else tensor
 
 
@@ -537,8 +564,9 @@ def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:
 def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
     """Identify the components of a tuple by shape and type.
 
-    Boxes have four columns, and labels an integer type. If each box has two numbers
-    and none of them is an integer, they are "score_or_label", (..., 2).
+    Boxes have four columns. A single further tensor with the same number of axes is a
+    score for every class. Otherwise there are two numbers for each box: the label has an
+    integer type, or both are "score_or_label", (..., 2).
 
     Raises:
         ValueError: shapes and types do not identify them.
@@ -550,9 +578,9 @@ def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
         for tensor in tensors
         if tensor is not boxes and tensor.shape[: len(shape)] == shape
     ]
-    if len(others) == 1 and others[0].ndim == boxes.ndim:  # a score of every class
+    has_score_of_every_class = len(others) == 1 and others[0].ndim == boxes.ndim
+    if has_score_of_every_class:
         return {"boxes": boxes, "scores": others[0]}
-    # otherwise two numbers for each box, a score and a label
     numbers = [_squeeze_last(tensor, shape) for tensor in others]
     integers = [tensor for tensor in numbers if not tensor.is_floating_point()]
     has_other_shape = any(tensor.shape != shape for tensor in numbers)
@@ -614,15 +642,17 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
         return _remove_padded_pairs(boxes, components["score_or_label"].float())
 
     scores, labels = _check_scores(components)
-    # (D, K), with a single score for each box if there are labels
-    values = scores.detach() if labels is None else scores.detach()[:, None]
+    has_labels = labels is not None
+    # (D, K): a score for every class, or a single one for the label of a box
+    values = scores.detach()[:, None] if has_labels else scores.detach()
     is_padding = _find_padding(boxes, values, labels)
-    _check_probabilities(values[~is_padding], has_labels=labels is not None)
+    _check_probabilities(values[~is_padding], has_labels=has_labels)
     checked = {"boxes": boxes, "scores": scores}
     if labels is not None:
         checked["labels"] = labels.long()
     detections = dict(_remove_padding(checked, is_padding, values))
-    # These rows were removed in an earlier check, which counted them.
+    # Pairs "score_or_label" were checked before, and rows of NaN were removed then. Their
+    # count is kept.
     if "n_nan_rows" in components:
         detections["n_nan_rows"] = components["n_nan_rows"]
     return detections
@@ -650,11 +680,12 @@ def _find_padding(boxes: Tensor, scores: Tensor, labels: Tensor | None) -> Tenso
 def _remove_padded_pairs(boxes: Tensor, pairs: Tensor) -> Detections:
     """Return boxes with their pairs ("score_or_label"), without rows of padding.
 
-    Such a row has an invalid box, and one of its two numbers is not over 0.
+    Such a row has an invalid box, and its two numbers are not both positive. NaN is not
+    positive.
 
     Args:
         boxes: (D, 4).
-        pairs: (D, 2), of which it is open which number is the score.
+        pairs: (D, 2) a score and a label, in an unknown order.
     """
     numbers = pairs.detach()
     are_positive = (numbers > 0.0).all(dim=1)
@@ -690,23 +721,23 @@ def _check_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | No
 
 
 def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
-    """Raise ValueError if a finite score is outside [0, 1].
+    """Raise ValueError if a score is outside [0, 1].
 
-    Scores without labels may be logits of a DETR; then the message also says with
-    which option the user states that.
+    NaN and plus infinity are not checked here; they make an output broken. Scores without
+    labels may be logits of a DETR. Then the message names the option that states this.
 
     Args:
         values: scores, of any shape.
         has_labels: whether each box has a label and a single score.
     """
-    is_too_low = values < -TOLERANCE
+    is_too_low = values < -TOLERANCE  # also minus infinity, as in logits
     is_too_high = (values > 1.0 + TOLERANCE) & values.isfinite()
     if not bool((is_too_low | is_too_high).any()):
         return
     advice = ""
     if not has_labels:
         options = " or ".join(format_option(f"order: {order}") for order in QUERIES)
-        advice = f", or say {options}"
+        advice = f", or set {options}"
     raise ValueError(
         "expected scores that are probabilities in [0, 1]; apply a sigmoid or a "
         f"softmax to them{advice}"
@@ -756,14 +787,14 @@ def resolve_detections(
         ValueError: the values do not show the order, or contradict it.
     """
     if "grid" in detections or "logits" in detections:
-        if classes is None:
+        if classes is None:  # such an output can't be read: name the expected ones
             raise ValueError(EXPECTED)
         order = order or infer_order([detections], classes)
         return _check_detections(_split_by_class_count(detections, classes, order))
     if "score_or_label" in detections:
         order = order or infer_order([detections], classes)
         return _resolve_pairs(detections, order)
-    # identified already
+    # Scores and labels are known already.
     return {name: value for name, value in detections.items() if name != "map_channels"}
 
 
@@ -789,31 +820,33 @@ def _split_by_class_count(
 
 
 def _resolve_pairs(detections: Detections, order: str) -> Detections:
-    """Replace the pairs of numbers of an image ("score_or_label") by what they are.
+    """Replace the pairs of numbers of an image ("score_or_label") by scores and labels.
 
     They are a score and a label, or two scores.
 
     Args:
         detections: detections of one image.
-        order: what the numbers are: one of `ORDERS`, or of `HEADS` with a layout if
-            both are scores; "" if that is unknown.
+        order: order of the numbers: one of `ORDERS`, or one of `HEAD_ORDERS` if both
+            are scores; "" if it is unknown.
 
     Raises:
-        ValueError: the order is unknown, and there are boxes that count.
+        ValueError: the order is unknown, and there are boxes with a positive number or
+            NaN.
     """
     pairs = detections["score_or_label"]
     if not order:
         has_values = are_counted(detections) | pairs.isnan().any(dim=1)
         if bool(has_values.any()):
             raise ValueError(
-                "which of a box's two numbers is its score does not show; "
+                "the output does not show which of a box's two numbers is its score; "
                 f"{ORDER_ADVICE}"
             )
-        order = SCORES_FIRST  # of no importance, since no box counts
+        order = SCORES_FIRST  # any order will do, since no box counts
     if order in HEAD_ORDERS:
-        # Both are scores; or the first is objectness, the probability that the box
-        # holds any object, and the score of a class is their product.
-        has_objectness = "objectness" in order
+        # Both are scores of classes; or the first is objectness, the probability of any
+        # object in the box, and the score of the only class is their product. There are
+        # no feature maps with such pairs.
+        has_objectness = order.startswith(OBJECTNESS_HEAD)
         scores = pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
         return _check_detections({"boxes": detections["boxes"], "scores": scores})
     first, second = pairs.unbind(dim=1)
@@ -836,10 +869,10 @@ def infer_order(
 ) -> str:
     """Infer from values and sizes in which order a network returns scores and classes.
 
-    For logits and grids the number of classes shows it. If a box comes with two
-    numbers, the class is an integer, and the score lies in [0, 1] and does not rise
-    from box to box, since suppression sorts by score. If neither is a class, both are
-    scores (`_infer_pair_order`).
+    For logits and grids the number of classes shows it. Without that it is unknown. If a
+    box has two numbers, their values show it (`_infer_pair_order`): a class is an
+    integer, and a score is in [0, 1] and does not rise from box to box, since suppression
+    sorts by score. If neither is a class, both are scores.
 
     Args:
         detections_of_images: detections of images.
@@ -867,10 +900,10 @@ def infer_order(
 
 
 def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
-    """Return which DETR head (one of `QUERIES`) has so many logits for each box.
+    """Infer the order of a DETR output, one of `QUERIES`, from its number of logits.
 
-    If there is one logit more than classes, it stands for "no object" and the scores
-    are a softmax, unless the user states the head. Otherwise they are sigmoids.
+    Without an order of the user, one logit more than classes stands for "no object", and
+    the scores are a softmax. Otherwise they are sigmoids.
 
     Args:
         n_logits: number of logits of a box.
@@ -885,10 +918,11 @@ def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
     order = head
     if not order:
         order = SOFTMAX_QUERIES if has_nothing_logit else SIGMOID_QUERIES
-    # Exclusive classes may have a last one for no object.
+    # With a softmax, the class for no object may also be one of the labels.
     allows_nothing_logit = order == SOFTMAX_QUERIES
     if n_logits == classes or (allows_nothing_logit and has_nothing_logit):
         return order
+    # sets of labels with as many classes, without or with a logit for no object
     fitting_sets = dict.fromkeys(
         [*list_sets_of_size(n_logits), *list_sets_of_size(n_logits - 1)]
     )
@@ -896,7 +930,7 @@ def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
     if fitting:
         advice = f"{' or '.join(fitting)} would fit"
     else:
-        advice = "give the `labels` of its classes"
+        advice = "set the `labels` of its classes"
     raise ValueError(
         f"expected {classes} logits of a box for {classes} classes, or "
         f"{classes + 1} with one for nothing, got {n_logits}; {advice}"
@@ -925,23 +959,25 @@ def _infer_grid_order(grids: Sequence[Detections], classes: int, head: str) -> s
     ]
     orders = set.intersection(*orders_of_images)
     if not orders:
-        raise ValueError("pictures do not agree about how its numbers are to be read")
+        raise ValueError("the numbers of different pictures have different orders")
     if len(orders) > 1:
         options = " or ".join(
             format_option(f"order: {name}") for name in sorted(orders)
         )
-        raise ValueError(f"how its numbers are to be read does not show; say {options}")
+        raise ValueError(
+            f"the output does not show the order of its numbers; set {options}"
+        )
     return orders.pop()
 
 
 def _infer_pair_order(
     detections_of_images: Sequence[Detections], classes: int | None
 ) -> str:
-    """Return what the two numbers of boxes ("score_or_label") are, "" if it is open.
+    """Infer the order of the two numbers of boxes ("score_or_label"); "" if unknown.
 
-    Scores lie in [0, 1], and classes are integers. If both columns may be either, the
-    scores are in the column that never rises within an image, since suppression sorts
-    boxes by score. If neither can be classes, both are scores
+    Scores are in [0, 1], and classes are integers. If that allows both orders, the scores
+    are in the column that never rises within an image, since suppression sorts boxes by
+    score. If neither column can be classes, both are scores
     (`_infer_order_without_labels`).
 
     Args:
@@ -958,30 +994,31 @@ def _infer_pair_order(
     max_classes = math.inf if classes is None else classes
     are_classes = [_may_be_classes(column, max_classes) for column in columns]
     are_scores = [_may_be_scores(column) for column in columns]
-    may_have_scores_first = are_scores[0] and are_classes[1]
-    may_have_labels_first = are_scores[1] and are_classes[0]
-    if not may_have_scores_first and not may_have_labels_first:
+    fits_scores_first = are_scores[0] and are_classes[1]
+    fits_labels_first = are_scores[1] and are_classes[0]
+    if not fits_scores_first and not fits_labels_first:
         if all(are_scores):
             order = _infer_order_without_labels(columns, classes)
             if order:
                 return order
         if classes is not None:
             # The number of classes may be wrong: try without it.
-            return infer_order(detections_of_images)
+            return _infer_pair_order(detections_of_images, classes=None)
         raise ValueError(
-            "expected for each box a score in [0, 1] and the number of a "
+            "expected for each box a score in [0, 1] and the index of a "
             "class, got other numbers"
         )
-    if may_have_scores_first and may_have_labels_first:
-        may_have_scores_first = _is_falling(pairs_of_images, column=0)
-        may_have_labels_first = _is_falling(pairs_of_images, column=1)
-    if may_have_scores_first == may_have_labels_first:
-        return ""
-    return SCORES_FIRST if may_have_scores_first else LABELS_FIRST
+    if fits_scores_first and fits_labels_first:
+        # Numbers such as 0 and 1 may be scores or classes.
+        fits_scores_first = _is_falling(pairs_of_images, column=0)
+        fits_labels_first = _is_falling(pairs_of_images, column=1)
+        if fits_scores_first == fits_labels_first:  # both columns fall, or none does
+            return ""
+    return SCORES_FIRST if fits_scores_first else LABELS_FIRST
 
 
 def _infer_order_without_labels(columns: Sequence[Tensor], classes: int | None) -> str:
-    """Return the order of boxes that have two scores and no class, "" if there is none.
+    """Return the order of boxes that have two scores and no class; "" if unknown.
 
     They are the scores of two classes; or, with a single class, objectness (the
     probability of any object) and the score of that class. If a column has only
@@ -999,8 +1036,9 @@ def _infer_order_without_labels(columns: Sequence[Tensor], classes: int | None) 
 
 
 def _collect_pairs(detections_of_images: Sequence[Detections]) -> list[Tensor]:
-    """Return the pairs `score_or_label` (K, 2) of each image that has such pairs: the
-    finite ones of boxes that count.
+    """Return the pairs "score_or_label" (K, 2) of each image that has such pairs.
+
+    Only finite pairs of boxes that count (`are_counted`) are returned.
     """
     pairs_of_images = []
     for detections in detections_of_images:
@@ -1012,18 +1050,18 @@ def _collect_pairs(detections_of_images: Sequence[Detections]) -> list[Tensor]:
 
 
 def _may_be_classes(values: Tensor, max_classes: float) -> bool:
-    """Whether all values are class indices, or -1 for none."""
+    """Return whether all values can be class indices, or -1 for no class."""
     is_integer = values == values.round()
     return bool((is_integer & (values >= -1.0) & (values < max_classes)).all())
 
 
 def _may_be_scores(values: Tensor) -> bool:
-    """Whether all values are in [0, 1]."""
+    """Return whether all values are in [0, 1]."""
     return bool(((values >= -TOLERANCE) & (values <= 1.0 + TOLERANCE)).all())
 
 
 def _is_falling(pairs_of_images: Sequence[Tensor], column: int) -> bool:
-    """Whether a column never rises within any image."""
+    """Return whether a column never rises within any image."""
     return all(
         bool((pairs[:, column].diff() <= 0.0).all()) for pairs in pairs_of_images
     )
@@ -1057,18 +1095,20 @@ def find_head_orders(
         Orders such as "boxes scores channels first".
 
     Raises:
-        ValueError: it has none of them; the message names what it seems to be.
+        ValueError: it has none of them; the message states what it seems to be.
     """
     orders = list[str]()
-    problem = ""  # why an order of the right size does not fit
+    # Why an order of the right size does not fit. An angle is the best explanation, and
+    # otherwise the first one is reported.
+    problem = ""
     for name in _list_orders_of_size(returned.shape, map_channels, classes, order):
         _, scores = split_grid(returned, classes, name, multiply_objectness=False)
         scores = scores.detach()
         is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
         if not bool((is_outside & scores.isfinite()).any()):
             orders.append(name)
-        elif name == _WITH_ANGLE and not bool(is_outside[:, :-1].any()):
-            # only the last channel is outside: an angle
+        elif name == _OBB_LIKE_ORDER and not bool(is_outside[:, :-1].any()):
+            # Only the last channel is outside of [0, 1]: it is an angle.
             problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
         elif not problem:
             problem = (
@@ -1076,13 +1116,13 @@ def find_head_orders(
                 f"{float(scores.max()):.3g} if it is read as '{name}'; "
                 "expected probabilities in [0, 1]: apply a sigmoid to them"
             )
-    # A head with objectness has 5 channels before its scores, as many as the box and
-    # the angle of an OBB head. So this order is accepted only if the user states it.
-    if orders == [_WITH_ANGLE] and not order:
+    # The angle of an OBB head may be in [0, 1] as well. So this order is accepted only if
+    # the user states it.
+    if orders == [_OBB_LIKE_ORDER] and not order:
         raise ValueError(
             f"its {5 + classes} channels may be those of an OBB head (with an angle), "
-            f"{_UNREAD}; if it has objectness, say `task='detection={{order: "
-            f"{_WITH_ANGLE}}}'`"
+            f"{_UNREAD}; if it has objectness, set `task='detection={{order: "
+            f"{_OBB_LIKE_ORDER}}}'`"
         )
     if orders:
         return tuple(orders)
@@ -1134,8 +1174,8 @@ def _make_channel_error(shape: tuple[int, int], classes: int) -> ValueError:
 def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> str:
     """Return the end of the message about a number of channels that does not fit.
 
-    It says what the channels other than boxes and scores seem to be, and what the user
-    can do.
+    It explains what the channels other than boxes and scores seem to be, and what the
+    user can do.
 
     Args:
         n_channels: number of channels of a box.
@@ -1143,9 +1183,11 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
         may_be_rows: whether boxes are rows; these may begin with a box, a score and a
             class.
     """
+    # channels after the box and a score for every class
     excess_channels = {n_channels - 4 - classes}
-    if may_be_rows:  # 4 numbers of a box, a score and a class
+    if may_be_rows:  # or after the box, a score and a class
         excess_channels.add(n_channels - 4 - 2)
+    # sets of labels with as many classes as there are channels from the first score on
     fitting = [
         f"`labels={name}`"
         for first_score in HEADS.values()
@@ -1153,20 +1195,20 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
     ]
     if fitting:
         return f"; {' or '.join(fitting)} would fit"
-    # OBB heads have 1 channel more, YOLO's masks 32, and keypoints 3 each
+    # OBB heads have 1 more channel, YOLO's masks 32, and each keypoint 3.
     if 1 in excess_channels:
         return f", as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
     if 32 in excess_channels:
         return (
-            ", as with mask coefficients, and no prototypes (N, 32, h, w) came "
-            "beside them"
+            ", as with mask coefficients, but the network returned no prototypes (N, "
+            "32, h, w) with them"
         )
     if any(excess > 0 and excess % 3 == 0 for excess in excess_channels):
         return (
-            f", as pose heads (with keypoints) have it, {_UNREAD}; or give the "
+            f", as pose heads (with keypoints) have it, {_UNREAD}; or set the "
             "`labels` of the model's classes"
         )
-    return "; give the `labels` of the model's classes"
+    return "; set the `labels` of the model's classes"
 
 
 def split_grid(

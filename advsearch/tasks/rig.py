@@ -1,5 +1,6 @@
-"""Judge the images of a rig of cameras: a task for each image, and a rule that combines
-them into one prediction.
+"""Task for a rig: several cameras that take images of the same configuration.
+
+Each image is judged by the same task, and a rule combines the judgements.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from torch import Tensor
 from advsearch.extend import InputError, Model, Task, models, tasks
 
 RULES = ("any", "all", "mean", "vote")
-"""When the rig is right: in any image, in all, on average of the losses, or in more
-than half.
+"""Conditions for a right prediction of the rig: it is right in any image, in all images,
+by the mean of the losses, or in more than half of the images.
 """
 
 
@@ -24,9 +25,10 @@ than half.
 class Rig(tasks.JointTask):
     """Combine the predictions about the images of several cameras in one configuration.
 
-    Each image has its own truth, such as the box in it. The loss of the rig is the
-    smallest, the largest or the mean of the losses of its images, or for `vote` the one
-    that more than half of them are at or below.
+    Each image has its own truth, such as the object's box in that image. The loss of the
+    rig is the smallest ("any"), the largest ("all") or the mean ("mean") of the losses of
+    its images, or the smallest number that more than half of the losses do not exceed
+    ("vote").
 
     Args:
         task: task of each image: a name, or a mapping with a `name` and options.
@@ -41,8 +43,10 @@ class Rig(tasks.JointTask):
 
     task: Any = "classification"
     rule: str = RULES[0]
-    part: Any = field(default=None, metadata=tasks.FROM_RUN)  # the task on the model
-    cameras: int = field(default=1, metadata=tasks.FROM_RUN)  # how many there are
+    # task of each image, for the model
+    part: Any = field(default=None, metadata=tasks.FROM_RUN)
+    # number of cameras
+    cameras: int = field(default=1, metadata=tasks.FROM_RUN)
 
     def __post_init__(self) -> None:
         """Check the rule, and that the task is a name, a mapping or a task."""
@@ -77,22 +81,22 @@ class Rig(tasks.JointTask):
         Args:
             model: the model, whose `cameras` is the number of images of a rig.
             target: name of the class that the attack seeks; None for any wrong one.
-            minimise: whether the opposite of an error is sought.
+            minimise: whether a right prediction is sought.
 
         Raises:
-            InputError: there is a single camera, or the task is about all images at
-                once and the model takes them one by one.
+            InputError: there is a single camera; or the task needs a single output for
+                all images, and the model takes them one by one.
         """
         if model.cameras < 2:
             raise InputError(
-                "task rig: expected a rig, got one camera; give it with "
-                "`camera=rig.yaml`"
+                "task rig: expected a rig, got one camera; set `camera=rig.yaml`"
             )
+        # The task of an image does not depend on the number of cameras.
         part = self.part.on(replace(model, cameras=1), target=target, minimise=minimise)
         if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
             raise InputError(
-                "task rig: task command is of one action for all pictures; give a "
-                "policy that takes them at once, as "
+                f"task rig: task {part.name} judges one output for all pictures; use a "
+                "policy that takes all of them at once, as "
                 "advsearch.models.all_at_once.AllAtOnce"
             )
         return replace(
@@ -116,7 +120,8 @@ class Rig(tasks.JointTask):
         self, output: Sequence[tasks.Outputs], truth: tasks.Truths | None
     ) -> Rig:
         """Calibrate the task of the images on the clean image of the first camera."""
-        first_output = output[0][0]
+        first_rig = output[0]
+        first_output = first_rig[0]
         first_truth = None if truth is None else truth[0]
         part = self.part.after_calibration(first_output, first_truth)
         return replace(self, part=part)
@@ -132,12 +137,15 @@ class Rig(tasks.JointTask):
         return self._combine(self._map_images(self.part.loss, output, truth))
 
     def score(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
-        """See `Task.score`: a target is reached, and a right prediction made, by the
-        rule.
+        """Combine the scores of the images by the rule, (N,).
+
+        With a target, the rig is a success if it reaches the target by the rule, e.g. in
+        any of its images. With `minimise` it is a success if it is right by the rule.
         """
         scores = self._map_images(self.part.score, output, truth)
         if self.target is not None or self.minimise:
-            # The score of an image is then minus a loss, and the rule is one for losses.
+            # Such a score is minus a loss: that of the target, or that of the truth. The
+            # rule combines losses, so the sign is changed before and after it.
             return -self._combine(-scores)
         return self._combine(scores)
 
@@ -172,11 +180,12 @@ class Rig(tasks.JointTask):
         if self.rule == "mean":
             return values.mean(dim=1)
         n_images = values.shape[1]
-        # Which of the losses in ascending order decides.
+        # index of the deciding loss, if losses are in ascending order
         rank_by_rule = {
             "any": 0,  # over 0 only if no image is right
-            "all": n_images - 1,  # over 0 unless all are right
-            # over 0 unless more than half are right: of an even number the upper middle
+            "all": n_images - 1,  # over 0 unless all images are right
+            # Over 0 unless more than half of the images are right. For four images it is
+            # the third loss: three images have to be right.
             "vote": n_images // 2,
         }
         return values.sort(dim=1).values[:, rank_by_rule[self.rule]]
@@ -184,13 +193,18 @@ class Rig(tasks.JointTask):
     def predictions(
         self, output: Sequence[tasks.Outputs], count: int = 1
     ) -> list[tuple[tasks.Prediction, ...]]:
-        """Return a single prediction for each rig: those about its images, joined."""
+        """Return a single prediction for each rig: those about its images, joined.
+
+        Args:
+            output: outputs of the images of each rig.
+            count: not used; there is only one joined prediction.
+        """
         predictions_of_rigs: list[tuple[tasks.Prediction, ...]] = []
         for image_outputs in output:
-            predictions = [
-                self.part.predictions(image_output)[0][0]
-                for image_output in image_outputs
-            ]
+            predictions = []
+            for image_output in image_outputs:
+                (image_predictions,) = self.part.predictions(image_output)
+                predictions.append(image_predictions[0])
             predictions_of_rigs.append((tasks.join_predictions(predictions),))
         return predictions_of_rigs
 
@@ -213,7 +227,7 @@ class Rig(tasks.JointTask):
                 self.part.judge(image_output, image_truth)[0]
                 for image_output, image_truth in zip(image_outputs, truth, strict=True)
             ]
-            # The rule could skip an image without a number: the rig is broken anyway.
+            # The rule may ignore an image with NaN, but the rig's judgement is NaN then.
             if any(judgement.is_non_finite for judgement in judgements):
                 margin = math.nan
             rig_judgements.append(self._join_judgements(judgements, margin, score))
@@ -259,7 +273,8 @@ class Rig(tasks.JointTask):
         """
         if self.rule == "mean":
             return min(judgements, key=lambda judgement: judgement.margin)
-        # Under other rules the rig's margin is the margin of one of its images.
+        # Under other rules the rig's margin is the margin of one of its images. With a
+        # margin of NaN the outcome is not stored.
         return min(judgements, key=lambda judgement: abs(judgement.margin - margin))
 
     def marks(
@@ -277,7 +292,8 @@ class Rig(tasks.JointTask):
                 [
                     replace(mark, mask=self._pad_to_rig(mark.mask))
                     for mark in marks
-                    if mark.map is None  # a map is of one image, and drawn beside it
+                    # A map would be drawn next to the image, where the second image is.
+                    if mark.map is None
                 ]
             )
         return marks_of_rigs

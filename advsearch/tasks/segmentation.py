@@ -1,4 +1,4 @@
-"""Judge semantic segmentation: whether the object's pixels get a right class."""
+"""Task for semantic segmentation: do the object's pixels get a right class?"""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PixelMargin = Callable[[Tensor, tasks.Labels], Tensor]
 
 @dataclass(frozen=True)
 class SegmentationTruth:
-    """What has to be segmented in an image: the truth of segmentation.
+    """The truth of segmentation: the object in an image.
 
     Attributes:
         labels: indices of the right classes.
@@ -108,10 +108,11 @@ class Segmentation(tasks.ClassTask):
         return self.get_class_names(truth.labels)
 
     def loss(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
-        """Compute the margin of wrong classes at the deciding pixel, in logits, (N,).
+        """Compute the margin at the pixel that decides about the object, in logits, (N,).
 
-        It is over 0 if fewer than `accuracy` of the object's pixels are right, see
-        `_compute_deciding_margin`.
+        The margin of a pixel is its largest wrong logit minus its largest right one. The
+        pixel is chosen so that the loss is over 0 if and only if fewer than `accuracy`
+        of the object's pixels are right (`_compute_deciding_margin`).
         """
         return self._compute_deciding_margin(
             output, truth, tasks.compute_misclassification_margin, truth.labels
@@ -127,16 +128,18 @@ class Segmentation(tasks.ClassTask):
             return super().score(output, truth)
 
         def compute_target_shortfall(logits: Tensor, labels: tasks.Labels) -> Tensor:
-            """Compute by how much the target falls short of other classes at pixels.
+            """Compute the largest other logit minus the largest one of the target.
 
-            At most 0 means that a pixel gets the target. The sign is that of the margin
-            of wrong classes, which is at most 0 at right pixels.
+            Like the margin of wrong classes, it is at most 0 at pixels that get the
+            requested class.
             """
             return -tasks.compute_target_margin(logits, labels)
 
-        return -self._compute_deciding_margin(
+        # A loss, as if the target were the truth; the score is minus this loss.
+        target_loss = self._compute_deciding_margin(
             output, truth, compute_target_shortfall, self.target
         )
+        return -target_loss
 
     def pixel_margin(self, output: Tensor, truth: SegmentationTruth) -> Tensor:
         """Compute the mean margin over the object's pixels, in logits, (N,).
@@ -254,13 +257,15 @@ class Segmentation(tasks.ClassTask):
         results: list[tasks.PredictionWithPayload] = []
         mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):
+            # of a batch with this image only
             pixels = self._select_object_logits(logits[None], truth)
             if pixels is None:
                 results.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
                 continue
-            is_correct = self._find_correct_pixels(logits, truth)
-            accuracy = float(is_correct[mask].float().mean())
-            iou = float((is_correct & mask).sum() / (is_correct | mask).sum())
+            # in the full image: the pixels with a right class
+            is_right_class = self._find_right_pixels(logits, truth)
+            accuracy = float(is_right_class[mask].float().mean())
+            iou = float((is_right_class & mask).sum() / (is_right_class | mask).sum())
             counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
             prediction, outcome = self._describe_object(
                 counts, truth, accuracy, is_right=margin >= 0.0
@@ -298,12 +303,13 @@ class Segmentation(tasks.ClassTask):
         *,
         is_right: bool,
     ) -> tuple[tasks.Prediction, tasks.Outcome]:
-        """Return the prediction about the object, and what becomes of it.
+        """Return the prediction about the object, and its outcome.
 
         If enough pixels are right, the prediction is the most frequent right class.
-        Otherwise it is the most frequent wrong class. If that one stands for
-        background, the prediction is "no bottle"; or "bottle in part" if at least
-        `MIN_PARTIAL_ACCURACY` of the pixels are right.
+        Otherwise it is the most frequent wrong class. But if that class stands for
+        background, the prediction is the name of the object: "no bottle" (missed), or
+        "bottle in part" (loose) if at least `MIN_PARTIAL_ACCURACY` of its pixels are
+        right.
 
         Args:
             counts: number of the object's pixels with each class, (classes,).
@@ -314,8 +320,9 @@ class Segmentation(tasks.ClassTask):
         """
         is_right_class = torch.zeros_like(counts, dtype=torch.bool)
         is_right_class[list(truth.labels)] = True
-        is_candidate = is_right_class == is_right
-        # a count of -1 comes last, also behind classes without a pixel
+        # right classes if the object is right, otherwise wrong classes
+        is_candidate = is_right_class if is_right else ~is_right_class
+        # Other classes come last with a count of -1, even after classes without pixels.
         top_class = int(counts.masked_fill(~is_candidate, -1).argmax())
         if is_right or top_class not in self.nothing_classes:
             prediction = tasks.Prediction(
@@ -331,14 +338,19 @@ class Segmentation(tasks.ClassTask):
         return prediction, tasks.Outcome.MISSED
 
     @staticmethod
-    def _find_correct_pixels(logits: Tensor, truth: SegmentationTruth) -> Tensor:
-        """Return at which pixels the largest of the logits (C, h, w) is that of a right
-        class, (h, w) bool; a tie is right, NaN is not.
+    def _find_right_pixels(logits: Tensor, truth: SegmentationTruth) -> Tensor:
+        """Return which pixels of the full image get a right class, (h, w) bool.
+
+        A tie with a wrong class is right, and NaN is not.
+
+        Args:
+            logits: (classes, h, w) logits of the image.
+            truth: truth of the image.
         """
         n_classes = logits.shape[0]
         pixels = logits.permute(1, 2, 0).reshape(-1, n_classes)
-        is_correct = tasks.compute_misclassification_margin(pixels, truth.labels) <= 0.0
-        return is_correct.reshape(logits.shape[1:])
+        is_right = tasks.compute_misclassification_margin(pixels, truth.labels) <= 0.0
+        return is_right.reshape(logits.shape[1:])
 
     def marks(self, output: Tensor, truth: SegmentationTruth) -> list[list[tasks.Mark]]:
         """Return what is drawn: the object, and the pixels that get a right class."""
@@ -347,12 +359,15 @@ class Segmentation(tasks.ClassTask):
         return [
             [
                 true_mark,
-                tasks.Mark(name, False, mask=self._find_correct_pixels(logits, truth)),
+                tasks.Mark(name, False, mask=self._find_right_pixels(logits, truth)),
             ]
             for logits in output.detach()
         ]
 
 
 def _make_hidden_value(output: Tensor) -> Tensor:
-    """Return -1 for each of N outputs, attached to their graph, (N,)."""
+    """Return -1, a right prediction, for each of N images without the object, (N,).
+
+    The values are attached to the graph of the output.
+    """
     return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0

@@ -1,8 +1,8 @@
-"""Judge similarity: which reference images are nearest, by the cosine of features.
+"""Task for similarity: which reference images are nearest, by the cosine of features?
 
-With a gallery, one folder of images per name, it is a classification among these names.
-Without, a prediction is right if the network still sees the same thing as in the clean
-image.
+With a gallery, a folder of images for each name, it is a classification among these
+names. Without a gallery, a prediction is right if the features are similar to those of
+the clean image.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from torch.nn import functional
 from advsearch.extend import InputError, Model, models, stored_files, tasks
 
 MAX_REFERENCES = 10_000  # maximum number of images in a gallery, before `scale_limit`
-# Maximum size of a loaded image in pixels; larger ones are averaged down.
+# Maximum size of a loaded image in pixels; larger ones are reduced.
 MAX_IMAGE_SIZE = 1024
-BATCH_SIZE = 16  # batch size for a network
+BATCH_SIZE = 16  # batch size for embedding
 # Weight of the squared weights of a linear head, next to a mean cross-entropy in nats.
 WEIGHT_PENALTY = 1e-3
 # Maximum number of iterations of the fit; it usually converges after a few dozen.
@@ -37,10 +37,11 @@ class Gallery:
     Attributes:
         names: names of the folders, in order.
         name_index: (R,) int64, the index of each image's name.
-        paths: paths of each image, relative to the folder.
+        paths: path of each image, relative to the folder.
         features: (R, D), of length 1.
-        embedder: the network that embedded them, and its preprocessing.
-        head: head of `linear`: weights (names, D) and biases (names,).
+        embedder: the network that embedded the images, and its preprocessing.
+        head: linear head of the method "linear": weights (names, D) and biases
+            (names,). None for other methods.
     """
 
     names: tuple[str, ...]
@@ -140,8 +141,14 @@ def _list_references(
 
 
 def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
-    """Compute the features (R, D) of length 1 of the images in files, in batches."""
-    # A generator: images are loaded one by one, when a batch below needs them.
+    """Compute the features (R, D) of length 1 of the images in files, in batches.
+
+    Raises:
+        InputError: the model returns no features (N, D), or some that are not finite.
+        FileFormatError: a file is no image or is too large.
+    """
+    # A generator: images are loaded one by one, when a batch below needs them. They have
+    # the aspect ratio of the model's input, but their sizes may differ.
     images = (
         _crop_center(
             torch.from_numpy(models.load_upright(path, MAX_IMAGE_SIZE)),
@@ -151,7 +158,8 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
     )
     batches: list[Tensor] = []
     with torch.no_grad():
-        # A batch has images of one size; groupby keeps the order of the files.
+        # All images of a batch have the same size. `groupby` keeps the order of the
+        # files: it joins neighbors of the same size.
         for _, same_size in itertools.groupby(images, key=lambda image: image.shape):
             while batch := list(itertools.islice(same_size, BATCH_SIZE)):
                 batches.append(model(torch.stack(batch)))
@@ -161,11 +169,11 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
                         f"got {tuple(batches[-1].shape)}; use another task"
                     )
     features = torch.cat(batches)
-    has_nan = ~features.isfinite().all(dim=1)
-    if bool(has_nan.any()):
-        first = int(has_nan.nonzero()[0])
+    is_non_finite = ~features.isfinite().all(dim=1)
+    if bool(is_non_finite.any()):
+        first = int(is_non_finite.nonzero()[0])
         raise InputError(
-            f"references: model {model.name} returns for {paths[first]} NaN"
+            f"references: model {model.name} returns NaN or infinity for {paths[first]}"
         )
     return functional.normalize(features, dim=1)
 
@@ -251,47 +259,48 @@ def _crop_center(image: Tensor, size: tuple[int, int]) -> Tensor:
     return image[top : top + crop_height, left : left + crop_width]
 
 
-METHODS = ("nearest", "linear")  # how features become logits
+METHODS = ("nearest", "linear")  # methods that compute logits from features
 
 TEMPERATURE = 0.07
-"""Cosines are divided by it to be logits (Wu et al. 2018, arXiv 1805.01978, section
-4.1; Caron et al. 2021, arXiv 2104.14294, section 4.1).
+"""Divisor that turns cosines into logits (Wu et al. 2018, arXiv 1805.01978, section 4.1;
+Caron et al. 2021, arXiv 2104.14294, section 4.1).
 """
 
 ITSELF = "itself"
 SOMETHING_ELSE = "something else"
-"""The predictions with a threshold."""
+"""The predictions of a task with a threshold."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Similarity(tasks.Classification):
-    """Judge whether the object is what the nearest reference images show, or the clean
-    one.
+    """Judge whether an image is most similar to the right reference images.
+
+    With a threshold, it is compared with the clean image.
 
     The output is features (N, D) of any length. With `references` the truth is the
     indices of the right names, and logits (N, names) are computed from the features by
     `method`:
 
     - `nearest`: the mean cosine of the `k` nearest images of each name, over
-      `TEMPERATURE`. Each name is scored by its own images, so that a name with many has
-      no more votes than one with few, and every name has a gradient. With k = 1, the
-      default, a prediction is right exactly if the nearest image of all is; a larger k
-      lets no single image decide.
-    - `linear`: those of a logistic regression on the reference features, of length 1
-      (`fit_linear_head`).
+      `TEMPERATURE`. Each name is scored by its own images. So names with many images
+      have no advantage, and the logit of every name has a gradient. With k = 1, the
+      default, a prediction is right if and only if the nearest image of all has a right
+      name. With a larger k, no single image decides.
+    - `linear`: the outputs of a logistic regression on the reference features, of
+      length 1 (`fit_linear_head`).
 
-    With `threshold` the logits are the cosine to the clean image's features and the
-    threshold, over `TEMPERATURE`.
+    With `threshold` there are two logits: the cosine to the clean image's features, and
+    the threshold, both over `TEMPERATURE`.
 
     Args:
-        references: a folder with a folder of images for each name; "" for none.
+        references: folder with a folder of images for each name; "" for none.
         method: one of `METHODS`.
-        k: how many of the nearest images of a name count.
-        threshold: minimum cosine of an image that shows the same as the clean one; None
-            if there are references.
+        k: number of nearest images of each name that count.
+        threshold: minimum cosine of an image that counts as similar to the clean one;
+            None if there are references.
 
     Raises:
-        InputError: a value out of range, or options that exclude each other.
+        InputError: an option is out of range, or options exclude each other.
     """
 
     name = "similarity"
@@ -325,7 +334,7 @@ class Similarity(tasks.Classification):
             )
         if self.method == "linear" and self.k != 1:
             raise InputError(
-                "task similarity: k: belongs to `method: nearest`; leave "
+                "task similarity: k: is an option of `method: nearest`; leave "
                 "one of the two out"
             )
         if self.threshold is not None:
@@ -343,12 +352,13 @@ class Similarity(tasks.Classification):
     ) -> Similarity:
         """Return the task for a model, with the features of its reference images.
 
-        References are not embedded again if that was done for the same model.
+        If the task has a gallery already, which the same network with the same
+        preprocessing has embedded, references are not embedded again.
 
         Args:
             model: model that returns features.
             target: name that the attack seeks; None for any wrong one.
-            minimise: whether the opposite of an error is sought.
+            minimise: whether a right prediction is sought.
 
         Raises:
             InputError: there are neither references nor a threshold, a target has no
@@ -364,8 +374,8 @@ class Similarity(tasks.Classification):
             )
         if target is not None and not self.references:
             raise InputError(
-                "target: a `threshold` knows no names; give `references` "
-                "to task similarity"
+                "target: with a `threshold` there are no names; set `references` "
+                "of task similarity"
             )
         task = super().on(model, target=target, minimise=minimise)
         embedder = (model.module, model.preprocessing)
@@ -394,8 +404,8 @@ class Similarity(tasks.Classification):
             return super().find_right_classes(facts)
         if facts.label is not None:
             raise InputError(
-                "label: a `threshold` knows no names, the clean picture "
-                "is what is right; leave it out"
+                "label: with a `threshold` there are no names, and the clean picture "
+                "is the truth; leave it out"
             )
         return (0,)
 
@@ -406,7 +416,8 @@ class Similarity(tasks.Classification):
     def after_calibration(
         self, output: Tensor, truth: tasks.Labels | None
     ) -> Similarity:
-        """Store the features of the clean image, to which others are compared."""
+        """Store the features of the clean image, with which others are compared."""
+        # not with references, or if they are stored already
         if not self.calibrates:
             return self
         features = functional.normalize(output.detach().float(), dim=1)
@@ -426,12 +437,15 @@ class Similarity(tasks.Classification):
         Raises:
             ValueError: there are no features of this shape.
         """
-        # A named tuple has the type of its class, and its components have names.
-        is_tuple = type(returned) in (tuple, list) and returned
-        features = models.pooled(returned[0] if is_tuple else returned, token=True)
+        # A named tuple has another type; its components are found by their names.
+        is_plain_sequence = type(returned) in (tuple, list) and len(returned) > 0
+        if is_plain_sequence:
+            returned = returned[0]
+        # None if there are no features; `token` selects the first token
+        features = models.pooled(returned, token=True)
         if features is None or features.dim() != 2 or features.shape[0] != count:
             raise ValueError(
-                f"expected features ({count}, D), or what has one of "
+                f"expected features ({count}, D), or an output with one of "
                 f"{', '.join(models.PARTS)}"
             )
         return features.float()
@@ -475,8 +489,8 @@ class Similarity(tasks.Classification):
         """
         if self.clean is None or self.threshold is None:
             raise InputError(
-                "task similarity: expected references, or a clean picture that it was "
-                "shown first"
+                "task similarity: expected references, or a clean picture before "
+                "other pictures"
             )
         cosine = features @ self.clean.to(features)
         threshold = torch.full_like(cosine, self.threshold)
@@ -515,7 +529,7 @@ class Similarity(tasks.Classification):
 def _rank_references(
     gallery: Gallery, features: Tensor, logits: Tensor, truth: tasks.Labels
 ) -> list[dict[str, tasks.JsonValue]]:
-    """Rank the right reference images and the right name for each of N images.
+    """Rank the right reference images and the right names for each of N images.
 
     Args:
         gallery: gallery of R references.
@@ -524,9 +538,10 @@ def _rank_references(
         truth: indices of the right names.
 
     Returns:
-        Payloads with the `rank` of the nearest right reference among all (1 if it is
-        the nearest) and its `cosine`; the `name_rank` of the right name by its logit;
-        and the `nearest` reference and its cosine.
+        Payloads with the `rank` of the nearest right reference among all `references`
+        (1 if it is the nearest) and its `cosine`; the `name_rank` of the best right name
+        among all names, by its logit; and the path of the `nearest` reference with its
+        cosine.
     """
     right_names = torch.tensor(truth)
     cosines = gallery.compute_cosines(features)
@@ -544,7 +559,7 @@ def _rank_references(
     return [
         {
             "rank": int(image_rank[row]),
-            "references": len(gallery.paths),
+            "references": len(gallery.paths),  # their number
             "cosine": round(float(right_cosine[row]), 4),
             "name_rank": int(name_rank[row]),
             "nearest": gallery.paths[int(nearest_image[row])],

@@ -1,4 +1,4 @@
-"""Combine tasks: several models with a task each, and every thing in an image."""
+"""Tasks made of others: for several models, and for every thing in an image."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from advsearch.tasks.base import (
     mean,
 )
 
-# What each of several models returns for one image, or one model for each image of a
-# rig.
+# The outputs of several models for one image, or of one model for each image of a rig.
 Outputs = tuple[Any, ...]
 
 
 @final
 class Ensemble:
-    """Run several models, each with its own preprocessing: the `Model.module` of
-    `join_models`.
+    """Run several models, each with its own preprocessing.
+
+    It is the network in the model from `join_models`.
     """
 
     def __init__(self, models: Sequence[Model]) -> None:
@@ -95,8 +95,10 @@ Truths = tuple[Truth, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class JointTask(Task):
-    """A task made of others, the `judges`: one for each of its truths in order, or one
-    for all.
+    """Base class for tasks that are made of other tasks, the `judges`.
+
+    There is a judge for each of its truths, in their order, or a single judge for all
+    truths.
     """
 
     varies = True
@@ -126,7 +128,7 @@ class JointTask(Task):
 
     def truth_names(self, truth: Any) -> tuple[str, ...]:
         truths = truth.values() if isinstance(truth, Mapping) else truth
-        # A single judge is repeated for all truths; several have one each.
+        # A single judge is repeated for all truths; otherwise each truth has its own.
         judged_truths = zip(cycle(self.judges), truths, strict=False)
         return _distinct(judge.truth_names(value) for judge, value in judged_truths)
 
@@ -156,15 +158,18 @@ class EnsembleTask(JointTask):
     A prediction is right if all models are right, and a success if it is one for every
     model. So the loss is the largest of the models' losses, and the score the smallest
     of their scores.
+
+    Attributes:
+        parts: task for each model, in the order of the outputs of `join_models`.
+        models: the models. Set by `on`.
+        tasks: the `parts`, for these models. Set by `on`.
     """
 
     name = "ensemble"
     objective = "each"
 
-    # One for each model, in the order of the outputs of `join_models`.
     parts: tuple[Task, ...]
     models: tuple[Model, ...] = field(default=(), metadata=FROM_RUN)
-    # The `parts` on these models.
     tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)
 
     @property
@@ -188,7 +193,7 @@ class EnsembleTask(JointTask):
             model: model from `join_models`.
             target: label that the attack seeks; None for any wrong one. It is passed
                 only to the tasks that take a label, if any do.
-            minimise: whether the opposite of an error is sought.
+            minimise: whether a right prediction is sought.
 
         Raises:
             InputError: the model is not from `join_models`, or has not one model per
@@ -219,11 +224,14 @@ class EnsembleTask(JointTask):
         )
 
     def select_facts(self, task: Task, facts: Facts) -> Facts:
-        """Return the facts for one of the tasks: without a label that is for others."""
+        """Return the facts for one of the tasks, without a label for other tasks."""
         return facts if self._takes_label(task) else replace(facts, label=None)
 
     def _takes_label(self, task: Task) -> bool:
-        """Whether a label is for this task: it takes one, or no task does."""
+        """Return whether a label is passed to a task.
+
+        It is passed to all tasks if none takes one, so that they report the error.
+        """
         return task.labelled or not any(part.labelled for part in self.parts)
 
     def check(self, facts: Facts) -> None:
@@ -233,7 +241,7 @@ class EnsembleTask(JointTask):
     def after_calibration(
         self, output: Sequence[Outputs], truth: Truths | None
     ) -> EnsembleTask:
-        """Let each task infer what it needs from the clean output of its model.
+        """Calibrate each task with the output of its model for the clean image.
 
         Args:
             output: outputs of all models for each image.
@@ -305,8 +313,8 @@ class EnsembleTask(JointTask):
         """Join the models' judgements of one image, in the order of the models.
 
         The margin and the outcome are those of the model with the smallest margin. The
-        payload has the payloads of all models by name. If a model returned NaN, the
-        joint margin is NaN too.
+        payload has the payloads of all models by name, and the outcome. If a model
+        returned NaN, the joint margin is NaN too, and there is no payload.
         """
         worst = min(judgements, key=lambda judgement: judgement.margin)
         margin = worst.margin
@@ -324,10 +332,11 @@ class EnsembleTask(JointTask):
         return Judgement.from_margin(score, margin, prediction, payload)
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
-        """Return what is drawn over each image.
+        """Return the marks to draw on each image.
 
-        This is the truth as the first model's task marks it, the maps of all models,
-        and the prediction of each model with its name before the text.
+        They are the boxes and masks of the truth, as the first model's task marks it,
+        the true maps of all models, and the prediction of each model with its name
+        before the text.
         """
         marks_of_images: list[list[Mark]] = [[] for _ in output]
         for index, (task, model_output, task_truth) in enumerate(
@@ -356,10 +365,10 @@ class EnsembleTask(JointTask):
         return list(zip(self.tasks, split_by_model(output), truth, strict=True))
 
 
-# ---- one task for the object and every other thing ----
+# ---- a task for every thing in an image ----
 #
-# A prediction is right if it is right about all of them. A search seeks a wrong
-# prediction about any of them: loss and score are the largest over the things.
+# A prediction is right if it is right about all things. A search seeks a wrong prediction
+# about any of them: loss and score are the largest over the things.
 
 TruthByThing = Mapping[str, Truth]  # the truth of each thing, by name
 
@@ -370,7 +379,7 @@ class EachThingTask(JointTask):
 
     name = "each thing"
 
-    part: Task  # the task of a single thing, on its model
+    part: Task  # the task for a single thing, bound to its model
 
     @property
     def judges(self) -> tuple[Task, ...]:
@@ -379,7 +388,7 @@ class EachThingTask(JointTask):
     def after_calibration(
         self, output: Output, truth: TruthByThing | None
     ) -> EachThingTask:
-        """Calibrate the task of an object with the truth of the first object."""
+        """Calibrate the task with the truth of the first thing, which is the object."""
         first_truth = None if truth is None else next(iter(truth.values()))
         return replace(self, part=self.part.after_calibration(output, first_truth))
 
@@ -422,15 +431,16 @@ class EachThingTask(JointTask):
     def describe(
         self, output: Output, truth: TruthByThing, margins: Sequence[float]
     ) -> list[PredictionWithPayload]:
-        """Return the prediction about the worst visible object in each image.
+        """Return the prediction about the worst visible thing in each image.
 
-        The payload is that of the worst object. It also has the name of this object,
-        the mean margin, and a summary of the judgement of each object ("things").
+        The payload is that of the worst thing. It also has the name of this thing
+        ("worst"), the mean margin, and a summary of the judgement of each thing
+        ("things").
 
         Args:
             output: output of N images.
-            truth: truth of each object, by its name.
-            margins: not used; the margin of each object is computed here.
+            truth: truth of each thing, by its name.
+            margins: not used; the margin of each thing is computed here.
         """
         judgements_of_things = [
             self.part.judge(output, thing_truth) for thing_truth in truth.values()
@@ -457,15 +467,16 @@ class EachThingTask(JointTask):
         return results
 
     def marks(self, output: Output, truth: TruthByThing) -> list[list[Mark]]:
-        """Return what is drawn over each image: the truth of all objects, and the
-        prediction once.
+        """Return the marks to draw on each image.
+
+        They are the true marks of all things, and the predicted ones once.
         """
         marks_of_things = [
             self.part.marks(output, thing_truth) for thing_truth in truth.values()
         ]
         marks_of_images = []
         for image_marks in zip(*marks_of_things, strict=True):
-            # the predictions are the same whichever thing is judged
+            # The predicted marks are the same for each thing.
             marks = [mark for thing in image_marks for mark in thing if mark.true]
             marks += [mark for mark in image_marks[0] if not mark.true]
             marks_of_images.append(marks)
@@ -473,8 +484,9 @@ class EachThingTask(JointTask):
 
 
 def _find_worst_thing(judgements: Mapping[str, Judgement]) -> str:
-    """Return the name of the thing with the smallest margin among the visible ones; of
-    all, if none is visible.
+    """Return the name of the thing with the smallest margin among the visible ones.
+
+    If none is visible, it is that of all things.
     """
     visible = [
         name
@@ -485,7 +497,7 @@ def _find_worst_thing(judgements: Mapping[str, Judgement]) -> str:
 
 
 def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:
-    """Return what a payload has about one of several things."""
+    """Return the summary of a thing's judgement for a payload."""
     summary: dict[str, JsonValue] = {
         "right": judgement.right,
         "margin": judgement.margin,
@@ -498,10 +510,10 @@ def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:
 
 
 def make_each_thing_task(task: Task) -> EachThingTask:
-    """Return a task that judges every object in the scene by the given task.
+    """Return a task that judges every thing in the scene by the given task.
 
     Args:
-        task: task that judges one object, already bound to its model.
+        task: task that judges one thing, already bound to its model.
 
     Raises:
         InputError: its models make one prediction about the full image, or there are
@@ -512,7 +524,8 @@ def make_each_thing_task(task: Task) -> EachThingTask:
             f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; "
             "judge one thing, by its name"
         )
-    # A class is made for this task, since name and objective are attributes of a class.
+    # Name and objective are attributes of a class, so a class is made for this task. The
+    # goal of the search is that of the task.
     attributes = {"name": task.name, "objective": task.objective}
     task_class: Any = type("EachThing", (EachThingTask,), attributes)
     result: EachThingTask = task_class(

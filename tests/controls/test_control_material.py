@@ -50,7 +50,7 @@ def test_a_pattern_has_one_scale_on_the_object_whatever_its_charts(scene: SceneD
     charts = rasterize_charts(mesh, 128)
     positions, normals = charts.compute_positions(), charts.compute_normals()
     flat = np.abs(normals[..., 2]) > 0.98  # seen from above only: the floor, the foot
-    cell = PATTERNS["checker"].size / 4.0
+    cell = PATTERNS["checker"].tile_size / 4.0
     inside = (np.abs(positions[..., :2] / cell % 1.0 - 0.5) < 0.4).all(axis=-1) & flat
     odd = (np.floor(positions[..., 0] / cell) + np.floor(-positions[..., 1] / cell)) % 2.0
     assert inside.sum() > 100

@@ -203,7 +203,7 @@ def test_headings_go_the_shorter_way_round(
         angle = float(torch.rad2deg(torch.atan2(*_turned(scene, control, (place + 0.5) / (len(headings) - 1)))))
         assert (angle - middle_of + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-2)
     notes = PathControl(path=str(file), moves="object").prepare(scene).notes
-    assert any("the shorter way" in note for note in notes) == told
+    assert any("the shorter direction" in note for note in notes) == told
 
 
 def _turned(scene: SceneDescription, control: Control, share: float) -> tuple[Tensor, Tensor]:

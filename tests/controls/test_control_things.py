@@ -38,7 +38,7 @@ def test_a_thing_that_moves_stays_out_of_houses_and_posts() -> None:
         taken = compute_footprint(mesh @ pose[:3, :3].T + pose[:3, 3])
         assert not any(is_overlapping(solid.footprint, taken) for solid in solids)
     post = load_description("car", "avenue", things="person@-15,-3.05")
-    with pytest.raises(InputError, match="person stands in"):
+    with pytest.raises(InputError, match="person overlaps with"):
         space_of(post, {"x": [-1.0, 1.0]})
 
 

@@ -104,7 +104,7 @@ def test_a_folder_needs_the_control_and_the_control_a_folder(folder: Path) -> No
     scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
     with pytest.raises(InputError, match="is a folder of photographs; name one of them, or let the control"):
         scene.renderer("texture", resolution=96)
-    with pytest.raises(InputError, match=r"chooses among the photographs of a folder.*give `backdrop=FOLDER`"):
+    with pytest.raises(InputError, match=r"chooses among the photographs of a folder.*set `backdrop=FOLDER`"):
         advsearch.load_scene(BOX, backdrop=folder / NAMES[0], unit="mm").renderer("backdrop", resolution=96)
     with pytest.raises(InputError, match=r"has no photograph sofa.jpg; it has 000001.jpg, "):
         scene.renderer({"backdrop": {"which": ["sofa.jpg"]}}, resolution=96)
@@ -123,7 +123,7 @@ def test_photographs_that_can_not_be_chosen_among_are_named(tmp_path: Path) -> N
         if name != NAMES[1]:
             change_json((folder / name).with_suffix(".json"), up=[0.0, -1.0, 0.0])
     scene = advsearch.load_scene(BOX, backdrop=folder, unit="mm")
-    with pytest.raises(InputError, match=r"in 000003.jpg the object stands with another side down than in"):
+    with pytest.raises(InputError, match=r"in 000003.jpg the object stands on another side than in"):
         scene.renderer("backdrop", resolution=96)
     for name in NAMES:
         change_json(

@@ -151,7 +151,7 @@ def test_a_policy_of_a_rig_takes_all_pictures_at_once(tmp_path: Path) -> None:
     found = advsearch.attack("mug", model, task={"name": "rig", "task": part}, policy="random", baseline=False, **given)
     assert found.summary.ending == "found"
     alone = advsearch.load_model(TowardsBlue(), task=task, input_size=SIDE)
-    with pytest.raises(InputError, match="one action for all pictures"):
+    with pytest.raises(InputError, match="one output for all pictures"):
         advsearch.attack("mug", alone, task={"name": "rig", "task": part}, **given)
 
 

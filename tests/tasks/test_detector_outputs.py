@@ -108,7 +108,7 @@ def test_scores_and_classes_are_told_apart_and_rows_that_fill_up_are_nothing(for
 def test_what_the_numbers_leave_open_is_asked_for() -> None:
     network = Shaped(rows, classes=(1, 0), scores=(1.0, 1.0))
     with pytest.raises(
-        InputError, match=r"which of a box's two numbers is its score does not show; say `task='detection="
+        InputError, match=r"the output does not show which of a box's two numbers is its score; say `task='detection="
     ):
         on(network)
     task, output = on(network, order="boxes scores labels")

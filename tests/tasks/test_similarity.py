@@ -205,7 +205,7 @@ def test_a_threshold_compares_with_the_clean_picture(model: Model) -> None:
     task = Similarity(threshold=0.8).on(model)
     clean, other = noisy(COLOURS["red"], 1), noisy(COLOURS["blue"], 1)
     assert task.calibrates and task.truth(Facts("mug", object_label="mug")) == (0,)
-    with pytest.raises(InputError, match="a clean picture that it was shown first"):
+    with pytest.raises(InputError, match="a clean picture before other pictures"):
         task.judge(model(clean), (0,))
     task = task.after_calibration(model(clean), (0,))
     assert not task.calibrates and task.after_calibration(model(other), (0,)) is task

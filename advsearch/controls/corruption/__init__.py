@@ -1,14 +1,15 @@
-"""The `corruption` control: one of the common image corruptions, by name and severity,
-on the finished picture.
+"""The `corruption` control: a common image corruption on the finished image.
+
+It has a name and a severity:
 
     severity 0   the image as it is
     0 to 1       mixed with that of severity 1
     1 to 5       the published severities; between two of them their parameters are
                  interpolated
 
-They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4
-and appendix A) as functions of the picture in torch; those by noise, blur, shifted
-pixels and weather are in `filters`.
+The corruptions are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261,
+section 4 and appendix A), as torch functions of an image (H, W, 3), display-referred
+sRGB in [0, 1]. Noise, blur, shifted pixels and weather are in the module `filters`.
 """
 
 from __future__ import annotations
@@ -29,14 +30,15 @@ BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))
 CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))
 SATURATION = ((0.3, 0.0), (0.1, 0.0), (2.0, 0.0), (5.0, 0.1), (20.0, 0.2))
 """Factor on the saturation, and what is added to it."""
-PIXELATE = (0.6, 0.5, 0.4, 0.3, 0.25)  # pixels left along a side, as a share
+# number of cells along a side, as a fraction of the number of pixels
+PIXELATE = (0.6, 0.5, 0.4, 0.3, 0.25)
 JPEG = (25, 18, 15, 10, 7)  # quality
-# values and saturations this small have no hue to speak of; keeps quotients finite
+# keeps quotients finite; colors with a smaller value or saturation have no visible hue
 _GREY = 1.0 / 512.0
 
 
 def brightness(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Raise the value of each pixel, keep hue and saturation."""
+    """Increase the value of each pixel, and keep hue and saturation."""
     (increase,) = filters.interpolate_table(BRIGHTNESS, level)
     value = image.amax(dim=-1, keepdim=True)
     return image + ((value + increase).clamp(max=1.0) - value) * (image + _GREY) / (
@@ -52,7 +54,7 @@ def contrast(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
-    """Scale the saturation, keep hue and value; grey stays grey."""
+    """Scale the saturation, and keep hue and value; gray stays gray."""
     factor, increase = filters.interpolate_table(SATURATION, level)
     value = image.amax(dim=-1, keepdim=True)
     saturation = (value - image.amin(dim=-1, keepdim=True)) / (value + _GREY)
@@ -61,10 +63,10 @@ def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
 
 
 def pixelate(image: Tensor, severity: int) -> Tensor:
-    """Average the picture (H, W, 3) over square cells; linear in the picture.
+    """Average an image (H, W, 3) over square cells; linear in the image.
 
     At the reference size a cell is 1.7 to 4 pixels wide, depending on the severity. In
-    a larger picture a cell is larger in proportion; in a smaller one it is not smaller.
+    a larger image a cell is larger in proportion; in a smaller one it is not smaller.
     """
     height, width = image.shape[:2]
     fraction = PIXELATE[severity - 1] / max(
@@ -104,20 +106,27 @@ CONTINUOUS_CORRUPTIONS: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = 
         saturate,
     )
 }
-"""Corruptions of every severity in [1, 5], mixed in below: of the picture, the severity
-and the seed.
+"""Corruptions that are defined for severities in [1, 5], by name.
+
+Below 1, the original image is blended with the result for severity 1. Arguments are the
+image, the severity and the seed.
 """
 CONTINUOUS_FROM_ZERO: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
     "elastic": filters.elastic
 }
-"""Corruptions of every severity in [0, 5]: a mix of a warped and an unwarped picture
-would show the object twice.
+"""Corruptions that are defined for severities in [0, 5], by name.
+
+They are not blended: a blend of a warped image and the original would show the object
+twice.
 """
 STEPPED_CORRUPTIONS: Mapping[str, Callable[[Tensor, int], Tensor]] = {
     "pixelate": pixelate,
     "jpeg": jpeg,
 }
-"""Corruptions of whole severities only: of the picture and the severity."""
+"""Corruptions that are defined for integer severities only, by name.
+
+Arguments are the image and the severity.
+"""
 CORRUPTION_NAMES = (
     *CONTINUOUS_CORRUPTIONS,
     *CONTINUOUS_FROM_ZERO,
@@ -126,9 +135,7 @@ CORRUPTION_NAMES = (
 
 
 class CorruptionControl(Control):
-    """A common image corruption (noise, blur, weather, digital) by name and
-    severity.
-    """
+    """A common image corruption (noise, blur, weather, digital) and its severity."""
 
     kind = "corruption"
     strength_parameter = "severity"
@@ -161,15 +168,17 @@ class CorruptionControl(Control):
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
-        # a name without a severity does nothing, and a severity needs a name: what is
-        # not given is searched
+        # A range of one parameter does not fix the other: a name without a severity has
+        # no effect, and a severity needs a name.
         self.has_requested_search = False
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        stepped = parameter.name == "severity" and {
-            *self.list_allowed_values("which", *CORRUPTION_NAMES)
-        } <= {*STEPPED_CORRUPTIONS}
-        return replace(parameter, estimators=()) if stepped else parameter
+        """Return a parameter; the severity of stepped corruptions has no derivative."""
+        allowed_names = {*self.list_allowed_values("which", *CORRUPTION_NAMES)}
+        are_all_stepped = allowed_names <= {*STEPPED_CORRUPTIONS}
+        if parameter.name == "severity" and are_all_stepped:
+            return replace(parameter, estimators=())
+        return parameter
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
         return apply_corruption(
@@ -182,7 +191,7 @@ class CorruptionControl(Control):
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return the severity that is applied: a whole one for stepped corruptions."""
+        """Return the applied severity: an integer for stepped corruptions."""
         severity = values["severity"]
         applied = float(severity)
         if CORRUPTION_NAMES[int(values["which"])] in STEPPED_CORRUPTIONS:
@@ -193,23 +202,23 @@ class CorruptionControl(Control):
 def apply_corruption(
     image: Tensor, name: str, severity: Tensor, seed: int = 0
 ) -> Tensor:
-    """Corrupt a picture.
+    """Corrupt an image.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
         name: one of `CORRUPTION_NAMES`.
-        severity: () in [0, 5]; 0 returns the picture.
-        seed: chooses the noise.
+        severity: () in [0, 5]; 0 returns the image.
+        seed: seed of the noise.
 
     Returns:
-        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and the severity, as
-        `docs/controls/corruption.md` says.
+        (H, W, 3) sRGB in [0, 1]; differentiable in the image and the severity, see
+        `docs/controls/corruption.md`.
     """
     if name in STEPPED_CORRUPTIONS:
         return _apply_stepped(image, STEPPED_CORRUPTIONS[name], severity)
     if name in CONTINUOUS_FROM_ZERO:
         return CONTINUOUS_FROM_ZERO[name](image, severity, seed).clamp(0.0, 1.0)
-    # The tables of these begin at severity 1; below, the picture is blended with that.
+    # Below severity 1, the image is blended with the result for severity 1.
     if float(severity.detach()) >= 1.0:
         return CONTINUOUS_CORRUPTIONS[name](image, severity, seed).clamp(0.0, 1.0)
     mildest = CONTINUOUS_CORRUPTIONS[name](
@@ -243,5 +252,5 @@ def _apply_stepped(
 
 
 def round_severity(severity: Tensor) -> int:
-    """Return the whole number nearest to a severity (), halves upwards."""
+    """Return the integer nearest to a severity (), where halves are rounded up."""
     return int(float(severity.detach()) + 0.5)

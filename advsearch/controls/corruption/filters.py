@@ -1,11 +1,10 @@
-"""Corruptions by noise, blur, shifted pixels and weather, and what all share: tables by
-severity, blurs, warps.
+"""Corruptions by noise, blur, shifted pixels and weather.
 
-Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A; their frost is photographs,
-and here it is grown from noise. Pictures are (H, W, 3) float32 display-referred sRGB in
-[0, 1]. Lengths in the tables are pixels of a picture whose smaller side has
-`REFERENCE_SIDE` pixels. Noise is one fixed draw, chosen by the seed: the same at every
-severity.
+They follow Hendrycks & Dietterich 2019, arXiv 1903.12261, appendix A. Their frost is a
+photograph; here it is drawn from noise. Images are (H, W, 3) float32 display-referred
+sRGB in [0, 1]. Lengths in the tables are in pixels of a reference image, whose shorter
+side has `REFERENCE_SIDE` pixels. The noise depends on the seed only, so that it is the
+same at every severity.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from torch import Tensor
 
 from advsearch.extend import images, seeds
 
-# smaller side in pixels of the pictures that the published tables were made for
+# shorter side in pixels of the images that the published tables were made for
 REFERENCE_SIDE = 224
-MAX_SEVERITY = 5  # severities run from 1 to this
+MAX_SEVERITY = 5  # severities go from 1 to this
 
 
 def compute_pixel_scale(image: Tensor) -> float:
-    """Return pixels of this (H, W, 3) picture for a pixel of the reference size."""
+    """Return how many pixels of an image (H, W, 3) are one pixel of the reference."""
     return min(image.shape[0], image.shape[1]) / REFERENCE_SIDE
 
 
@@ -44,16 +43,19 @@ def compute_reference_size(height: int, width: int) -> tuple[int, int]:
 
 
 def make_generator(seed: int, name: str) -> torch.Generator:
-    """Return a source of random numbers of its own for each corruption."""
+    """Return a random generator, which is different for each seed and corruption."""
     return torch.Generator().manual_seed(seeds.stream(seed, f"corruption {name}"))
 
 
 def interpolate_table(
     table: Sequence[Sequence[float]], severity: Tensor
 ) -> tuple[Tensor, ...]:
-    """Interpolate the five rows of a table linearly at a severity () in [1, 5].
+    """Interpolate a table linearly at a severity () in [1, 5].
 
-    Returns one tensor () a column; differentiable.
+    The table has a row for each integer severity.
+
+    Returns:
+        The value () of each column; differentiable in the severity.
     """
     rows = torch.tensor(table, dtype=torch.float32, device=severity.device)
     return interpolate_severity(severity, lambda integer: rows[integer - 1]).unbind()
@@ -66,12 +68,13 @@ def interpolate_severity(
 
     Args:
         severity: () in [1, 5]; the result is differentiable in it, and on its device.
+            Severities below 1 have no result.
         make_at_severity: returns a tensor for an integer severity.
     """
-    # at the largest severity the one before it, so that there is one above
+    # For the largest severity it is 4 with the fraction 1, as there is none above 5.
     below = min(int(severity.detach()), MAX_SEVERITY - 1)
     fraction = severity - below
-    # At an integer severity the upper result has no weight, and takes time to compute.
+    # At an integer severity the upper result has no weight; computing it takes time.
     if float(fraction.detach()) == 0.0 and not fraction.requires_grad:
         return make_at_severity(below).to(severity.device)
     lower = make_at_severity(below).to(severity.device)
@@ -112,27 +115,31 @@ def blur_gaussian(image: Tensor, sigma: Tensor) -> Tensor:
 def blur_along_line(
     image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float
 ) -> Tensor:
-    """Blur an image along a line: a one-sided Gaussian, cut off at twice the radius.
+    """Blur an image along a line, as motion does.
 
-    Lengths are in pixels of the reference image, that with a smaller side of
-    `REFERENCE_SIDE` pixels.
+    A pixel becomes the weighted mean of the pixels on one side of it. Weights are a
+    Gaussian of the distance, cut off at twice the radius. Distances are rounded to whole
+    pixels, but weights are continuous, so that the result is differentiable in radius
+    and sigma.
 
     Args:
         image: (H, W, C).
-        radius: () reference pixels.
+        radius: () half of the largest distance, reference pixels.
         sigma: () standard deviation, reference pixels.
-        angle: angle of the line, radians; 0 is to the right, 90 degrees down.
+        angle: angle of the line, radians; 0 is to the right, and pi / 2 down.
         step: pixels of this image for a reference pixel.
     """
-    # number of weights, one for each pixel along the line
+    # The kernel has 2 radius + 1 pixels, as one with the radius on both sides has.
+    kernel_length = 2.0 * radius + 1.0
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
-    # (count,) of each weight from the first, in reference pixels
+    # (count,) distance of each weight from the pixel, in reference pixels
     distance = torch.arange(count, device=image.device) / step
-    # soft over one pixel, so that the result is differentiable in the radius
-    cut_off = (2.0 * radius + 1.0 - distance).clamp(0.0, 1.0)
+    # falls from 1 to 0 over one pixel: differentiable in the radius
+    cut_off = (kernel_length - distance).clamp(0.0, 1.0)
     weights = torch.exp(-0.5 * (distance / sigma) ** 2) * cut_off
     weights = weights / weights.sum()
     height, width = image.shape[:2]
+    # enough on each side for lines in any direction
     padded = F.pad(images.to_planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
     for index, weight in enumerate(weights):
@@ -146,7 +153,7 @@ def blur_along_line(
 
 GAUSSIAN = ((0.08,), (0.12,), (0.18,), (0.26,), (0.38,))  # standard deviation, sRGB
 SHOT = ((60.0,), (25.0,), (12.0,), (5.0,), (3.0,))  # photons in a white pixel
-# share of the values that are lost
+# fraction of the values that are replaced
 IMPULSE = ((0.03,), (0.06,), (0.09,), (0.17,), (0.27,))
 # standard deviation relative to the value
 SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))
@@ -154,8 +161,9 @@ _DARK = 1e-3  # keeps the slope of a square root finite in black
 
 
 def _draw_noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tensor:
-    """Return noise of an image's shape (H, W, 3), other for each name: standard normal,
-    or uniform in [0, 1).
+    """Return noise (H, W, 3) of an image's shape, different for each name.
+
+    It is standard normal, or uniform in [0, 1).
     """
     return images.draw_noise(
         image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal
@@ -247,11 +255,13 @@ GAUSSIAN_BLUR = ((1.0,), (2.0,), (3.0,), (4.0,), (6.0,))
 # radius of the disc, reference pixels
 DEFOCUS = ((3.0,), (4.0,), (6.0,), (8.0,), (10.0,))
 GLASS = ((0.7, 1, 2), (0.9, 2, 1), (1.0, 2, 3), (1.1, 3, 2), (1.5, 4, 2))
-"""Standard deviation and farthest neighbour, reference pixels; number of passes."""
+"""Standard deviation of the blur and largest distance of a neighbor, reference pixels;
+and number of passes.
+"""
 MOTION = ((10.0, 3.0), (15.0, 5.0), (15.0, 8.0), (15.0, 12.0), (20.0, 15.0))
 """Radius and standard deviation, reference pixels."""
 ZOOM = ((1.11,), (1.15,), (1.2,), (1.24,), (1.3,))  # largest magnification
-# magnified pictures that are averaged; the published ones take 11 to 16
+# number of magnified images that are averaged; the published code takes 11 to 16
 ZOOM_STEPS = 16
 ELASTIC = (
     (488.0, 170.8, 24.4),
@@ -260,8 +270,8 @@ ELASTIC = (
     (17.08, 2.44, 4.88),
     (29.28, 2.44, 4.88),
 )
-"""Height of the wrinkles, their width, and how far a corner of the middle third moves;
-reference pixels.
+"""Height and width of the wrinkles, and largest shift of a corner of the shear; reference
+pixels.
 """
 
 
@@ -328,7 +338,7 @@ def motion_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 
 
 def zoom_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
-    """Average the image with magnified ones, like a camera that moves ahead.
+    """Average the image with magnified ones, like a camera that moves forwards.
 
     Args:
         image: (H, W, 3).
@@ -339,21 +349,24 @@ def zoom_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     zooms = 1.0 + (largest - 1.0) * torch.linspace(
         0.0, 1.0, ZOOM_STEPS, device=severity.device
     )
-    # an image magnified by a zoom is looked up 1 / zoom as far from its center
-    matrices = torch.diag_embed((1.0 / zooms)[:, None].expand(-1, 2))
-    theta = torch.cat([matrices, matrices.new_zeros(ZOOM_STEPS, 2, 1)], dim=2).to(
-        image.device
-    )
+    # A magnified image is looked up 1 / zoom as far from its center: affine maps
+    # (ZOOM_STEPS, 2, 3) that scale x and y, without a shift.
+    scales = (1.0 / zooms)[:, None].expand(-1, 2)
+    scale_matrices = torch.diag_embed(scales)
+    no_shift = scale_matrices.new_zeros(ZOOM_STEPS, 2, 1)
+    theta = torch.cat([scale_matrices, no_shift], dim=2).to(image.device)
     height, width = image.shape[:2]
     grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
     copies = images.to_planes(image).expand(ZOOM_STEPS, -1, -1, -1)
     zoomed = F.grid_sample(copies, grid, padding_mode="border", align_corners=False)
+    # The image counts twice, as in the published code: the first zoom is 1.
     return (image + zoomed.sum(dim=0).permute(1, 2, 0)) / (ZOOM_STEPS + 1)
 
 
 def glass_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Blur, show at each pixel what a neighbor shows, and blur again."""
     pixel_scale = compute_pixel_scale(image)
+    # The distance of neighbors and the number of passes are used in `_make_glass_shift`.
     reference_sigma, _, _ = interpolate_table(GLASS, severity)
     sigma = reference_sigma * pixel_scale
     height, width = image.shape[:2]
@@ -366,7 +379,12 @@ def glass_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 
 
 def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
-    """Return (2, N), how far to the right and down the origin (N,) of each pixel is."""
+    """Return how far the origin of each pixel is to the right and down, (2, N).
+
+    Args:
+        origin: (N,) index of the pixel that each pixel is taken from, row by row.
+        columns: number of pixels in a row.
+    """
     pixel = torch.arange(len(origin))
     right = origin % columns - pixel % columns
     down = origin // columns - pixel // columns
@@ -375,33 +393,36 @@ def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
-    """Make the shift of each pixel to where it is taken from behind frosted glass.
+    """Make the shift from each pixel to the pixel that frosted glass shows there.
 
-    One pixel after the other, from the bottom right on, takes over the content of a
-    random neighbor. The neighbor may have taken it over itself before, so that a pixel
+    Each pixel takes over the content of a random neighbor, one after the other from the
+    bottom right. The neighbor may have taken over other content before, so that a pixel
     may come from farther away than one step.
 
     Args:
         height: height of the image.
         width: width of the image.
-        seed: chooses the neighbors.
+        seed: seed of the neighbors.
         severity: 1 to 5.
 
     Returns:
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
     rows, columns = compute_reference_size(height, width)
-    # the first number is the strength of the blur, which is done elsewhere
+    # the first number is the standard deviation of the blur in `glass_blur`
     _, reach, n_passes = (int(value) for value in GLASS[severity - 1])
     source = make_generator(seed, "glass blur")
+    # index of the pixel whose content each pixel has, changed in each pass
     origins = list(range(rows * columns))
     for _ in range(n_passes):
+        # from -reach to reach - 1 down and to the right, as in the published code
         jumps = torch.randint(-reach, reach, (rows, columns, 2), generator=source)
         # as steps between indices of the flattened image
         to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
         _take_over_origins(origins, to_neighbor, rows, columns, reach)
     shift = _compute_shifts(torch.tensor(origins), columns)
     shift = shift.view(1, 2, rows, columns).float()
+    # Shifts are repeated, not interpolated, so that pixels stay scattered.
     return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
 
 
@@ -410,16 +431,25 @@ def _take_over_origins(
 ) -> None:
     """Let each pixel take over the origin of its neighbor, from the bottom right.
 
-    Pixels nearer to an edge than `reach` keep theirs. `origins` is changed in place;
-    `to_neighbor` is how much to add to a pixel's index.
+    Pixels near the edges keep their origins, so that all neighbors are inside of the
+    image: those in the first `reach` + 1 and the last `reach` - 1 rows and columns, as
+    in the published code.
+
+    Args:
+        origins: index of the origin of each pixel; it is changed in place.
+        to_neighbor: step from the index of each pixel to that of its neighbor.
+        rows: rows of the image.
+        columns: columns of the image.
+        reach: largest distance of a neighbor, pixels.
     """
     for row in range(rows - reach, reach, -1):
-        for pixel in range(row * columns + columns - reach, row * columns + reach, -1):
+        last_pixel = row * columns + columns - reach
+        for pixel in range(last_pixel, row * columns + reach, -1):
             origins[pixel] = origins[pixel + to_neighbor[pixel]]
 
 
 def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
-    """Shear the picture and wrinkle it; below severity 1 by less."""
+    """Shear an image and wrinkle it; below severity 1 the shifts are scaled down."""
     height, width = image.shape[:2]
     if float(severity.detach()) < 1.0:
         shift = severity * _make_elastic_shift(height, width, seed, 1).to(
@@ -435,12 +465,12 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
-    """Make the shift of each pixel to where it is taken from: wrinkles and a shear.
+    """Make the shift from each pixel to its source: wrinkles and a shear.
 
     Args:
         height: height of the image.
         width: width of the image.
-        seed: chooses the wrinkles and the shear.
+        seed: seed of the wrinkles and the shear.
         severity: 1 to 5.
 
     Returns:
@@ -449,6 +479,7 @@ def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Te
     rows, columns = compute_reference_size(height, width)
     wrinkle_height, wrinkle_width, corner_shift = ELASTIC[severity - 1]
     source = make_generator(seed, "elastic")
+    # (3, 2) random shifts of three points, which determine an affine map
     corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner_shift
     noise = torch.rand(rows, columns, 2, generator=source) * 2.0 - 1.0
     waves = ndimage.gaussian_filter(
@@ -459,6 +490,7 @@ def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Te
     )
     shear = _make_shear(rows, columns, corners)
     shift = torch.from_numpy(waves) * wrinkle_height + shear
+    # `elastic` converts reference pixels to pixels of the image.
     return images.resized(shift, height, width)
 
 
@@ -474,24 +506,26 @@ def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
         corners: (3, 2) shifts of the lower right, upper right and upper left corner.
     """
     # An affine map is its value at the center, and its slopes along rows and columns.
-    third = REFERENCE_SIDE // 3
-    # from the upper to the lower right corner, per row
-    by_row = (corners[0] - corners[1]) / (2 * third)
-    by_column = (corners[0] - corners[2]) / (2 * third) - by_row
+    lower_right, upper_right, upper_left = corners
+    side = 2 * (REFERENCE_SIDE // 3)
+    by_row = (lower_right - upper_right) / side
+    # The diagonal from the upper left to the lower right has both slopes.
+    by_column = (lower_right - upper_left) / side - by_row
     row = torch.arange(rows)[:, None, None] - (rows - 1) / 2.0
     column = torch.arange(columns)[None, :, None] - (columns - 1) / 2.0
-    # the center is in the middle between the lower right and the upper left corner
-    return (corners[0] + corners[2]) / 2.0 + row * by_row + column * by_column
+    # the center is halfway between the lower right and the upper left corner
+    at_center = (lower_right + upper_left) / 2.0
+    return at_center + row * by_row + column * by_column
 
 
-FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))  # how dense the fog is
-# how fast its details lose height: less is rougher
+FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))  # density of the fog
+# `decay` of its noise, see `make_fractal_noise`; a smaller one is rougher
 FOG_DECAY = (2.0, 2.0, 1.7, 1.5, 1.4)
-# weight of the picture and of the frost
+# weights of the image and of the frost
 FROST = ((1.0, 0.4), (0.8, 0.6), (0.7, 0.7), (0.65, 0.7), (0.6, 0.75))
-# square half-pixels of the reference picture for each feather of ice
+# number of pixels for each feather of ice, in an image of twice the reference size
 FEATHER_AREA = 260
-ICE_COLOR = (0.86, 0.95, 1.0)  # colour of the ice, sRGB
+ICE_COLOR = (0.86, 0.95, 1.0)  # color of the ice, sRGB
 SNOW = (
     (0.1, 0.3, 3.0, 0.5, 10.0, 4.0),
     (0.2, 0.3, 2.0, 0.5, 12.0, 4.0),
@@ -499,18 +533,20 @@ SNOW = (
     (0.55, 0.3, 4.5, 0.85, 12.0, 8.0),
     (0.55, 0.3, 2.5, 0.85, 12.0, 12.0),
 )
-"""Mean and spread of the noise, size of a flake, noise over which there is one, radius
-and spread of its streak.
+"""Mean and standard deviation of the noise, size of a flake, noise above which there is a
+flake, and radius and standard deviation of its streak.
 """
-# weight of the picture; the rest is a paler one
+# weight of the image; the rest is a paler image
 SNOW_IMAGE_WEIGHT = ((0.8,), (0.7,), (0.7,), (0.65,), (0.55,))
-LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey
+LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a gray
 
 
 def fog(image: Tensor, severity: Tensor, seed: int) -> Tensor:
-    """Add drifts of white, and scale the brightest value back to what it was."""
+    """Add drifts of white, and scale the image so that its maximum stays the same."""
     height, width = image.shape[:2]
     (density,) = interpolate_table(FOG, severity)
+    # Drifts for two integer severities are blended: noise can't be made for a decay in
+    # between, as the result has to be differentiable in the severity.
     drift = interpolate_severity(
         severity,
         lambda integer: _make_drift(height, width, seed, FOG_DECAY[integer - 1]),
@@ -544,7 +580,8 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
 
     Args:
         side: smallest side of the result; it is rounded up to a power of two.
-        decay: the height of the noise is divided by its square after each step.
+        decay: the height of the noise is divided by `decay` squared after each step.
+            With more than 1, finer details are lower.
         source: generator of random numbers; it advances.
     """
     grid = torch.zeros(1, 1)
@@ -552,16 +589,20 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
     while grid.shape[0] < side:
         size = grid.shape[0]
         noise = (torch.rand(3, size, size, generator=source) * 2.0 - 1.0) * height
+        # neighbors of each point, which wrap around the edges of the torus
         right = grid.roll(-1, 1)
-        down = grid.roll(-1, 0)
-        # diamond step: the centers of the cells
-        middle = (grid + right + down + right.roll(-1, 0)) / 4.0 + noise[0]
+        below = grid.roll(-1, 0)
+        lower_right = right.roll(-1, 0)
+        # diamond step: the centers of the cells, from their four corners
+        center = (grid + right + below + lower_right) / 4.0 + noise[0]
+        center_above = center.roll(1, 0)
+        center_left = center.roll(1, 1)
         finer = torch.empty(2 * size, 2 * size)
         finer[::2, ::2] = grid
-        finer[1::2, 1::2] = middle
+        finer[1::2, 1::2] = center
         # square step: the centers of the edges, from two old points and two centers
-        finer[::2, 1::2] = (grid + right + middle + middle.roll(1, 0)) / 4.0 + noise[1]
-        finer[1::2, ::2] = (grid + down + middle + middle.roll(1, 1)) / 4.0 + noise[2]
+        finer[::2, 1::2] = (grid + right + center + center_above) / 4.0 + noise[1]
+        finer[1::2, ::2] = (grid + below + center + center_left) / 4.0 + noise[2]
         grid = finer
         height = height / decay**2
     grid = grid - grid.min()
@@ -569,7 +610,7 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
 
 
 def frost(image: Tensor, severity: Tensor, seed: int) -> Tensor:
-    """Lay ice crystals over the picture."""
+    """Lay ice crystals over an image."""
     image_weight, ice_weight = interpolate_table(FROST, severity)
     ice = _make_ice(image.shape[0], image.shape[1], seed).to(image.device)
     return image_weight * image + ice_weight * ice
@@ -584,7 +625,7 @@ def _make_ice(height: int, width: int, seed: int) -> Tensor:
     rows, columns = compute_reference_size(height, width)
     source = make_generator(seed, "frost")
     film = make_fractal_noise(max(rows, columns), 1.4, source)[:rows, :columns, None]
-    # drawn at twice the size, so that lines are smooth
+    # drawn at twice the size and reduced, so that lines are smooth
     feathers = images.resized(
         _draw_feathers(2 * rows, 2 * columns, source), rows, columns
     )
@@ -603,6 +644,7 @@ def _draw_feathers(height: int, width: int, source: torch.Generator) -> Tensor:
     canvas = Image.new("L", (width, height))
     pen = ImageDraw.Draw(canvas)
     needles = torch.rand(height * width // FEATHER_AREA, 5, generator=source).tolist()
+    # The brightest needles are drawn last, over the others.
     for shine, x, y, turn, size in sorted(needles):
         _draw_feather(pen, complex(x * width, y * height), turn, size, shine)
     return torch.from_numpy(np.asarray(canvas, dtype=np.float32) / 255.0)[..., None]
@@ -641,7 +683,7 @@ def _draw_line(
 
 
 def snow(image: Tensor, severity: Tensor, seed: int) -> Tensor:
-    """Pale the picture and let streaks of snow fall before it."""
+    """Make an image paler, and add streaks of falling snow."""
     (image_weight,) = interpolate_table(SNOW_IMAGE_WEIGHT, severity)
     layer = interpolate_severity(
         severity,
@@ -665,7 +707,8 @@ def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     rows, columns = compute_reference_size(height, width)
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
     source = make_generator(seed, "snow")
-    # downwards, up to 45 degrees to either side
+    # Vertical streaks, up to 45 degrees to either side. -90 degrees is upwards: each
+    # pixel averages those above it, so that flakes are smeared downwards.
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
     noise = mean + spread * torch.randn(
         math.ceil(rows / flake_size),

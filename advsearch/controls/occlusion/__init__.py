@@ -1,13 +1,13 @@
-"""The `occlusion` control: a second object between the camera and the object, hiding a
-wanted share of it.
+"""The `occlusion` control: an occluder that hides a fraction of the object.
 
-The occluder comes in from one side of the picture, on a sphere around the camera, and
-stops where it hides as much as was asked for (3DB, Leclerc et al. 2021, arXiv
+The occluder moves on a sphere around the camera, from one side of the image towards the
+object, and stops when it hides the requested fraction (3DB, Leclerc et al. 2021, arXiv
 2106.03805, section 4):
 
-    place = camera + distance * turned(line of sight, direction, angle),    hidden(angle) = coverage
+    position = camera + distance * turned(line of sight, direction, angle)
+    hidden(angle) = coverage
 
-`angle` is found by bisection on rasterised silhouettes (`silhouettes`).
+`angle` is found by bisection on rasterized silhouettes (`silhouettes`).
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ PRIMITIVES = ("card", "sphere")
 BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
 OPTIONS = (*PRIMITIVES, *BUNDLED)
 EASE_IN_COVERAGE = 0.02
-"""Below this coverage the occluder slides in from outside the frame, so that the
-picture changes without a jump.
+"""Below this coverage the occluder moves in from outside of the image, so that the image
+changes without a jump.
 """
 # smallest distance in object sizes between the camera and the occluder
 MIN_CAMERA_DISTANCE = 0.05
@@ -88,8 +88,10 @@ def _make_card() -> assets.ObjectAsset:
     generator = np.random.Generator(np.random.PCG64(7))
     grain = generator.normal(0.0, 0.012, (64, 64, 1)) * np.ones(3)
     texels = np.array([0.70, 0.53, 0.36]) + grain
-    # the flutes under the paper
-    texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]
+    # Corrugations are visible through the paper as horizontal stripes, with a period of
+    # four rows.
+    row = np.arange(64)
+    texels += 0.012 * np.sin(row * math.pi / 2.0)[:, None, None]
     uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
     vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1)
     normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
@@ -101,18 +103,18 @@ def _make_card() -> assets.ObjectAsset:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where an occluder goes, in the camera's coordinates.
+    """Position and size of an occluder, in the camera's coordinates.
 
     Lengths are in object sizes.
 
     Attributes:
         axes: (3, 3) rows right, up and forward of a camera that looks at the center of
-            what is visible of the object.
+            the visible part of the object.
         angle: angle from that center to the occluder, radians.
-        size: size of the occluder, made smaller if it would not fit.
-        distance: distance from the camera, changed if it would not fit.
-        hidden: fraction of the object's area in the image.
-        is_out_of_sight: whether the occluder is put away.
+        size: size of the occluder; smaller than requested if it would not fit.
+        distance: distance from the camera; not the requested one if it would not fit.
+        hidden: fraction of the object's area in the image that is hidden.
+        is_out_of_sight: whether the occluder is behind the camera, and hides nothing.
     """
 
     axes: assets.Float64Array
@@ -124,18 +126,19 @@ class Placement:
 
 
 class OcclusionControl(Control):
-    """A second object between the camera and the object, hiding a fraction of it."""
+    """A second object between camera and object, which hides a fraction of the object."""
 
     kind = "occlusion"
     strength_parameter = "coverage"
-    # none is changed; but it comes after whatever moves the camera or the object
+    # They are only read: so the control is evaluated after those that move the camera or
+    # the object.
     refines = frozenset(geometry.OCCLUDER_INPUTS)
     parameters = (
         Parameter.named(
             "which",
             OPTIONS,
             "card",
-            "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
+            "The occluder: a piece of cardboard, a grey sphere, or a bundled object.",
             estimators=("differences",),
             moves_silhouettes=True,
         ),
@@ -145,8 +148,8 @@ class OcclusionControl(Control):
             0.0,
             0.9,
             0.0,
-            "Share of the object's picture area that it hides; at 0 it is out of "
-            "the frame.",
+            "Fraction of the object's area in the picture that it hides; at 0 it is "
+            "outside of the picture.",
             (0.0, 0.5),
         ),
         _moving(
@@ -155,7 +158,7 @@ class OcclusionControl(Control):
             -3600.0,
             3600.0,
             0.0,
-            "Side of the picture it comes in from: 0 is the right, 90 the top, "
+            "Side of the picture from which it comes: 0 is the right, 90 the top, "
             "counter-clockwise.",
             (0.0, 360.0),
             periodic=True,
@@ -176,8 +179,7 @@ class OcclusionControl(Control):
             0.1,
             0.9,
             0.5,
-            "Where between the camera and the object's middle: 0 is the camera, 1 "
-            "the middle.",
+            "Position between the camera (0) and the object's centre (1).",
             (0.3, 0.7),
         ),
         _moving(
@@ -186,7 +188,7 @@ class OcclusionControl(Control):
             -3600.0,
             3600.0,
             0.0,
-            "Rotation of the occluder about its own upright axis.",
+            "Rotation of the occluder about its vertical axis.",
             periodic=True,
         ),
     )
@@ -194,8 +196,8 @@ class OcclusionControl(Control):
         Choice(
             "object",
             None,
-            "Another occluder in place of `which`: any bundled "
-            "object, or a path to a mesh file.",
+            "Another occluder instead of `which`: any bundled "
+            "object, or the path of a mesh file.",
         ),
     )
 
@@ -215,8 +217,8 @@ class OcclusionControl(Control):
             )
         if "which" in self._settings:
             raise InputError(
-                f"{self.name}: object and which both say what the "
-                "occluder is; leave one of them out"
+                f"{self.name}: object and which both state the "
+                "occluder; leave one of them out"
             )
         self._settings["object"] = self.chosen["object"] = str(occluder)
 
@@ -285,18 +287,23 @@ class OcclusionControl(Control):
     def _part_name(self, option: str) -> str:
         """Return the name of an occluder's part of the scene.
 
-        The instance's name, with the option where there are several.
+        It is the name of the control, with the option if there are several.
         """
         return self.name if len(self._list_options()) == 1 else f"{self.name}-{option}"
 
     def find_placement(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> Placement:
-        """Find where the occluder goes, without derivatives.
+        """Find the position of the occluder, without derivatives.
 
         It moves into the image from the side that "direction" states, until it hides
         the fraction "coverage" of the object. It is placed out of sight if the object
-        is not in the image, or nothing is to be hidden.
+        is not in the image, or if the coverage is 0.
+
+        First the occluder is made to fit between camera and object, and its silhouette
+        is rasterized straight ahead of the camera. Then the angle is searched at which
+        the silhouette covers the fraction of the directions in which the object is
+        visible.
 
         Args:
             values: values of the control, by parameter.
@@ -328,14 +335,14 @@ class OcclusionControl(Control):
             requested["direction"],
         )
         angle = _find_covering_angle(view, passage, requested["coverage"])
-        # what it hides there, which may be less than requested
-        hidden = float(passage.compute_coverage(np.array([angle]))[0])
+        # The occluder may be too small to hide as much as requested.
+        hidden_fraction = float(passage.compute_coverage(np.array([angle]))[0])
         return Placement(
-            passage.axes, angle, size, distance, hidden, is_out_of_sight=False
+            passage.axes, angle, size, distance, hidden_fraction, is_out_of_sight=False
         )
 
 
-# ---- what the camera sees
+# ---- the view of the camera
 
 
 def _find_covering_angle(
@@ -344,24 +351,26 @@ def _find_covering_angle(
     """Find the angle, in radians, at which an occluder hides a fraction of the object.
 
     The angle is that between the occluder's and the object's centers, seen from the
-    camera. For fractions below `EASE_IN_COVERAGE` it is interpolated from the angle
-    outside of the image, so that the occluder does not jump in at a tiny fraction.
+    camera. At a coverage of 0 the occluder is just outside of the image. Below
+    `EASE_IN_COVERAGE` the angle is interpolated linearly from there, so that the
+    occluder does not jump into the image at a tiny coverage.
 
     Args:
         view: the object as the camera sees it.
-        passage: the occluder and the line on which it moves.
+        passage: the occluder, the object and the direction of movement.
         coverage: fraction of the visible object that should be hidden, over 0.
     """
-    outside = silhouettes.find_angle_outside(
+    angle_outside = silhouettes.find_angle_outside(
         view.directions_of_image,
         view.rim,
         passage.cover,
         passage.axes,
         passage.direction,
     )
-    angle = passage.find_angle(max(coverage, EASE_IN_COVERAGE), outside)
+    angle = passage.find_angle(max(coverage, EASE_IN_COVERAGE), angle_outside)
     if coverage < EASE_IN_COVERAGE:
-        angle = outside + (angle - outside) * coverage / EASE_IN_COVERAGE
+        to_inside = angle - angle_outside
+        angle = angle_outside + to_inside * coverage / EASE_IN_COVERAGE
     return angle
 
 
@@ -379,16 +388,20 @@ def _make_hidden_placement(size: float, distance: float) -> Placement:
 
 @dataclass(frozen=True, eq=False)
 class _ObjectView:
-    """The object as the camera sees it."""
+    """The object as the camera sees it.
 
-    # (N, 3) in which it is visible, each for the same area; None if it is not in the
-    # image
+    Directions are unit vectors in camera coordinates: right, up and forward.
+    """
+
+    # (N, 3) directions in which the object is visible, each for the same area of the
+    # image; None if it is not in the image
     directions: assets.Float64Array | None
-    # (M, 3) directions spread over the full image
+    # (M, 3) directions spread over the full image, to test if an occluder is outside
     directions_of_image: assets.Float64Array
-    rim: assets.Float64Array  # (K, 3) those at its edge
-    nearest_distance: float  # distance of its nearest vertex from the camera
-    center_distance: float  # distance of the middle of its bounding box
+    # (K, 3) directions at the edge of the image, which give its largest angle
+    rim: assets.Float64Array
+    nearest_distance: float  # distance of the object's nearest vertex from the camera
+    center_distance: float  # distance of the center of its bounding box
 
     @staticmethod
     def from_scene(
@@ -419,10 +432,14 @@ class _ObjectView:
             directions_of_image = silhouettes.spread_directions(frame)
             rim = frame.corners()
             directions = None if silhouette is None else silhouette.list_directions()
-        middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-        near = float(np.linalg.norm(points, axis=1).min())
-        far = float(np.linalg.norm(middle))
-        return _ObjectView(directions, directions_of_image, rim, near, far)
+        center = (points.min(axis=0) + points.max(axis=0)) / 2.0
+        return _ObjectView(
+            directions,
+            directions_of_image,
+            rim,
+            nearest_distance=float(np.linalg.norm(points, axis=1).min()),
+            center_distance=float(np.linalg.norm(center)),
+        )
 
 
 def _object_in_camera(
@@ -433,27 +450,29 @@ def _object_in_camera(
     Args:
         scene: the scene.
         earlier_inputs: inputs of earlier controls: the poses of camera and object, and
-            offsets (V, 3) of the vertices. What is missing is as in the scene.
+            offsets (V, 3) of the vertices. Those of the scene replace missing ones.
     """
     camera = (
         geometry.get_camera_pose(scene, earlier_inputs).detach().double().cpu().numpy()
     )
-    pose = _input_or(earlier_inputs, "object.to_world", geometry.object_to_world(scene))
-    offsets = _input_or(earlier_inputs, "object.offsets", np.zeros(3))
+    pose = _get_array(
+        earlier_inputs, "object.to_world", geometry.object_to_world(scene)
+    )
+    offsets = _get_array(earlier_inputs, "object.offsets", np.zeros(3))
     vertices = scene.object.mesh.vertices.astype(np.float64) + offsets
-    world = vertices @ pose[:3, :3].T + pose[:3, 3]
-    # a sensor's own x axis points to the left
-    in_camera = (world - camera[:3, 3]) @ camera[:3, :3] * (-1.0, 1.0, 1.0)
-    return np.asarray(in_camera)
+    in_world = vertices @ pose[:3, :3].T + pose[:3, 3]
+    # The columns of a camera's rotation are its axes: left, up and forward.
+    left_up_forward = (in_world - camera[:3, 3]) @ camera[:3, :3]
+    return np.asarray(left_up_forward * (-1.0, 1.0, 1.0))
 
 
 def _image_frame(
     scene: SceneDescription, earlier_inputs: Mapping[str, Tensor]
 ) -> geometry.Frame:
-    """Return what the image of a camera without distortion shows."""
+    """Return the bounds of the image of a camera without distortion."""
     scene_fov = np.array([scene.get_number("camera.fov")])
-    fov = float(_input_or(earlier_inputs, "camera.fov", scene_fov)[0])
-    shift = _input_or(earlier_inputs, "camera.shift", np.zeros(2))
+    fov = float(_get_array(earlier_inputs, "camera.fov", scene_fov)[0])
+    shift = _get_array(earlier_inputs, "camera.shift", np.zeros(2))
     return geometry.Frame.from_fov(
         fov, scene.aspect, (float(shift[0]), float(shift[1]))
     )
@@ -475,16 +494,18 @@ def _directions_through_lens(
         Unit directions (N, 3), each for the same area of the image; None if the mesh is
         not in the image.
     """
-    # A pinhole camera that looks at the mesh gives its silhouette. Directions through
-    # the lens that hit the silhouette are those in which the mesh is seen.
+    # The silhouette is rasterized for a pinhole camera that looks at the mesh. Then
+    # directions through the lens are spread over the image, and those in the silhouette
+    # are returned.
     vertex_directions = points / np.linalg.norm(points, axis=1, keepdims=True)
     axes = silhouettes.compute_center_axes(vertex_directions)
-    cover = silhouettes.rasterise_silhouette(points @ axes.T, faces)
-    if cover is None:
+    silhouette = silhouettes.rasterise_silhouette(points @ axes.T, faces)
+    if silhouette is None:
         return None
     # a camera model has y downwards
     positions, is_visible = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
-    # the part of the image to look at: the box of the vertices, if all are visible
+    # Directions are denser in a part of the image: the bounding box of the vertices. If
+    # some are outside of the image, the box is not known, and the full image is used.
     columns = (0.0, 1.0)
     rows = (0.0, 1.0)
     if bool(is_visible.all()):
@@ -492,8 +513,9 @@ def _directions_through_lens(
         right, bottom = positions.amax(dim=0).clamp(0.0, 1.0).tolist()
         columns = (left, right)
         rows = (top, bottom)
-    directions = _spread_directions(model, columns, rows, silhouettes.RASTER)
-    directions_on_mesh = directions[cover.contains(*(directions @ axes.T).T)]
+    directions = _spread_directions(model, columns, rows, count=silhouettes.RASTER)
+    right_up_forward = (directions @ axes.T).T
+    directions_on_mesh = directions[silhouette.contains(*right_up_forward)]
     return directions_on_mesh if len(directions_on_mesh) else None
 
 
@@ -527,29 +549,32 @@ def _spread_directions(
     return np.asarray(visible / np.linalg.norm(visible, axis=1, keepdims=True))
 
 
-def _input_or(
-    inputs: Mapping[str, Tensor], name: str, otherwise: assets.Float64Array
+def _get_array(
+    inputs: Mapping[str, Tensor], name: str, default: assets.Float64Array
 ) -> assets.Float64Array:
-    return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
+    """Return a scene input as a NumPy array, or the default if it is missing."""
+    return inputs[name].detach().double().cpu().numpy() if name in inputs else default
 
 
-# ---- where the occluder goes
+# ---- the position of the occluder
 
 
 def _fit_occluder(
-    points: assets.Float64Array, size: float, distance: float, near: float
+    points: assets.Float64Array, size: float, distance: float, nearest_distance: float
 ) -> tuple[float, float]:
     """Fit an occluder between the camera and the object.
 
     It keeps `MIN_CAMERA_DISTANCE` from the camera, and none of its vertices is farther
     from the camera than the object's nearest one. It is made smaller until it fits.
 
+    The occluder is treated as a cylinder around the line to the camera.
+
     Args:
         points: (V, 3) vertices of the occluder, centered on the origin, largest extent
             1; x points to the camera.
         size: requested size.
         distance: requested distance from the camera.
-        near: distance of the object's nearest vertex from the camera.
+        nearest_distance: distance of the object's nearest vertex from the camera.
 
     Returns:
         Its size, and its distance from the camera.
@@ -557,19 +582,19 @@ def _fit_occluder(
     front = float(points[:, 0].max())
     back = float(-points[:, 0].min())
     half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
-    # An object very close to the camera would leave no room for any occluder.
-    near = max(near, 3.0 * MIN_CAMERA_DISTANCE)
-    # 0.95 to the 200th is 1 / 28,000: by then anything fits
+    # An object very close to the camera would leave no room for any occluder: there, the
+    # occluder may be behind its nearest vertex.
+    limit = max(nearest_distance, 3.0 * MIN_CAMERA_DISTANCE)
+    # 0.95 to the 200th is 1 / 28,000: by then any occluder fits.
     for _ in range(200):
         min_distance = MIN_CAMERA_DISTANCE + size * front
-        # The back corners lie on a sphere of radius `near` around the camera.
-        squared_back_distance = near * near - (size * half_width) ** 2
+        # Pythagoras: the edge of the cylinder's back is `limit` away from the camera.
+        squared_back_distance = limit * limit - (size * half_width) ** 2
         max_distance = 0.0
         if squared_back_distance > 0.0:
             max_distance = math.sqrt(squared_back_distance) - size * back
         if max_distance >= min_distance:
             break
-        # not enough room: try a smaller one
         size *= 0.95
     return size, min(max(distance, min_distance), max_distance)
 
@@ -612,21 +637,44 @@ def _compute_pose(camera: Tensor, placement: Placement, values: Values) -> Tenso
         placement: where the occluder goes.
         values: values of the control, with "direction" and "turn" in degrees.
     """
-    right, up, forward = torch.from_numpy(placement.axes).to(camera)
+    axes = torch.from_numpy(placement.axes).to(camera)
     direction = torch.deg2rad(values["direction"])
-    # in the image: towards the occluder, and at a right angle to that
-    outwards = torch.cos(direction) * right + torch.sin(direction) * up
-    sideways = -torch.sin(direction) * right + torch.cos(direction) * up
-    to_occluder, outwards = _rotate_pair(forward, outwards, placement.angle)
-    # right and up as seen by a camera that looks at the occluder
-    right = torch.cos(direction) * outwards - torch.sin(direction) * sideways
-    up = torch.sin(direction) * outwards + torch.cos(direction) * sideways
-    # axes of the occluder, whose front (x) is towards the camera before it is turned
+    turned_axes = _turn_axes(axes, direction, placement.angle)
+    right, up, to_occluder = turned_axes
+    # Axes of the occluder: its front (x) faces the camera before it is turned about its
+    # vertical axis.
     turn = torch.deg2rad(values["turn"])
     x = -torch.cos(turn) * to_occluder + torch.sin(turn) * right
     y = torch.sin(turn) * to_occluder + torch.cos(turn) * right
-    # a sensor's own x axis points to the left
+    # from right, up and forward; the first column of a camera's pose is its left
     to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
     linear = placement.size * to_world @ torch.stack([x, y, up], dim=1)
     center = camera[:3, 3] + placement.distance * (to_world @ to_occluder)
     return geometry.make_affine(linear, center)
+
+
+def _turn_axes(
+    axes: Tensor, direction: Tensor, angle: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Turn a camera that looks at the object until it looks at the occluder.
+
+    Args:
+        axes: (3, 3) rows right, up and forward of the camera.
+        direction: () direction of the turn in the image, radians: 0 is to the right,
+            pi / 2 up.
+        angle: angle of the turn, radians.
+
+    Returns:
+        Right, up and forward (3,) of the turned camera.
+    """
+    right, up, forward = axes
+    # axes in the image: towards the occluder, and at a right angle to that
+    outwards = torch.cos(direction) * right + torch.sin(direction) * up
+    sideways = -torch.sin(direction) * right + torch.cos(direction) * up
+    turned_forward, turned_outwards = _rotate_pair(forward, outwards, angle)
+    # back from the axes in the image to right and up
+    turned_right = (
+        torch.cos(direction) * turned_outwards - torch.sin(direction) * sideways
+    )
+    turned_up = torch.sin(direction) * turned_outwards + torch.cos(direction) * sideways
+    return turned_right, turned_up, turned_forward

@@ -1,13 +1,13 @@
-"""How much of one thing another hides in the picture: silhouettes, rasterised in numpy,
-without a renderer.
+"""Silhouettes, which measure how much of a target an occluder hides in the image.
 
-The second thing moves on a sphere around the camera and keeps its side towards it. So
-its outline, as a set of directions from the camera, turns rigidly: it is rasterised
-once, and every position afterwards is a rotation of the directions in which the first
-thing is seen and a lookup.
+They are rasterized by NumPy, without a renderer. The occluder moves on a sphere around
+the camera, and the same side of it always faces the camera. So its silhouette, as a set
+of directions from the camera, turns rigidly. It is rasterized only once. For each
+position of the occluder, the directions in which the target is visible are rotated and
+looked up in the silhouette.
 
-Coordinates here are the camera's: to the right, upwards and forwards, in object sizes;
-"tangents" are the first two over the third.
+Coordinates are those of the camera: to the right, upwards and forwards, in object sizes.
+Tangents are the first two, divided by the third.
 """
 
 from __future__ import annotations
@@ -21,17 +21,22 @@ from numpy.typing import NDArray
 from advsearch.extend import assets, geometry, images
 
 RASTER = 128  # pixels along the longer side of a silhouette
-# angles at which the coverage is looked up before the crossing is narrowed down
+# number of angles at which the coverage is computed before the bisection
 N_SCAN_ANGLES = 48
-N_BISECTIONS = 12  # steps that narrow it down
-DIRECTION_GRID = 24  # rows and columns of the directions that stand for the whole frame
+N_BISECTIONS = 12
+DIRECTION_GRID = (
+    24  # rows and columns of directions that are spread over the full image
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """Which directions a thing is seen in.
+    """The directions in which something is visible.
 
-    A mask (h, w) over a window of tangents, row 0 at its low end.
+    Attributes:
+        mask: (h, w) whether it is visible in each pixel of the window, with row 0 at
+            the bottom.
+        window: bounds of the mask in tangents.
     """
 
     mask: NDArray[np.bool_]
@@ -71,7 +76,8 @@ class Silhouette:
         """
         height, width = self.mask.shape
         window = self.window
-        # This only avoids a division by 0: `is_inside` excludes what is not in front.
+        # The limit only avoids a division by 0: `is_inside` excludes directions that do
+        # not point forwards.
         depth = np.maximum(forwards, geometry.MIN_DEPTH)
         column = np.floor(
             (x / depth - window.left) / (window.right - window.left) * width
@@ -152,15 +158,15 @@ class Passage:
     """An occluder that moves sideways past a target, both as the camera sees them.
 
     Attributes:
-        hidden: (N, 3) unit directions in which the target is visible.
-        cover: silhouette of the occluder, straight ahead of the camera.
+        target_directions: (N, 3) unit directions in which the target is visible.
+        cover: silhouette of the occluder when it is straight ahead of a camera.
         axes: (3, 3) rows right, up and forward of a camera that looks at the center of
             the target.
         direction: side that the occluder comes from, degrees: 0 is the right of the
             image, 90 the top.
     """
 
-    hidden: assets.Float64Array
+    target_directions: assets.Float64Array
     cover: Silhouette
     axes: assets.Float64Array
     direction: float
@@ -168,26 +174,29 @@ class Passage:
     def compute_coverage(self, angles: assets.Float64Array) -> assets.Float64Array:
         """Return the fraction of the target that is hidden at each angle, (K,).
 
-        The occluder is not rasterised again for each angle. Instead, the directions of
-        the target are turned back by the angle and looked up in its silhouette.
+        The occluder is not rasterized again for each angle. Instead, the directions of
+        the target are expressed in the axes of a camera that looks at the occluder, and
+        looked up in its silhouette.
 
         Args:
             angles: (K,) radians, between the centers of occluder and target as seen
                 from the camera.
         """
-        turn = math.radians(self.direction)
-        right, up, forward = (self.hidden @ self.axes.T).T
-        # axes in the image: towards the occluder's side, and across
-        outwards = math.cos(turn) * right + math.sin(turn) * up
-        sideways = -math.sin(turn) * right + math.cos(turn) * up
+        side = math.radians(self.direction)
+        # components of the target's directions
+        right, up, forward = (self.target_directions @ self.axes.T).T
+        # in the image: towards the side of the occluder, and at a right angle to that
+        outwards = math.cos(side) * right + math.sin(side) * up
+        sideways = -math.sin(side) * right + math.cos(side) * up
         fractions = []
         for angle in angles:
-            turned_outwards = outwards * math.cos(angle) - forward * math.sin(angle)
-            depth = outwards * math.sin(angle) + forward * math.cos(angle)
-            # back to right and up
-            x = math.cos(turn) * turned_outwards - math.sin(turn) * sideways
-            y = math.sin(turn) * turned_outwards + math.cos(turn) * sideways
-            fractions.append(float(self.cover.contains(x, y, depth).mean()))
+            # components after the camera has turned outwards by the angle
+            new_outwards = outwards * math.cos(angle) - forward * math.sin(angle)
+            new_forward = outwards * math.sin(angle) + forward * math.cos(angle)
+            new_right = math.cos(side) * new_outwards - math.sin(side) * sideways
+            new_up = math.sin(side) * new_outwards + math.cos(side) * sideways
+            is_hidden = self.cover.contains(new_right, new_up, new_forward)
+            fractions.append(float(is_hidden.mean()))
         return np.array(fractions)
 
     def find_angle(self, fraction: float, outside: float) -> float:
@@ -222,7 +231,7 @@ class Passage:
 
 
 def spread_directions(frame: geometry.Frame) -> assets.Float64Array:
-    """Return unit directions (N, 3) that stand for all that a frame shows."""
+    """Return unit directions (N, 3) that are spread over a frame."""
     return Silhouette(
         np.ones((DIRECTION_GRID, DIRECTION_GRID), dtype=np.bool_), frame
     ).list_directions()
@@ -238,8 +247,8 @@ def compute_center_axes(directions: assets.Float64Array) -> assets.Float64Array:
     """
     forward = directions.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
-    # (0, 1, 0) is up. `forward` is never parallel to it, as it is in front of the
-    # camera.
+    # (0, 1, 0) is up. `forward` is not parallel to it, since the silhouette is in the
+    # image, in front of the camera.
     right = np.cross((0.0, 1.0, 0.0), forward)
     right = right / max(float(np.linalg.norm(right)), 1e-12)
     return np.stack([right, np.cross(forward, right), forward])
@@ -252,9 +261,9 @@ def find_angle_outside(
     axes: assets.Float64Array,
     direction: float,
 ) -> float:
-    """Return the angle in radians from which on an occluder is outside of the image.
+    """Return an angle in radians at which an occluder is just outside of the image.
 
-    Angles are scanned from outside to the center; the result is the last one before the
+    Angles are scanned from outside to the center. The result is the last one before the
     occluder covers any direction of the image.
 
     Args:
@@ -265,12 +274,14 @@ def find_angle_outside(
         direction: side that the occluder comes from, in degrees: 0 is the right, 90 the
             top.
     """
-    # the largest angles of the occluder and of the image from their centers
+    # The largest angles of the occluder from the forward direction, and of the image
+    # from the target. Corners and rim are unit vectors, so that cosines are components.
     corners = cover.window.corners()
     occluder_radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
     image_radius = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
-    # a little beyond the edge (0.02 is about a degree); never behind the camera
+    # a little beyond the edge (0.02 is about a degree), but not behind the camera
     max_angle = min(image_radius + occluder_radius + 0.02, 0.9 * math.pi)
+    # twice as dense as `find_angle` scans a smaller range
     angles = np.linspace(max_angle, 0.0, 2 * N_SCAN_ANGLES)
     coverage = Passage(directions, cover, axes, direction).compute_coverage(angles)
     indices_inside = np.nonzero(coverage > 0.0)[0]

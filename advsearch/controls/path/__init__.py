@@ -1,10 +1,10 @@
-"""The `path` control: the camera, the object or both travel, and `time` says where
-along the way they are.
+"""The `path` control: the camera, the object or both travel along a path.
 
-Of several paths (`approach,orbit,own.csv`) one is drawn with each configuration: `way`
-is its name. A frame of a drive is one time. So `--over path` finds one configuration
-for a whole drive, and a grid over `path.time` has its frames in order. Where the scene
-as it is described is a frame, that is the clean one: the end of `approach`, the middle
+The parameter `time` is the time on the path, so that each time is a frame of a drive. With
+`--over path` one configuration is found for a full drive, and a grid over `path.time`
+has its frames in order. If there are several paths (`approach,orbit,own.csv`), the
+parameter `way` selects one of them in each configuration. The clean scene is the frame in
+which camera and object are as the scene describes them: the end of `approach`, the center
 of `pass`, the beginning of `orbit`.
 """
 
@@ -55,23 +55,24 @@ PASS = "pass"
 ORBIT = "orbit"
 PATHS = (APPROACH, PASS, ORBIT)
 CAMERA, OBJECT = MOVERS = "camera", "object"
-# of files with a path, in small letters
+# suffixes of files with a path, in lower case
 PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
 MOVER_SEPARATOR = "+"  # between the camera's path and the object's
-PATH_SEPARATOR = ","  # between paths of which one is drawn
+PATH_SEPARATOR = ","  # between several paths, of which a configuration has one
 MAX_PATHS = 64
-# share of the time at which the scene is as it is described
+# time of the clean scene, as a fraction of the duration
 CLEAN_TIME_FRACTION = {APPROACH: 1.0, PASS: 0.5, ORBIT: 0.0}
 
 DEFAULT_REACH = 4.0
 DEFAULT_SECONDS = 10.0
-MIN_SECONDS = 1e-3  # seconds between waypoints at least, and of a path at most
-MAX_SECONDS = 3600.0
+MIN_SECONDS = 1e-3  # smallest time between waypoints
+MAX_SECONDS = 3600.0  # largest duration of a path
 # tolerance of `MIN_SECONDS`, as a fraction, for times that were rounded to decimals
 ROUNDING_FRACTION = 1e-3
-# object sizes from the camera to what it looks at, at least: nearer, it looks nowhere
+# smallest distance of the camera from the point that it looks at, object sizes; nearer,
+# it would have no direction
 MIN_TARGET_DISTANCE = 1e-3
-# times at which curved paths are looked at; a file's waypoints are in addition
+# number of times at which paths are checked, in addition to the waypoints of files
 N_CHECKED_TIMES = 2048
 TIME_COLUMN = "time"
 POSITION_COLUMNS = ("x", "y", "z")
@@ -79,34 +80,45 @@ TARGET_COLUMNS = ("look_x", "look_y", "look_z")
 HEADING_COLUMN = "heading"
 OBJECT_SHIFT_COLUMNS = ("object_x", "object_y", "object_z")
 OBJECT_HEADING_COLUMN = "object_heading"
-"""Columns of the object in a file that is about both."""
+"""Columns for the object in a file with the camera's and the object's path."""
 MAX_WAYPOINTS = 100_000
 MAX_FILE_BYTES = 16 * 2**20
 TRAJECTORY_CHOICES = ("axes", "up", "object_at")
-MAX_TILT = 60.0  # degrees from up, on average, over which other axes are likelier
-MAX_DISTANCE = 1e5  # metres, or object sizes, that a waypoint may be away
+# A mean angle, in degrees, between the camera's upward direction and the vertical. If it
+# is larger, the axes of a file are probably other ones.
+MAX_TILT = 60.0
+MAX_DISTANCE = 1e5  # largest coordinate of a waypoint, metres or object sizes
 
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
     """A path from a file.
 
-    Lengths are in metres where the object's size is known, in object sizes elsewhere.
+    Lengths are in metres if the object's size is known, otherwise in object sizes.
+
+    Attributes:
+        times: (n,) seconds from the first waypoint, ascending.
+        positions: (n, 3) for a camera, positions relative to the object's center in the
+            scene; for an object, shifts from there.
+        targets: (n, 3) points that the camera looks at, relative to the same center.
+            None if it looks at the object.
+        headings: (n,) angles by which the object is turned, degrees. None if it is not
+            turned.
+        rotations: (n, 4) quaternions x, y, z, w from the camera's axes (x right, y
+            down, z ahead). None if the camera looks at targets.
+        has_times: whether the file states times.
+        is_trajectory: whether the file is a trajectory of TUM, EuRoC or KITTI.
+        notes: sentences for the user about how the file is read.
     """
 
-    times: Tensor  # (n,) ascending, seconds from the first
-    # (n, 3) from the middle of where the object stands; of an object that moves, its
-    # shift
+    times: Tensor
     positions: Tensor
-    # (n, 3) what the camera looks at, from the same middle; None for the middle itself
     targets: Tensor | None
-    headings: Tensor | None  # (n,) degrees that the object is turned by; None for none
-    # (n, 4) quaternions x, y, z, w from the camera's axes (x right, y down, z ahead);
-    # None where it looks at targets
+    headings: Tensor | None
     rotations: Tensor | None = None
     has_times: bool = True
     is_trajectory: bool = False
-    notes: tuple[str, ...] = ()  # sentences about how it is read
+    notes: tuple[str, ...] = ()
 
     def interpolate(self, time: Tensor, column: Tensor) -> Tensor:
         """Interpolate a column, or several, linearly between waypoints.
@@ -146,30 +158,33 @@ class Waypoints:
 
 
 class Start(NamedTuple):
-    """A scene as it is described: poses (4, 4), and the object's middle (3,),
-    float32.
+    """Poses in the scene as it was described, float32.
+
+    Attributes:
+        camera: (4, 4) pose of the camera.
+        center: (3,) center of the object.
+        object: (4, 4) pose of the object.
     """
 
     camera: Tensor
-    middle: Tensor
+    center: Tensor
     object: Tensor
 
 
-Movement = str | Waypoints  # one of `PATHS`, or that of a file
+Movement = str | Waypoints  # one of `PATHS`, or waypoints from a file
 
-MovementByMover = Mapping[
-    str, Movement
-]  # what the camera, the object or both do, by `MOVERS`
+# the movement of the camera, the object or both, by one of `MOVERS`
+MovementByMover = Mapping[str, Movement]
 
 
 class PathControl(Control):
     """The camera, the object or both travel along a path; a frame is a time.
 
     Attributes:
-        seconds: how long the path takes; of several, the longest.
-        _paths: what each mover does, for each path.
-        _movers: what moves on any path: camera, object or both.
-        _files: the movements that were read from files.
+        seconds: duration of the path, or of the longest one.
+        _paths: movements of camera and object on each path.
+        _movers: what moves on any of the paths: "camera", "object" or both.
+        _files: movements that were read from files, on all paths.
     """
 
     kind = "path"
@@ -181,20 +196,19 @@ class PathControl(Control):
             "s",
             0.0,
             MAX_SECONDS,
-            "where the scene is as it is",
-            "Time since the path began.",
+            "the time of the clean scene",
+            "Time since the beginning of the path.",
         ),
     )
     choices = (
         Choice(
             "path",
             APPROACH,
-            "approach (straight up to where it stands), pass (straight past it), "
-            "orbit (once around), a .csv file "
+            "approach (straight to its position in the scene), pass (straight past "
+            "it), orbit (once around), a .csv file "
             "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. "
-            "Two of them with a + between: the "
-            "camera's and the object's. Several with commas between: each "
-            "configuration has one of them, `way`.",
+            "Two of them with a + between are the camera's and the object's path. "
+            "Several with commas between: each configuration has one of them, `way`.",
             "path",
         ),
         Choice(
@@ -206,29 +220,28 @@ class PathControl(Control):
         Choice(
             "seconds",
             DEFAULT_SECONDS,
-            "How long it takes; a file says so itself, but for KITTI's poses.",
+            "Duration of the path; a file states it, except for KITTI's poses.",
             max_value=MAX_SECONDS,
         ),
         Choice(
             "reach",
             DEFAULT_REACH,
-            "How far it goes, in distances of the scene's own camera: where "
-            "approach begins, half of what pass "
-            "takes.",
+            "Length, as a multiple of the camera's distance from the object in the "
+            "scene: the distance at which approach begins, or half the length of pass.",
             max_value=1000.0,
         ),
         Choice(
             "shutter",
             None,
-            "Seconds that each row is exposed: motion blur.",
+            "Seconds for which each row is exposed, which causes motion blur.",
             "shutter",
             max_value=60.0,
         ),
         Choice(
             "rolling",
             None,
-            "Seconds in which the rows are read, one after the "
-            "other; below 0 from the bottom.",
+            "Seconds in which all rows are read, one after the "
+            "other; negative if the lowest row is read first.",
             "rolling",
             max_value=60.0,
             signed=True,
@@ -246,15 +259,14 @@ class PathControl(Control):
         Choice(
             "up",
             None,
-            "What is up in a trajectory's world; by default z, of KITTI -y.",
+            "Upward axis of a trajectory's world; by default z, for KITTI -y.",
             options=tuple(WORLD_TO_Z_UP),
         ),
         Choice(
             "object_at",
             None,
-            "Where the object's middle is in a trajectory's "
-            "world, as [x, y, z]; by default its "
-            "origin.",
+            "Position of the object's centre in a trajectory's "
+            "world, as [x, y, z]; by default its origin.",
         ),
     )
 
@@ -275,8 +287,9 @@ class PathControl(Control):
         """Read the paths, and check the other choices against them.
 
         The choice `path` has one name or several, e.g. "orbit" or "drive.csv". A file
-        with times states its duration, so `seconds` must not be set as well; `reach`
-        must not be set if all paths are files.
+        with times states its duration, so that `seconds` must not be set as well. If
+        all paths are files, `reach` must not be set. If any path is a file, all paths
+        get the duration of the longest file.
 
         Raises:
             InputError: choices contradict each other or the files.
@@ -296,33 +309,33 @@ class PathControl(Control):
         self._files = [
             movement for movement in all_movements if isinstance(movement, Waypoints)
         ]
-        self._check_choices_of_files(
+        self._check_choices_fit_paths(
             names, are_all_files=len(self._files) == len(all_movements)
         )
         if self._files:
             self.chosen["seconds"] = max(
                 float(movement.times[-1]) for movement in self._files
             )
-        self.seconds = float(self.chosen["seconds"])  # how long the path takes
+        self.seconds = float(self.chosen["seconds"])
 
-    def _check_choices_of_files(
+    def _check_choices_fit_paths(
         self, names: Sequence[str], *, are_all_files: bool
     ) -> None:
         """Raise InputError if a choice is set that the paths state themselves.
 
         Args:
             names: names of the paths, e.g. "orbit" or "drive.csv".
-            are_all_files: whether every movement is from a file, none a named one such
-                as "orbit".
+            are_all_files: whether every movement is from a file, and none is a named
+                one such as "orbit".
         """
-        has_single_path = any(MOVER_SEPARATOR not in name for name in names)
-        if "moves" in self._settings and not has_single_path:
+        has_single_mover = any(MOVER_SEPARATOR not in name for name in names)
+        if "moves" in self._settings and not has_single_mover:
             raise InputError(
-                f"{self.name}: {names[0]} says what the camera does and "
-                "what the object; leave moves out"
+                f"{self.name}: {names[0]} states the movements of both the camera and "
+                "the object; leave moves out"
             )
-        # Where no path is set here, a setting of the run may state one later, and
-        # `prepare` checks then.
+        # Without a path in this control, a setting of the run may state one later.
+        # `prepare` checks that.
         if "path" in self._settings:
             self._check_trajectory_choices()
         if any(movement.has_times for movement in self._files):
@@ -331,28 +344,24 @@ class PathControl(Control):
             self._check_not_set("reach")
 
     def _check_not_set(self, setting: str) -> None:
-        """Check that a choice is not set, because the files of the paths state it.
-
-        Raises:
-            InputError: it is set.
-        """
+        """Raise InputError if a choice is set that the files of the paths state."""
         if setting in self._settings:
             raise InputError(
-                f"{self.name}: {setting}: the file in {self.chosen['path']} says "
-                "that itself; leave it out"
+                f"{self.name}: {setting}: the file in {self.chosen['path']} states it; "
+                "leave it out"
             )
 
     def _read_path(self, name: str) -> MovementByMover:
         """Return the movement of the camera, the object or both on a path.
 
         Args:
-            name: a path, e.g. "orbit" or "drive.csv", for what the choice `moves`
-                states; or two with a "+" between them, e.g. "approach+orbit": the
-                camera's and the object's.
+            name: a single movement, e.g. "orbit" or "drive.csv", of what the choice
+                `moves` states; or the camera's and the object's with a "+" between
+                them, e.g. "approach+orbit".
         """
         names = [name]
         halves = name.split(MOVER_SEPARATOR)
-        # a "+" may also stand in the name of one file
+        # The name of a single file may have a "+", too.
         if len(halves) == 2 and all(map(_is_path, halves)):
             names = halves
         is_single = len(names) == 1
@@ -364,13 +373,14 @@ class PathControl(Control):
                 "object's, got "
                 f"{name!r}"
             )
+        # `MOVERS` has the order of the names: the camera, then the object
         movers = [str(self.chosen["moves"])] if is_single else MOVERS
         movements: dict[str, Movement] = {}
         for mover, path_name in zip(movers, names, strict=True):
             if path_name in PATHS:
                 movements[mover] = path_name
             else:
-                # a file about the camera may have the object's movement too
+                # A file for the camera may have the object's movement too.
                 movements |= self._read_file(Path(path_name), mover, is_single)
         return movements
 
@@ -380,16 +390,16 @@ class PathControl(Control):
         A trajectory is a file of camera poses (TUM, EuRoC or KITTI).
 
         Raises:
-            InputError: one is set without a trajectory.
+            InputError: such a choice is set without a trajectory.
         """
-        needless = [
+        chosen_names = [
             name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
         ]
-        if needless and not any(waypoints.is_trajectory for waypoints in self._files):
+        has_trajectory = any(waypoints.is_trajectory for waypoints in self._files)
+        if chosen_names and not has_trajectory:
             raise InputError(
-                f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or "
-                "KITTI, and there is none; "
-                "leave it out"
+                f"{self.name}: {chosen_names[0]}: needs a trajectory of TUM, EuRoC or "
+                "KITTI, and there is none; leave it out"
             )
 
     def _check_object_at(self) -> None:
@@ -416,18 +426,20 @@ class PathControl(Control):
         Args:
             path: the file.
             mover: "camera" or "object", which moves along it.
-            is_single: whether no other file is about the object, so that a file about
-                the camera may state the object's movement too.
+            is_single: whether it is the only movement of its path. Then a table for the
+                camera may have columns with the object's movement as well.
+
+        Raises:
+            FileFormatError: it is in no such format, or a trajectory for the object.
         """
         text = _read_text(path)
         trajectory = read_trajectory(path, text)
-        if trajectory is None:
+        if trajectory is None:  # in none of the formats of trajectories
             return read_waypoints(path, mover, text=text, is_single_path=is_single)
         if mover != CAMERA:
             raise errors.FileFormatError(
-                f"{path}: {trajectory.format.value} is about the camera, and here the "
-                "object moves; write its way as "
-                "time,x,y,z,heading"
+                f"{path}: {trajectory.format.value} is a path of the camera, and here "
+                "the object moves; write its path as columns time,x,y,z,heading"
             )
         return {mover: self._read_camera_path(path, trajectory)}
 
@@ -441,7 +453,7 @@ class PathControl(Control):
             path: the file, for messages.
             trajectory: what was read from it.
         """
-        # choices that were left out by name, with the defaults taken for them
+        # defaults of choices that the user left out, by the name of the choice
         assumed = dict[str, str]()
         times = self._find_times(trajectory, assumed)
         check_times(path, times)
@@ -454,8 +466,8 @@ class PathControl(Control):
             tilt = measure_tilt(rotations)
             if tilt > MAX_TILT:
                 notes.append(
-                    f"{path}: the top of its pictures is {tilt:.0f} degrees from up, "
-                    "on average; another `axes` or "
+                    f"{path}: the upward direction of its pictures is {tilt:.0f} "
+                    "degrees from the vertical, on average; another `axes` or "
                     "`up` may be right."
                 )
             quaternions = torch.from_numpy(
@@ -482,8 +494,8 @@ class PathControl(Control):
 
         Args:
             trajectory: the trajectory.
-            assumed: defaults by the name of the choice; the rate is added if it is
-                used.
+            assumed: defaults of choices that the user left out, by name. If the rate is
+                used, the duration is added.
         """
         if trajectory.times is not None:
             return trajectory.times
@@ -505,17 +517,19 @@ class PathControl(Control):
         Args:
             path: the file, for messages.
             trajectory: what was read from it.
-            assumed: defaults by the name of the choice; those that are used here, for
-                choices that the user left out, are added.
+            assumed: defaults of choices that the user left out, by name. Those of
+                `axes`, `up` and `object_at` are added if they are used.
 
         Returns:
-            Positions (n, 3) relative to the object, in the file's unit, and rotations;
-            None if the file has none or they are not used.
+            Positions (n, 3) relative to the object, in the file's unit. And rotations,
+            which are None if the file has none, or if the axes are "none": then the
+            camera looks at the object.
 
         Raises:
-            InputError: the file has no rotations, and `axes` asks to ignore them.
-            FileFormatError: it is too far from the object.
+            InputError: the file has no rotations, and `axes` is "none".
+            FileFormatError: a position is too far from the object.
         """
+        # Without a setting, a choice is None.
         axes = str(self.chosen["axes"] or OPTICAL)
         up = str(self.chosen["up"] or trajectory.default_up)
         origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
@@ -533,28 +547,29 @@ class PathControl(Control):
         if np.abs(positions).max() > MAX_DISTANCE:
             raise errors.FileFormatError(
                 f"{path}: expected positions within {MAX_DISTANCE:g} of the object, "
-                "got "
-                "larger ones; object_at says where "
-                "that is in the file's world"
+                "got larger ones; set object_at to the object's position in the file's "
+                "world"
             )
         return positions, rotations
 
     def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        """Return the spec of a parameter; the choice among paths is always searched,
-        unless the user fixed it.
+        """Return the spec of a parameter.
+
+        The selection of a path is searched unless the user fixed it, even if the user
+        set a range for the time only.
         """
         is_path_choice = parameter.name == Control.PATH_PARAMETER
         if is_path_choice and parameter.name not in self.specs:
             return OneOf(parameter.options)
         return super().get_spec(parameter)
 
-    _time_shift = 0.0
+    _time_shift = 0.0  # seconds by which `advance_time` has moved the time
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and seconds in which all rows are read.
+        """Seconds during which the shutter is open, and seconds to read out all rows.
 
-        The latter are below 0 where rows are read from the bottom.
+        The latter are negative if rows are read from the bottom.
         """
         return float(self.chosen["shutter"] or 0.0), float(
             self.chosen["rolling"] or 0.0
@@ -569,8 +584,8 @@ class PathControl(Control):
         """Return the scene with notes on the files, after checking the paths in it.
 
         Raises:
-            InputError: something else fixes the camera, or the camera would be where it
-                looks.
+            InputError: something else fixes the camera, or the camera would be at the
+                point that it looks at.
         """
         if CAMERA in self._movers:
             self._check_camera_is_free(scene)
@@ -590,23 +605,23 @@ class PathControl(Control):
         """Raise InputError if a camera or a photograph of the scene fixes the pose."""
         if not scene.uses_orbit_camera:
             raise InputError(
-                f"`controls` {self.name}: moves the camera, and the scene is seen by "
-                f"its camera {scene.camera!r}; give "
-                f"moves=object, or have it seen by 'orbit'"
+                f"`controls` {self.name}: moves the camera, and the scene uses its own "
+                f"camera {scene.camera!r}; set moves=object, or set the camera to "
+                "'orbit'"
             )
         photograph = scene.backdrop_photograph
         if photograph is not None:
             raise InputError(
                 f"`controls` {self.name} and `backdrop={photograph.spec}` contradict "
-                "each other: the photograph was taken from one place; give "
+                "each other: the photograph was taken from one position; set "
                 "moves=object, or leave one of the two out"
             )
 
     def _list_notes(self) -> list[str]:
         """Return notes on the files, and one if they have different durations.
 
-        Frames are drawn from the duration of the longest, so that on a shorter path
-        some frames show the end position.
+        Times are drawn from the duration of the longest file. On a shorter one, the
+        frames after its end all show its last position.
         """
         notes = [note for waypoints in self._files for note in waypoints.notes]
         durations = [float(waypoints.times[-1]) for waypoints in self._files]
@@ -615,8 +630,8 @@ class PathControl(Control):
             notes.append(
                 f"path: the shortest of the files takes {_format_rounded(shortest)} s "
                 "of "
-                f"{_format_rounded(self.seconds)}; who "
-                "has arrived waits, and these frames count"
+                f"{_format_rounded(self.seconds)}; frames after its end show its last "
+                "position, and count"
             )
         return notes
 
@@ -624,14 +639,15 @@ class PathControl(Control):
         """Check that the camera is never at the point that it looks at.
 
         There it would have no direction. The vector from the camera to that point is
-        computed at many times, waypoints included, and taken as linear between them.
+        computed at many times, including those of waypoints, and taken as linear
+        between them.
 
         Args:
             name: name of the path, for messages.
             movements: movements of camera and object on it.
 
         Raises:
-            InputError: the camera is there at some time.
+            InputError: the camera is at that point at some time.
         """
         waypoint_times = [
             movement.times
@@ -643,8 +659,10 @@ class PathControl(Control):
         start = get_start_poses(self.scene, times.device)
         shift, _ = self._shift_object(movements, start, times)
         position, target = self._position_camera(movements, start, times, shift)
+        # If nothing moves, there is a single vector for all times.
         to_target = (target - position).expand(len(times), 3).double()
-        # for each step between two times, where on it the distance is smallest
+        # For each step between two times: the fraction of the step at which the distance
+        # is smallest, and that distance.
         fraction, distance = _find_closest_to_origin(to_target)
         if float(distance.min()) < MIN_TARGET_DISTANCE:
             index = int(distance.argmin())
@@ -653,10 +671,9 @@ class PathControl(Control):
             )
             raise InputError(
                 f"`controls` {self.name}: {name}: {collision_time:.4g} s after its "
-                "start the camera is where it "
-                "looks, so that it has no direction; lead it past that place, or say "
-                "what it looks at (look_x, look_y, "
-                "look_z)"
+                "start the camera is at the point that it looks at, so that it has no "
+                "direction; move the path away from that point, or state another point "
+                "to look at (look_x, look_y, look_z)"
             )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -666,16 +683,18 @@ class PathControl(Control):
         them, e.g. the end of an approach. It is the default. The range is the duration.
 
         Args:
-            parameter: the time; or the choice of a path, which is returned unchanged.
+            parameter: the time; or the selection of a path, which is returned
+                unchanged.
         """
         if parameter.name == Control.PATH_PARAMETER:
             return parameter
-        # The clean time is that of the first path's first movement. If that is an
-        # orbit, it is that of the second: after an orbit the first is where it began.
+        # The clean time is that of the first path's first movement. An orbit is an
+        # exception: it is closed, so that its start and its end both are as in the
+        # scene. Then the second movement decides, if there is one.
         movement, *other_movements = self._paths[0].values()
         if other_movements and movement == ORBIT:
             movement = other_movements[0]
-        clean_time = 0.0
+        clean_time = 0.0  # for waypoints from a file
         if isinstance(movement, str):
             clean_time = CLEAN_TIME_FRACTION.get(movement, 0.0) * self.seconds
         estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
@@ -695,6 +714,7 @@ class PathControl(Control):
             values: values of the control, "time" in seconds and the index of the path.
             earlier_inputs: inputs of earlier controls, which are not used.
         """
+        # A camera exposes its rows at later times (`advance_time`).
         time = values["time"] + self._time_shift
         movements = self._select_movements(values)
         start = get_start_poses(self.scene, time.device)
@@ -703,6 +723,7 @@ class PathControl(Control):
         if CAMERA in self._movers:
             position, target = self._position_camera(movements, start, time, shift)
             roll = self.scene.get_number("camera.roll")
+            # None on a path on which only the object moves
             movement = movements.get(CAMERA)
             if isinstance(movement, Waypoints) and movement.rotations is not None:
                 pose = make_camera_pose(
@@ -730,7 +751,7 @@ class PathControl(Control):
             times: (n,) seconds.
 
         Returns:
-            (paths, n) in the unit of `measured`.
+            (paths, n) in metres if the object's size is known, else in object sizes.
         """
         return torch.stack(
             [
@@ -740,18 +761,19 @@ class PathControl(Control):
         )
 
     def _camera_distance(self, movements: MovementByMover, time: Tensor) -> Tensor:
-        """Return the distance of the camera from the object, in metres if the object's
-        size is known, at times (...,).
+        """Return the distance of the camera from the object at times (...,).
+
+        It is in metres if the object's size is known, else in object sizes.
         """
         start = get_start_poses(self.scene, time.device)
         shift, _ = self._shift_object(movements, start, time)
         position, _ = self._position_camera(movements, start, time, shift)
-        offset = position - start.middle - shift
+        offset = position - start.center - shift
         distance: Tensor = offset.norm(dim=-1).double() * self.scene.size_in_metres
         return distance
 
     def _select_movements(self, values: Values) -> MovementByMover:
-        """Return what camera and object do on the path of a configuration."""
+        """Return the movements of camera and object on the path of a configuration."""
         if Control.PATH_PARAMETER in values:
             return self._paths[int(values[Control.PATH_PARAMETER])]
         return self._paths[0]
@@ -763,15 +785,17 @@ class PathControl(Control):
         time: Tensor,
         shift: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        """Return where the camera is, and what it looks at.
+        """Return the position of the camera, and the point that it looks at.
 
-        It looks at the moved object, unless a file says something else. On "approach"
-        it moves straight ahead and ends where the scene has it, on "pass" it moves past
-        that position from left to right, and on "orbit" once around the object.
+        A camera that moves looks at the moved object, unless a file states something
+        else. On "approach" it moves straight ahead to its position in the scene, on
+        "pass" it moves past that position from left to right, and on "orbit" once
+        around the object.
 
         Args:
-            movements: movements of camera and object; it may have none.
-            scene_start: poses of the scene as it is described.
+            movements: movements of camera and object; without one of the camera, it
+                stays as in the scene.
+            scene_start: poses in the scene as it was described.
             time: (...,) seconds.
             shift: (..., 3) how far the object has moved, in object sizes.
 
@@ -780,32 +804,33 @@ class PathControl(Control):
             object sizes.
         """
         # columns of the pose: the camera's x axis points to the left, y up, z ahead
-        left, _, forward, start = scene_start.camera[:3].unbind(dim=1)
-        center = scene_start.middle
+        left, _, forward, scene_position = scene_start.camera[:3].unbind(dim=1)
+        center = scene_start.center
         movement = movements.get(CAMERA)
         if movement is None:
-            return start, center
+            return scene_position, center
         if isinstance(movement, Waypoints):
             return self._camera_on_waypoints(movement, center, time, shift)
-        distance = (start - center).norm()
+        distance = (scene_position - center).norm()
         reach = float(self.chosen["reach"])
         progress = (time / self.seconds).clamp(0.0, 1.0)
         if movement == APPROACH:
             ahead = _level_direction(forward)
-            # it begins `reach` times as far away as it ends
+            # It begins at `reach` times its last distance.
             to_go = (1.0 - progress)[..., None]
-            return start - ahead * distance * (reach - 1.0) * to_go, center + shift
-        if movement == PASS:
-            # 1 at the begin, 0 where the camera stands, -1 at the end
+            position = scene_position - ahead * distance * (reach - 1.0) * to_go
+        elif movement == PASS:
+            # 1 at the beginning, 0 at the position in the scene, -1 at the end
             to_the_left = (1.0 - 2.0 * progress)[..., None]
-            return start + left * distance * reach * to_the_left, center + shift
-        # orbit
-        return center + _turn_about_vertical(start - center, progress), center + shift
+            position = scene_position + left * distance * reach * to_the_left
+        else:  # an orbit
+            position = center + _turn_about_vertical(scene_position - center, progress)
+        return position, center + shift
 
     def _camera_on_waypoints(
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return where the camera is on waypoints, and what it looks at.
+        """Return the position of the camera on waypoints, and the point it looks at.
 
         It looks along its rotation if the waypoints have rotations, otherwise at their
         targets, otherwise at the object.
@@ -840,13 +865,14 @@ class PathControl(Control):
     ) -> tuple[Tensor, Tensor]:
         """Return how far the object is shifted and turned from its pose in the scene.
 
-        On "approach" it moves level towards the camera and ends where the scene has it,
-        on "pass" it moves past that position from right to left, and on "orbit" it
-        turns once about its own vertical.
+        On "approach" it moves on a level line towards the camera, up to its position in
+        the scene. On "pass" it moves past that position from right to left. On "orbit"
+        it turns once about its own vertical axis.
 
         Args:
-            movements: movements of camera and object; it may have none.
-            scene_start: poses of the scene as it is described.
+            movements: movements of camera and object; without one of the object, it is
+                neither shifted nor turned.
+            scene_start: poses in the scene as it was described.
             time: (...,) seconds.
 
         Returns:
@@ -861,6 +887,8 @@ class PathControl(Control):
         if movement is None:
             return no_shift, no_turn
         if isinstance(movement, Waypoints):
+            # The positions of an object's waypoints are relative to its position in the
+            # scene.
             shift = movement.interpolate(time, movement.positions)
             shift = shift / self.scene.size_in_metres
             if movement.headings is None:
@@ -870,30 +898,31 @@ class PathControl(Control):
         if movement == ORBIT:
             return no_shift, 360.0 * progress
         reach = float(self.chosen["reach"])
-        distance = (position - scene_start.middle).norm()
+        distance = (position - scene_start.center).norm()
         if movement == APPROACH:
-            # it begins `reach` times as far from the camera as it ends
+            # It begins at `reach` times its last distance from the camera.
             to_go = distance * (reach - 1.0) * (1.0 - progress)
             return _level_direction(forward) * to_go[..., None], no_turn
-        # Pass: to the right of where the object stands at first, then to the left.
+        # On "pass" it is to the right of its position in the scene at first, then to
+        # the left.
         to_right = distance * reach * (1.0 - 2.0 * progress)
         return _level_direction(-left) * to_right[..., None], no_turn
 
 
 @geometry.cache_per_scene
 def get_start_poses(scene: SceneDescription, device: torch.device) -> Start:
-    """Return the poses of a scene; cached, as it looks at every vertex."""
-    poses = (
-        geometry.camera_to_world(scene),
-        geometry.compute_center(scene),
-        geometry.object_to_world(scene),
+    """Return the poses of a scene; cached, as all vertices are read for the center."""
+    return Start(
+        camera=torch.from_numpy(geometry.camera_to_world(scene)).float().to(device),
+        center=torch.from_numpy(geometry.compute_center(scene)).float().to(device),
+        object=torch.from_numpy(geometry.object_to_world(scene)).float().to(device),
     )
-    return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
 
 
 def _level_direction(direction: Tensor) -> Tensor:
-    """Return the unit vector (3,) of a direction without its vertical part; zero for a
-    vertical one.
+    """Return the unit vector (3,) of the horizontal part of a direction.
+
+    It is zero for a vertical direction.
     """
     level = torch.stack([direction[0], direction[1], direction.new_zeros(())])
     return torch.as_tensor(level / level.norm().clamp_min(1e-6))
@@ -910,7 +939,7 @@ def _find_closest_to_origin(points: Tensor) -> tuple[Tensor, Tensor]:
         the distance of that point; (n - 1,) each.
     """
     delta = points[1:] - points[:-1]
-    # a segment may have no length, and must not be divided by 0
+    # A segment may have the length 0, by which nothing must be divided.
     squared_length = delta.square().sum(dim=1).clamp_min(1e-300)
     fraction = (-(points[:-1] * delta).sum(dim=1) / squared_length).clamp(0.0, 1.0)
     return fraction, (points[:-1] + fraction[:, None] * delta).norm(dim=1)
@@ -948,9 +977,9 @@ def make_camera_pose(position: Tensor, rotation: Tensor, roll: float) -> Tensor:
     """Return the pose (4, 4) of a camera with a rotation.
 
     Args:
-        position: (3,) of the camera.
-        rotation: (3, 3), columns right, down and ahead.
-        roll: degrees.
+        position: (3,) position of the camera.
+        rotation: (3, 3) its rotation, with columns right, down and ahead.
+        roll: degrees by which it is turned about its viewing direction.
     """
     right, down, ahead = rotation.unbind(dim=-1)
     return _roll_camera(position, -right, -down, ahead, roll)
@@ -964,7 +993,7 @@ def _roll_camera(
     Args:
         position: (3,) position of the camera.
         left, up, ahead: (3,) its unit axes without roll, at right angles.
-        roll: degrees.
+        roll: degrees by which it is turned.
     """
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
@@ -975,16 +1004,21 @@ def _roll_camera(
 
 
 def measure_tilt(rotations: Rotation) -> float:
-    """Return how far the top of a camera's images is from up, mean, degrees."""
-    upwards = -rotations.as_matrix()[:, 2, 1]
-    return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
+    """Return the angle between a camera's upward direction and the vertical, degrees.
+
+    It is the angle of the mean cosine over all rotations (x right, y down, z ahead) into
+    a world whose z is up.
+    """
+    # the z component of minus the y axis
+    cosines = -rotations.as_matrix()[:, 2, 1]
+    return math.degrees(math.acos(float(np.clip(cosines.mean(), -1.0, 1.0))))
 
 
 def align_quaternions(quaternions: assets.Float64Array) -> assets.Float64Array:
-    """Return quaternions (n, 4) with signs that make neighbours similar.
+    """Return quaternions (n, 4) with signs that make neighbors similar.
 
-    A quaternion and its negative are the same rotation; but between two of opposite
-    signs, interpolation would go the long way round.
+    A quaternion and its negative are the same rotation. But between two of opposite
+    signs, interpolation would take the longer direction.
     """
     is_opposite = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
     # the sign changes at each opposite pair, and stays changed
@@ -1023,13 +1057,14 @@ def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     """Return the pose (4, 4) of an object that is turned and shifted.
 
     Args:
-        start: poses of the scene as it is described.
+        start: poses in the scene as it was described.
         shift: (3,) shift in object sizes.
         heading: () degrees by which it turns about the vertical through its center.
     """
-    turn = geometry.make_euler_rotation(heading, *heading.new_zeros(2))
-    center = start.middle
-    # it turns about the center, and not about the origin
+    pitch, roll = heading.new_zeros(2)
+    turn = geometry.make_euler_rotation(heading, pitch, roll)
+    center = start.center
+    # It turns about the center, and not about the origin.
     movement = geometry.make_affine(turn, center - turn @ center + shift)
     pose: Tensor = movement @ start.object
     return pose
@@ -1061,8 +1096,8 @@ def unwrap_headings(
     first = f"{degrees[jumps[0]]:g}"
     last = f"{degrees[jumps[0] + 1]:g}"
     note = (
-        f"it turns the shorter way from {first} to {last} degrees; for the longer "
-        "one, add a waypoint between them"
+        f"it turns in the shorter direction from {first} to {last} degrees; for the "
+        "longer one, add a waypoint between them"
     )
     return np.asarray(np.unwrap(degrees, period=360.0)), note
 
@@ -1070,12 +1105,21 @@ def unwrap_headings(
 def _describe_assumptions(
     path: Path, pose_format: PoseFormat, assumed: Mapping[str, str]
 ) -> str:
-    """Return a note on what a trajectory does not state: `assumed` values by choice."""
+    """Return a note on the defaults of choices that the user left out.
+
+    A trajectory does not state its axes, for example. With wrong axes the camera looks in
+    a wrong direction; with "none" it looks at the object.
+
+    Args:
+        path: the file.
+        pose_format: format of the trajectory.
+        assumed: the defaults in words, by the name of the choice.
+    """
     assumptions = ", ".join(f"{name} {value}" for name, value in assumed.items())
     return (
         f"{path}: not everything is stated by {pose_format.value}. "
         f"Assumed: {assumptions}. If that is wrong, "
-        f"say {', '.join(assumed)} of the control path; with axes none the "
+        f"set {', '.join(assumed)} of the control path; with axes none the "
         "camera looks at the object."
     )
 
@@ -1086,7 +1130,7 @@ def _format_rounded(number: float) -> str:
 
 
 def _split_paths(path: object) -> tuple[str, ...]:
-    """Return the paths in a list, or in a text with commas between them."""
+    """Return the paths in a list, or in a string with commas between them."""
     names = path if isinstance(path, list | tuple) else str(path).split(PATH_SEPARATOR)
     return tuple(str(name).strip() for name in names)
 
@@ -1112,7 +1156,7 @@ def _read_text(path: Path) -> str:
 
 
 def _list_optional_columns(mover: str, is_single_path: bool) -> tuple[str, ...]:
-    """Return the columns that a table of waypoints may have besides time and
+    """Return the columns that a table of waypoints may have in addition to time and
     position.
     """
     if mover == OBJECT:
@@ -1129,11 +1173,11 @@ def read_waypoints(
 
     Args:
         path: path of the file, for messages.
-        mover: "camera" or "object", which the file is about.
+        mover: "camera" or "object", which moves along the columns x, y and z.
         text: text of a .csv file with the columns time, x, y, z, and perhaps look_x,
             look_y, look_z (camera) or heading (object).
-        is_single_path: whether a file about the camera may also have the object's
-            movement at the same times.
+        is_single_path: whether a file for the camera may have further columns with the
+            object's movement.
 
     Returns:
         The waypoints by mover; times begin at 0.
@@ -1149,13 +1193,12 @@ def read_waypoints(
     times = column.pop(TIME_COLUMN)
     times = times - times[0]
     check_times(path, times)
-    # NaN is not within the bounds either
+    # A comparison with NaN is false, so that NaN is rejected as well.
     if not all(np.abs(values).max() <= MAX_DISTANCE for values in column.values()):
         raise errors.FileFormatError(
-            f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones, or "
-            "none"
+            f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones or NaN"
         )
-    notes = _unwrap_headings(path, column)
+    notes = _unwrap_heading_columns(path, column)
 
     seconds = torch.from_numpy(times.astype(np.float32))
     positions = _stack_columns(column, POSITION_COLUMNS)
@@ -1179,7 +1222,7 @@ def read_waypoints(
 def _make_object_waypoints(
     column: Mapping[str, assets.Float64Array], seconds: Tensor, notes: tuple[str, ...]
 ) -> Waypoints | None:
-    """Return how the object moves, by the file of a camera's path; None if it does not.
+    """Return the object's movement in a file for the camera; None if it does not move.
 
     Args:
         column: columns (n,) of the file by name.
@@ -1204,7 +1247,7 @@ def _read_csv(path: Path, text: str) -> tuple[list[str], list[list[str]]]:
                 rows.append([cell.strip() for cell in row])
     except csv.Error as error:
         raise errors.FileFormatError(
-            f"{path}: expected a table of waypoints, got one with a {error}"
+            f"{path}: expected a table of waypoints, got an invalid one ({error})"
         ) from error
     if not rows:
         return [], []
@@ -1217,7 +1260,7 @@ def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> N
     Args:
         path: the file, for messages.
         header: names of its columns.
-        optional: names of columns that it may have besides time, x, y and z.
+        optional: names of columns that it may have in addition to time, x, y and z.
 
     Raises:
         FileFormatError: a column is missing, unknown or there twice.
@@ -1267,10 +1310,18 @@ def _parse_numbers(
         ) from error
 
 
-def _unwrap_headings(
+def _unwrap_heading_columns(
     path: Path, column: dict[str, assets.Float64Array]
 ) -> dict[str, tuple[str, ...]]:
-    """Let headings turn the shorter way, in place; return notes by column."""
+    """Unwrap the columns of headings in a table (`unwrap_headings`).
+
+    Args:
+        path: the file, for the notes.
+        column: columns (n,) of the file by name; those of headings are replaced.
+
+    Returns:
+        Notes for the user on each column of headings, by its name.
+    """
     notes = dict[str, tuple[str, ...]]()
     for name in (HEADING_COLUMN, OBJECT_HEADING_COLUMN):
         if name in column:

@@ -1,12 +1,12 @@
-"""Trajectories of TUM, EuRoC and KITTI: poses of a sensor in a world, as text.
+"""Trajectories of TUM, EuRoC and KITTI: text files with poses of a sensor in a world.
 
     TUM     timestamp tx ty tz qx qy qz qw             seconds, blanks between the numbers
     EuRoC   #timestamp [ns],p_RS_R_x [m],...,q_RS_w [],q_RS_x [],...   commas, real part first
     KITTI   12 numbers: the pose (3, 4), row by row    no times: 10 poses a second
 
-A header names the columns, in any order; without one, 8 numbers are TUM's and 12
-KITTI's. Which axes the sensor has and where the world's up is stands in none of these
-files.
+A header names the columns, in any order. Without a header, 8 numbers are TUM's and 12
+KITTI's. None of these files states the axes of the sensor, or the upward direction of the
+world.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ QUATERNION_TOLERANCE = 0.01  # how far from 1 the length of a quaternion may be
 ROTATION_TOLERANCE = 1e-3
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNIT_BY_SIZE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""The unit of times since 1970 that do not state it, by the least that they are."""
+"""Smallest size of a time since 1970 in each unit, for times whose unit is not stated."""
 
 POSITION = ("x", "y", "z")
 QUATERNION = ("qx", "qy", "qz", "qw")
-# of a table of waypoints, which is none of these formats
+# columns by which a table of waypoints is recognized, which is none of these formats
 WAYPOINT_COLUMNS = {"time", *POSITION}
 TIME_NAME = re.compile(r"(time_?)?stamp|time|t|sec(ond)?s?")
 POSITION_NAME = re.compile(
@@ -53,8 +53,8 @@ SENSOR_AXES: Mapping[str, assets.Float64Array] = {
     "frd": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
     "euroc": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""By name, what turns a camera's axes (x right, y down, z ahead) into those of the
-file's sensor.
+"""Rotations from a camera's axes (x right, y down, z ahead) to those of the sensor, by the
+name of the sensor's axes.
 """
 AXES_DESCRIPTIONS: Mapping[str, str] = {
     OPTICAL: "x right, y down, z ahead",
@@ -70,11 +70,11 @@ WORLD_TO_Z_UP: Mapping[str, assets.Float64Array] = {
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "-y": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
 }
-"""By what is up in the file's world, what turns it into one whose z is up."""
+"""Rotations from the file's world to one whose z is up, by the file's upward axis."""
 
 
 class PoseFormat(Enum):
-    """A format of trajectories, with what its files are called in messages."""
+    """A format of trajectories; its value names such a file in messages."""
 
     TUM = "TUM's trajectory"
     EUROC = "EuRoC's trajectory"
@@ -83,12 +83,20 @@ class PoseFormat(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses from a file, as they stand in it, but for times in seconds."""
+    """Poses from a file, in the axes and the world of the file.
+
+    Attributes:
+        format: format of the file.
+        times: (n,) seconds from the first pose; None if the file has no times.
+        positions: (n, 3) positions of the sensor.
+        rotations: n rotations from the sensor's axes to the world's; None if the file
+            has none.
+        notes: sentences for the user about how the file was read.
+    """
 
     format: PoseFormat
-    times: assets.Float64Array | None  # (n,) seconds; None where the file has none
-    positions: assets.Float64Array  # (n, 3)
-    # Rotations from the sensor's axes to the world's; None where the file has none.
+    times: assets.Float64Array | None
+    positions: assets.Float64Array
     rotations: Rotation | None
     notes: tuple[str, ...]
 
@@ -103,13 +111,13 @@ class Trajectory:
 
         Args:
             axes: axes of the sensor, a key of `SENSOR_AXES`, or `NO_AXES`.
-            up: what is up in the file's world, a key of `WORLD_TO_Z_UP`.
+            up: upward axis of the file's world, a key of `WORLD_TO_Z_UP`.
             origin: (3,) the object's position in the file's world.
 
         Returns:
-            Positions (n, 3) from the origin; rotations from a camera's axes (x
-                right, y down, z ahead), None where the axes are `NO_AXES` or the
-                file has none.
+            Positions (n, 3) relative to the origin; and rotations from a camera's axes
+            (x right, y down, z ahead), None if the axes are `NO_AXES` or the file has
+            none.
         """
         world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
         positions = world.apply(self.positions - np.asarray(origin, np.float64))
@@ -128,10 +136,14 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     numbers are TUM's and rows of 12 are KITTI's. For a table with another header, e.g.
     of waypoints, the result is None.
 
+    Args:
+        path: the file, for messages.
+        text: its text.
+
     Raises:
-        FileFormatError: rows of different lengths, numbers that are not finite,
-            quaternions that are not of length 1, matrices that are no rotations, or a
-            table of numbers whose columns are not known.
+        FileFormatError: rows have different lengths, numbers are not finite,
+            quaternions do not have the length 1, matrices are no rotations, or the
+            columns of the table are unknown.
     """
     lines = [line.strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
@@ -140,9 +152,12 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
         return None
     has_commas = "," in lines[first_row]
     candidates = [_split(line.lstrip("#").strip()) for line in lines[:first_row]]
+    # `_find_columns` is empty for a line that does not name a trajectory's columns
     headers = [names for names in candidates if _find_columns(names)]
     if not headers:
         is_waypoint_table = any(WAYPOINT_COLUMNS <= set(names) for names in candidates)
+        # With commas, a line before the numbers is an unknown header. Without, it may be
+        # a comment, as files of TUM have them.
         has_unknown_header = has_commas and bool(candidates)
         if is_waypoint_table or has_unknown_header:
             return None
@@ -167,12 +182,12 @@ def _read_unnamed_columns(
         has_commas: whether commas separate the columns, as in EuRoC's files.
 
     Raises:
-        FileFormatError: it has commas, or other columns.
+        FileFormatError: it has commas, or another number of columns.
     """
     if has_commas:
         raise errors.FileFormatError(
             f"{path}: expected a first line that names the columns, got numbers; add "
-            "time,x,y,z, or that of EuRoC's "
+            "time,x,y,z, or the line of EuRoC's "
             "files: #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w "
             "[],q_RS_x [],q_RS_y [],q_RS_z []"
         )
@@ -184,9 +199,9 @@ def _read_unnamed_columns(
     if count == 12:
         return _read_kitti(path, rows)
     hint = ""
-    # a matrix of 12 or 16 numbers after the number of a picture
+    # a matrix of 12 or 16 numbers after the index of an image
     if count in (13, 17):
-        hint = " (KITTI-360's first column is a number of a picture; leave it out)"
+        hint = " (KITTI-360's first column is the index of a picture; leave it out)"
     raise errors.FileFormatError(
         f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, "
         "or 12 as KITTI's poses, got "
@@ -203,7 +218,11 @@ def _is_row(line: str) -> bool:
 
 
 def _find_column(name: str) -> str | None:
-    """Return our name for a column of a trajectory, such as qx; None if it is none."""
+    """Return the standard name of a trajectory's column, such as "qx".
+
+    The standard names are time, x, y, z, qx, qy, qz and qw. The result is None for other
+    columns.
+    """
     plain = UNIT.sub("", name).strip().lower()
     if TIME_NAME.fullmatch(plain):
         return "time"
@@ -217,13 +236,13 @@ def _find_column(name: str) -> str | None:
 
 
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the index of each column of a trajectory by our names for them.
+    """Return the index of each column of a trajectory by its standard name.
 
-    The names are time, x, y, z, and perhaps qx, qy, qz and qw. The result is empty if
-    the table is no trajectory: if the time, a coordinate or a part of the quaternion is
-    missing, a column is there twice, or it is a table of waypoints.
+    The standard names are time, x, y, z, and perhaps qx, qy, qz and qw. The result is
+    empty if the table is no trajectory: if the time, a coordinate or a part of the
+    quaternion is missing, a column is there twice, or it is a table of waypoints.
     """
-    # time, x, y and z at least
+    # at least time, x, y and z
     if not 4 <= len(names) <= MAX_COLUMNS:
         return {}
     columns = dict[str, int]()
@@ -256,10 +275,12 @@ def _read_table(
                 f"{path}: expected {count} numbers in each row, got "
                 f"{reading.format_name(' '.join(row))}"
             )
-    table = np.array(rows, dtype=object).astype(np.float64)
+    table: assets.Float64Array = np.array(rows, dtype=object).astype(np.float64)
     if not np.isfinite(table).all():
-        raise errors.FileFormatError(f"{path}: expected finite numbers, got others")
-    return np.asarray(table, np.float64)
+        raise errors.FileFormatError(
+            f"{path}: expected finite numbers, got infinity or NaN"
+        )
+    return table
 
 
 def _read_named_columns(
@@ -278,11 +299,13 @@ def _read_named_columns(
     """
     columns = _find_columns(names)
     table = _read_table(path, rows, len(names))
-    unread = [name for index, name in enumerate(names) if index not in columns.values()]
+    used_indices = set(columns.values())
+    unread = [name for index, name in enumerate(names) if index not in used_indices]
     notes = [f"{path}: not read: {reading.join_names(unread)}."] if unread else []
     times = table[:, columns["time"]]
     unit = _find_time_unit(path, names[columns["time"]], times, notes)
-    # differences first: a time since 1970 in nanoseconds has more digits than a float
+    # First the differences: the product of a time since 1970 and the unit would be
+    # rounded.
     times = (times - times[0]) * UNITS[unit]
     positions = table[:, [columns[name] for name in POSITION]]
     rotations = None
@@ -320,11 +343,12 @@ def _find_time_unit(
                 f"{reading.format_name(unit)}; correct the first line"
             )
         return unit
-    # A time since 1970 shows its unit by its size: nanoseconds are the largest numbers.
+    # The unit of a time since 1970 follows from its size: nanoseconds are the largest
+    # numbers.
     for min_time, unit in UNIT_BY_SIZE:
         if abs(times[0]) >= min_time:
             notes.append(
-                f"{path}: its times do not state a unit; by their size they "
+                f"{path}: the unit of its times is not stated; by their size they "
                 f"are read as {unit}."
             )
             return unit
@@ -332,7 +356,7 @@ def _find_time_unit(
 
 
 def _check_quaternions(path: Path, quaternions: assets.Float64Array) -> None:
-    """Check quaternions (n, 4). Raises FileFormatError: one is not of length 1."""
+    """Raise FileFormatError if one of the quaternions (n, 4) has another length than 1."""
     lengths = np.linalg.norm(quaternions, axis=1)
     error = np.abs(lengths - 1.0)
     if error.max() > QUATERNION_TOLERANCE:
@@ -351,8 +375,8 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
     """
     poses = _read_table(path, rows, 12).reshape(-1, 3, 4)
     matrices = poses[:, :, :3]
-    # A rotation times its transpose is the identity. So is a reflection, which has a
-    # negative determinant.
+    # A rotation times its transpose is the identity. The same is true for a reflection,
+    # but that has a negative determinant.
     products = matrices @ matrices.transpose(0, 2, 1)
     error = np.abs(products - np.eye(3)).max(axis=(1, 2))
     error = np.where(np.linalg.det(matrices) > 0.0, error, np.inf)

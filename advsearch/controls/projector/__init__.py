@@ -1,5 +1,6 @@
-"""The controls `projector` and `spot`: light thrown onto the object; a spot is a
-projector of a round image.
+"""The controls `projector` and `spot`, which project light onto the object.
+
+A spot is a projector with the image of a round spot.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
-"""The `projector` control: a picture thrown onto the object, whose texels may be
-searched. It only adds light.
+"""The `projector` control: an image that is projected onto the object.
 
-A projector of `lumens` that throws a picture of width `w` and height `h` at distance 1
-puts the same light on all of a screen; at a distance of D metres that is `lumens / (w h
-D^2)` lux. How bright it is in the scene follows from the light that is there without
-it: `ambient` lux are the irradiance that the camera's exposure is metered for. So more
-ambient light is a darker projector in an equally bright picture, as a camera that
-meters would show it.
+Its texels can be searched. It only adds light. A white image of a projector of `lumens`,
+which is w wide and h high at distance 1, has the illuminance `lumens / (w h D^2)` lux at
+a distance of D metres. Its brightness in the scene is relative to the ambient light: the
+camera's exposure is metered for an irradiance of `ambient` lux. So with more ambient
+light the projector is darker in an equally bright image, as for a camera with automatic
+exposure.
 
     pattern = linear(texels) (1 - black) + black
     E(D) = E(ambient) lumens / (w h D^2 ambient) pattern
@@ -46,18 +45,16 @@ from advsearch.extend import (
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# degrees around the object between the camera and a projector that nobody has placed
+# default angle around the object between camera and projector, degrees
 DEFAULT_CAMERA_ANGLE = 15.0
-# lux of a place whose brightness has no unit: a lit hall, a street at late dusk
+# ambient light of an environment without a unit, lux: a lit hall, a street at late dusk
 DEFAULT_AMBIENT_LUX = 100.0
 DEFAULT_LUMENS = 3000.0
 MAX_AMBIENT_FACTOR = 20.0
-"""Of a projector that nobody has described: it is dimmed to so many times the light of
-the place.
-"""
+"""Limit of the default light of a projector, as a multiple of the ambient light."""
 MAX_DEFAULT_FOV = 150.0  # degrees
 START_GREY = 0.5
-DUTY_CYCLE = 0.5  # of its period, in which a flashing light is on
+DUTY_CYCLE = 0.5  # fraction of a period in which a flashing light is on
 
 
 _lit = partial(Parameter.number, Parameter.LIT)
@@ -67,15 +64,18 @@ _moving = partial(Parameter.moving, ("differences",))
 class ProjectorControl(PictureControl):
     """A picture that a projector throws onto the object.
 
-    Its texels are searched, and numbers where they get a range.
+    Its texels are searched, and those numbers for which the user sets a range.
+
+    Attributes:
+        part: projector in the scene. Set by `fit`.
     """
 
     part: parts.ProjectorPart
-    _time_shift = 0.0
+    _time_shift = 0.0  # seconds by which `advance_time` has moved the time
     kind = "projector"
     competes_with_ambient = True
     image_parameter = "pattern"
-    default_epsilon = 1.0  # every picture is inside
+    default_epsilon = 1.0  # the ball has all images
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
             "pattern",
@@ -111,8 +111,7 @@ class ProjectorControl(PictureControl):
             0.01,
             1e4,
             "the camera's",
-            "Distance to the object's middle; in metres where the object's size is "
-            "known.",
+            "Distance to the object's centre; in metres if the object's size is known.",
             log=True,
         ),
         _lit(
@@ -120,8 +119,8 @@ class ProjectorControl(PictureControl):
             "lumens",
             0.0,
             1e6,
-            f"{DEFAULT_LUMENS:g}, or what is {MAX_AMBIENT_FACTOR:g} times as bright as "
-            "the place",
+            f"{DEFAULT_LUMENS:g}, or less: {MAX_AMBIENT_FACTOR:g} times as bright as "
+            "the ambient light",
             "Light of a white picture.",
         ),
         _lit(
@@ -129,7 +128,7 @@ class ProjectorControl(PictureControl):
             "lux",
             1e-3,
             2e5,
-            f"the place's, or {DEFAULT_AMBIENT_LUX:g}",
+            f"that of the environment, or {DEFAULT_AMBIENT_LUX:g}",
             "Light on the object without the projector.",
             log=True,
         ),
@@ -139,7 +138,7 @@ class ProjectorControl(PictureControl):
             0.0,
             1.0,
             0.0,
-            "Share of white that a black texel still throws: 0.001 at a contrast of "
+            "Light of a black texel, as a fraction of white: 0.001 for a contrast of "
             "1000.",
         ),
         _lit(
@@ -148,7 +147,7 @@ class ProjectorControl(PictureControl):
             0.0,
             64.0,
             0.0,
-            "How far it is out of focus: standard deviation of the blur.",
+            "Standard deviation of the blur, if the projector is out of focus.",
         ),
         Parameter.number(
             ("differences",),
@@ -157,8 +156,8 @@ class ProjectorControl(PictureControl):
             0.0,
             1e5,
             0.0,
-            "How often a second it flashes: light in one half of each "
-            "period; at 0 it does not.",
+            "Flashes per second, with light in one half of each period; 0 is a "
+            "constant light.",
         ),
         Parameter.number(
             ("differences",),
@@ -167,8 +166,8 @@ class ProjectorControl(PictureControl):
             -3600.0,
             3600.0,
             0.0,
-            "Where in its period a flashing light is at the time of the "
-            "picture; up to 180 it is on.",
+            "Phase of a flashing light at the time of the picture; up to 180 degrees "
+            "it is on.",
             periodic=True,
         ),
     )
@@ -178,14 +177,14 @@ class ProjectorControl(PictureControl):
         Choice(
             "fov",
             None,
-            "Angle of the picture's width, degrees; by default it just "
+            "Angle of the picture's width, degrees; by default the picture just "
             "covers the object.",
             max_value=150.0,
         ),
         Choice(
             "start",
             "black",
-            "What the search begins with: black or grey.",
+            "Picture at the start of the search: black or grey.",
             options=("black", "grey"),
         ),
         Choice(
@@ -199,15 +198,15 @@ class ProjectorControl(PictureControl):
         Choice(
             "epsilon",
             None,
-            "Radius of that ball, display-referred; by default "
-            "every picture is inside.",
+            "Radius of that ball, display-referred; by default the ball has all "
+            "pictures.",
             "epsilon",
             max_value=PictureControl.MAX_EPSILON,
         ),
         Choice(
             "picture",
             None,
-            "A picture file to project as it is; then the pattern is not searched.",
+            "A picture file to project; the pattern is not searched then.",
             fixes="pattern",
         ),
     )
@@ -216,7 +215,8 @@ class ProjectorControl(PictureControl):
         """Check that the choices of pattern, picture and norm ball fit each other.
 
         Raises:
-            InputError: a picture is set together with a choice about searched texels.
+            InputError: a picture is set together with a choice for searched texels, or
+                the pattern has another range than its full one.
         """
         self._check_pattern()
         picture = self.chosen["picture"]
@@ -226,7 +226,9 @@ class ProjectorControl(PictureControl):
             raise InputError(
                 f"{self.name}.picture: expected the path of a picture, got {picture!r}"
             )
-        self._settings["picture"] = self.chosen["picture"] = str(picture)
+        # as a string, since settings are stored as JSON
+        self._settings["picture"] = str(picture)
+        self.chosen["picture"] = str(picture)
         conflicting = [
             setting
             for setting in ("pattern", "epsilon", "norm", "resolution", "aspect")
@@ -234,29 +236,30 @@ class ProjectorControl(PictureControl):
         ]
         if conflicting:
             raise InputError(
-                f"{self.name}.{conflicting[0]}: expected none beside "
+                f"{self.name}.{conflicting[0]}: expected none together with "
                 f"{self.name}.picture; "
                 "leave one of them out"
             )
 
     def _check_pattern(self) -> None:
-        """Check that the pattern, if it is set, has its full range [0, 1].
+        """Check that the pattern, if it is set, is fixed at 0 or has its full range.
 
-        A narrower range is stated by `epsilon`.
+        Smaller changes are requested by `epsilon`, not by a narrower range.
 
         Raises:
-            InputError: it has another range.
+            InputError: it has another value or range.
         """
         pattern = self._settings.get("pattern")
         if isinstance(pattern, (list, tuple)):
             is_valid = [*pattern] == [0.0, 1.0]
         else:
-            is_valid = not pattern  # left out, False or 0
+            # The setting is missing, or 0, which fixes a black image.
+            is_valid = not pattern
         if not is_valid:
             raise InputError(
                 f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; "
-                f"a file is {self.name}.picture, "
-                f"and how far texels may go {self.name}.epsilon"
+                f"set a file with {self.name}.picture, "
+                f"and how far texels may go with {self.name}.epsilon"
             )
 
     # ---- in a scene
@@ -271,29 +274,43 @@ class ProjectorControl(PictureControl):
         picture = self.read_picture()
         if picture is None:
             rows = int(self.chosen["resolution"])
+            # An image has at least two texels along each side.
             columns = max(2, round(rows * self.chosen["aspect"]))
         else:
             rows, columns = picture.shape[:2]
         fov = self.chosen["fov"]
         if fov is None:
-            offsets = scene.base_vertices - geometry.compute_center(scene)
-            object_radius = float(np.linalg.norm(offsets, axis=1).max())
-            half_width = object_radius * max(1.0, columns / rows) * scene.size_in_metres
-            distance = self.with_scene(scene)._start_distance()
-            covering_fov = math.degrees(2.0 * math.atan(half_width / distance))
-            fov = min(covering_fov, MAX_DEFAULT_FOV)
+            fov = self._compute_covering_fov(scene, aspect=columns / rows)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
+        # Radiance in the scene can be converted to lux.
         has_unit = (
             scene.environment is not None and scene.environment.candelas is not None
         )
         if not has_unit and "ambient" not in self.specs:
             note = (
-                "The place's brightness has no unit: its light is taken for "
-                f"{DEFAULT_AMBIENT_LUX:g} lux; "
-                f"{self.name}.ambient says otherwise."
+                "The environment's brightness has no unit: its light is taken as "
+                f"{DEFAULT_AMBIENT_LUX:g} lux, unless {self.name}.ambient is set."
             )
             scene = replace(scene, remarks=(*scene.remarks, note))
         return scene.with_part(part)
+
+    def _compute_covering_fov(self, scene: SceneDescription, aspect: float) -> float:
+        """Return the angle of the image's width at which it just covers the object.
+
+        It is at most `MAX_DEFAULT_FOV` degrees.
+
+        Args:
+            scene: scene with the object.
+            aspect: width of the image over its height.
+        """
+        offsets = scene.base_vertices - geometry.compute_center(scene)
+        object_radius = float(np.linalg.norm(offsets, axis=1).max())
+        # In a wide image the height has to cover the object, so that the width is
+        # larger.
+        half_width = object_radius * max(1.0, aspect) * scene.size_in_metres
+        distance = self.with_scene(scene)._start_distance()
+        covering_fov = math.degrees(2.0 * math.atan(half_width / distance))
+        return min(covering_fov, MAX_DEFAULT_FOV)
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its default in this scene.
@@ -331,20 +348,22 @@ class ProjectorControl(PictureControl):
         return parameter
 
     def _compute_ambient_lux(self) -> float:
-        """Return the illuminance by the environment, which may have no unit.
+        """Return the illuminance by the environment, lux.
 
-        Then it is `DEFAULT_AMBIENT_LUX`.
+        It is `DEFAULT_AMBIENT_LUX` if the environment's radiance has no unit.
         """
         environment = self.scene.environment
         if environment is None or environment.candelas is None:
             return DEFAULT_AMBIENT_LUX
+        # `candelas` are those per square metre for a radiance of 1
         lux = environment.candelas * self.scene.metered_irradiance
         return min(max(lux, 1e-3), 2e5)  # the parameter's range
 
     def _compute_max_lumens(self) -> float:
-        """Return the light that is `MAX_AMBIENT_FACTOR` times as bright as the ambient.
+        """Return the lumens with which white is `MAX_AMBIENT_FACTOR` times the ambient.
 
-        It falls on an area that grows with the squared distance.
+        Lumens are lux times the area of the image, which grows with the squared
+        distance; `self.part.area` is that at a distance of 1.
         """
         return (
             MAX_AMBIENT_FACTOR
@@ -358,7 +377,7 @@ class ProjectorControl(PictureControl):
         return self.part.sides
 
     def _start_distance(self) -> float:
-        """Return its distance at the start, in the unit of the parameter."""
+        """Return the projector's distance at the start, in the parameter's unit."""
         spec = self.specs.get("distance")
         if isinstance(spec, Fixed):
             return float(spec.value)
@@ -382,7 +401,9 @@ class ProjectorControl(PictureControl):
         if isinstance(flicker, Range):
             self.flashes = flicker.high
         else:
-            self.flashes = max(map(float, self.list_allowed_values("flicker", 0.0)))
+            # 0 Hz if the user did not set it
+            rates = self.list_allowed_values("flicker", 0.0)
+            self.flashes = max(map(float, rates))
 
     def read_picture(self) -> Tensor | None:
         """Return the image (h, w, 3) sRGB of the `picture` file, or None.
@@ -447,41 +468,53 @@ class ProjectorControl(PictureControl):
         if self._flashes_off(values):
             light = 0.0 * light  # still depends on the pattern, for its derivative
         distance_in_units = values["distance"].detach() / self.scene.size_in_metres
-        # white in units of the ambient light, at a distance of one unit: light falls
-        # off with the squared distance
-        brightness = self._relative_to_ambient(values) * distance_in_units**2
-        white = brightness * self.scene.metered_irradiance / math.pi
+        # The irradiance of white at the object, in scene units. At a distance of one
+        # unit it is larger by the squared distance.
+        white_irradiance = (
+            self._relative_to_ambient(values)
+            * distance_in_units**2
+            * self.scene.metered_irradiance
+        )
+        # The projector's input is the radiance of a white diffuse screen there, which
+        # is the irradiance over pi.
+        white = white_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
     def _flashes_off(self, values: Values) -> bool:
         """Return whether the light is off at this moment of its flicker."""
         rate = float(values["flicker"].detach())
         phase = float(values["phase"].detach()) / 360.0
-        # from 0 at the begin of a flash to 1 at that of the next one
+        # from 0 at the beginning of a flash to 1 at the beginning of the next one
         cycle_position = (rate * self._time_shift + phase) % 1.0
         return rate != 0.0 and cycle_position >= DUTY_CYCLE
 
     def project_light(self, values: Values) -> Tensor:
-        """Return the image (h, w, 3) as it is thrown, linear, as fractions of white.
+        """Return the projected image (h, w, 3), linear, as fractions of white.
 
-        Black texels throw the light of `black`, and the image is out of focus.
+        Black texels have the light of `black`, and the image is blurred.
         """
         pattern = color.srgb_to_linear(values["pattern"])
         light = pattern * (1.0 - values["black"]) + values["black"]
         return blur_light(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
-        """Return the illuminance () of a white image at the object's middle."""
+        """Return the illuminance () of a white image at the object's center, lux."""
         return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
 
     def _relative_to_ambient(self, values: Values) -> Tensor:
-        """Return the illuminance () of white as a multiple of the ambient light's."""
+        """Return the illuminance () of a white image at the object's center, as a
+        multiple of the ambient light.
+        """
         return self._lux(values) / values["ambient"]
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return how bright white is, and the mean of the pattern."""
+        """Return the brightness of a white image at the object, and the pattern's mean.
+
+        The brightness is in lux, and relative to the ambient light; the mean is a
+        fraction of white.
+        """
         return {
             "white": Value(value=float(self._lux(values)), unit="lux"),
             "beside_ambient": Value(
@@ -507,7 +540,7 @@ class ProjectorControl(PictureControl):
 
 
 def blur_light(light: Tensor, blur: Tensor) -> Tensor:
-    """Return an image (h, w, 3) after a Gaussian blur; outside of it is no light.
+    """Return an image (h, w, 3) after a Gaussian blur, black outside of its edges.
 
     Args:
         light: (h, w, 3) linear light.

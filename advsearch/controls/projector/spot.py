@@ -1,8 +1,7 @@
-"""The `spot` control: a torch or a laser from somewhere around the object. It only adds
-light.
+"""The `spot` control: the light of a torch or a laser on the object.
 
-It is a projector of an image with a round spot, so that no outline moves and its
-parameters have an adjoint:
+It only adds light. It is a projector with the image of a round spot, so that no outline
+moves and its parameters have an adjoint:
 
     image = color exp(-r^2 / (2 s^2)) image's area / (2 pi s^2)
     width = 2 s sqrt(2 ln 2)
@@ -59,7 +58,7 @@ class SpotControl(ProjectorControl):
             -10.0,
             10.0,
             0.0,
-            "Shift of its middle to the right, seen from the light.",
+            "Shift of its centre to the right, seen from the light.",
             (-0.5, 0.5),
         ),
         _lit(
@@ -68,7 +67,7 @@ class SpotControl(ProjectorControl):
             -10.0,
             10.0,
             0.0,
-            "Shift of its middle upwards.",
+            "Shift of its centre upwards.",
             (-0.5, 0.5),
         ),
         _lit(
@@ -77,7 +76,7 @@ class SpotControl(ProjectorControl):
             0.02,
             10.0,
             DEFAULT_WIDTH,
-            "Diameter in which half of its light falls.",
+            "Diameter of the circle that has half of its light.",
             (0.05, 0.6),
             log=True,
         ),
@@ -87,8 +86,8 @@ class SpotControl(ProjectorControl):
             "lumens",
             0.0,
             1e6,
-            "0, or what is 20 times as bright as the place",
-            "All of its light.",
+            "0, or 20 times as bright as the ambient light",
+            "Total light of the spot.",
             (0.0, DEFAULT_LUMENS),
         ),
         *(
@@ -101,20 +100,20 @@ class SpotControl(ProjectorControl):
         Choice(
             "resolution",
             64,
-            "Rows of texels of the picture that it is made of.",
+            "Rows of texels of the projected picture.",
             integer_bounds=(2, 512),
         ),
         Choice(
             "fov",
             None,
-            "Angle in which it may fall, degrees; by default it just "
+            "Angle in which the spot can be, degrees; by default it just "
             "covers the object.",
             max_value=150.0,
         ),
     )
 
-    # Its parameters are a few numbers, and there is no image among them: as of any
-    # control.
+    # There is no image among its parameters. So it has the methods of `Control` instead
+    # of those of `PictureControl`.
 
     def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         return Control.get_spec(self, parameter)
@@ -136,23 +135,26 @@ class SpotControl(ProjectorControl):
         return Control.make_artifact_images(self, values, earlier_inputs)
 
     def check_choices(self) -> None:
+        # choices of the projector that a spot does not have
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter for the scene.
 
-        Lumens are searched from 0 to `MAX_AMBIENT_FACTOR` times the ambient light, for
-        a spot of the default width. Their default is 0. But if only other parameters
-        are searched, it is that maximum, because a spot without light has no effect.
+        Lumens are searched from 0 to a maximum: `DEFAULT_LUMENS`, or less if a spot of
+        the default width would be more than `MAX_AMBIENT_FACTOR` times as bright as the
+        ambient light. Their default is 0. But if only other parameters are searched, it
+        is that maximum, because a spot without light has no effect.
         """
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
         std = DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.size_in_metres
-        # the integral of a Gaussian spot of peak 1
-        area = 2.0 * math.pi * std**2
+        # integral of a Gaussian spot whose peak is 1
+        effective_area = 2.0 * math.pi * std**2
+        ambient = float(self.get_clean_value("ambient"))
         max_lumens = min(
             DEFAULT_LUMENS,
-            MAX_AMBIENT_FACTOR * float(self.get_clean_value("ambient")) * area,
+            MAX_AMBIENT_FACTOR * ambient * effective_area,
         )
         default = 0.0
         if self.has_requested_search and not self.is_searched("lumens"):
@@ -160,28 +162,28 @@ class SpotControl(ProjectorControl):
         return replace(parameter, search=(0.0, max_lumens), default=default)
 
     def get_scene_value(self, parameter: Parameter) -> float | str:
-        return 0.0  # of the lumens; see `amount`
+        return 0.0  # only that of the lumens is used (`strength_parameter`)
 
     def project_light(self, values: Values) -> Tensor:
-        """Return the round spot (h, w, 3) as it is thrown, linear.
+        """Return the projected image (h, w, 3) of the round spot, linear.
 
-        It is a Gaussian in the plane through the object's center, scaled so that its
-        total light does not depend on the width.
+        The image lies in the plane through the object's center, at right angles to the
+        projector's direction. The spot is a Gaussian, scaled so that its total light
+        does not depend on the width.
         """
-        # half the width of the projector's image in that plane, object sizes
+        # half the width of the projector's square image in that plane, object sizes
         half_width = (
             math.tan(math.radians(self.part.fov) / 2.0)
             * values["distance"].detach()
             / self.scene.size_in_metres
         )
         rows, columns = self.part.sides
-        # positions of the texels' centers in that plane
+        # positions of the texels' centers in that plane; rows go downwards
         right = _compute_texel_centers(columns).to(half_width) * half_width
-        up = _compute_texel_centers(rows).to(half_width) * half_width
+        down = _compute_texel_centers(rows).to(half_width) * half_width
         std = values["width"] / WIDTH_PER_DEVIATION
-        # rows go downwards
         squared_distance = (right[None] - values["x"]) ** 2 + (
-            -up[:, None] - values["y"]
+            -down[:, None] - values["y"]
         ) ** 2
         image_area = (2.0 * half_width) ** 2
         integral = 2.0 * math.pi * std**2  # of the Gaussian
@@ -192,7 +194,7 @@ class SpotControl(ProjectorControl):
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return how bright the brightest point of the spot is."""
+        """Return the brightness of the brightest point of the spot."""
         brightest = float(self.project_light(values).detach().max())
         return {
             "lux": Value(
@@ -207,6 +209,6 @@ class SpotControl(ProjectorControl):
 
 
 def _compute_texel_centers(count: int) -> Tensor:
-    """Return the centers (count,) of the texels of a row that goes from -1 to 1."""
-    # every second one of twice as many points: the others are the texels' edges
+    """Return the centers (count,) of texels along a side that goes from -1 to 1."""
+    # Of evenly spaced points every second one is a center; the others are edges.
     return torch.linspace(-1.0, 1.0, 2 * count + 1)[1::2]

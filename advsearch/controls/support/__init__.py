@@ -1,1 +1,1 @@
-"""What several controls are made of; a module here is no control."""
+"""Functions and base classes that several controls use."""

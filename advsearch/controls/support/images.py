@@ -1,6 +1,4 @@
-"""Images that controls scale, warp, save and read, (H, W, C) tensors; and meshes as the
-texels of an image.
-"""
+"""Functions of images, (H, W, C) tensors, and of meshes as texels of an image."""
 
 from __future__ import annotations
 
@@ -21,7 +19,8 @@ from advsearch.scene.raster import MeshSurface as MeshSurface
 from advsearch.scene.raster import rasterize_charts as rasterize_charts
 from advsearch.scene.raster import rasterize_triangles as rasterize_triangles
 
-MIN_PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixels
+# smallest side in pixels of an image that is stored for printing
+MIN_PRINT_SIDE = 512
 
 
 def resize_to_square(image: Tensor, side: int) -> Tensor:
@@ -33,9 +32,9 @@ def resize_to_square(image: Tensor, side: int) -> Tensor:
 
 
 def enlarge(pixels: Tensor, factor: int) -> Tensor:
-    """Return an image (h, w, 3) sRGB at a whole multiple of its size.
+    """Enlarge an image (h, w, 3) sRGB by an integer factor.
 
-    It is interpolated linearly in light, as the renderer interpolates textures.
+    Linear light is interpolated, as the renderer interpolates textures.
     """
     larger = F.interpolate(
         to_planes(srgb_to_linear(pixels)),
@@ -47,16 +46,16 @@ def enlarge(pixels: Tensor, factor: int) -> Tensor:
 
 
 def compress_jpeg(image: Tensor, quality: int) -> Tensor:
-    """Save as a JPEG file and read it again, chroma subsampled.
+    """Compress an image as a JPEG file with subsampled chroma, and read it again.
 
-    The derivative is that of the identity (a straight-through estimate). For changes
-    that are smooth over three pixels or more it is within about a third of what the
-    file does with them (measured at qualities of 7 to 25); of finer changes the file
-    keeps less than the derivative predicts.
+    The derivative is that of the identity (a straight-through estimate). For changes of
+    the image that are smooth over three pixels or more, it is right within about a third
+    (measured at qualities of 7 to 25). Finer changes are reduced by the compression, so
+    that the derivative is too large.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].
-        quality: 1 to 100, as of libjpeg.
+        quality: quality of libjpeg, 1 to 100.
     """
     levels = to_uint8(image.clamp(0.0, 1.0)).cpu().numpy()
     file = io.BytesIO()
@@ -77,7 +76,7 @@ def to_image(stack: Tensor) -> Tensor:
 
 
 def warp(image: Tensor, offsets: Tensor) -> Tensor:
-    """Look every pixel of an image up at another position.
+    """Return an image whose pixels are looked up at other positions.
 
     Args:
         image: (H, W, C).

@@ -1,12 +1,12 @@
-"""Norms of the balls in which searched pixels stay, and the radii of these."""
+"""Norms and default radii of the balls that limit searched pixels."""
 
 from __future__ import annotations
 
 import math
 
 DEFAULT_EPSILON = 0.1
-"""Default radius of the L-infinity ball; the default L2 ball has the same
-root-mean-square change at its edge.
+"""Default radius of the L-infinity ball. A change at the edge of the default L2 ball has
+this root mean square.
 """
 NORMS = ("linf", "l2")
 
@@ -14,9 +14,13 @@ NORMS = ("linf", "l2")
 def compute_default_radius(
     norm: str, count: int, radius: float = DEFAULT_EPSILON
 ) -> float:
-    """Return the radius of a ball over `count` colors where none is stated.
+    """Return the default radius of a ball in a norm.
 
-    `radius` is that of the L-infinity ball; the L2 ball is so large that its edge has
-    the same root mean square.
+    A change at the edge of the L2 ball has the root mean square `radius`.
+
+    Args:
+        norm: "linf" or "l2".
+        count: number of values, e.g. three for each pixel.
+        radius: radius of the L-infinity ball.
     """
     return radius * (math.sqrt(count) if norm == "l2" else 1.0)

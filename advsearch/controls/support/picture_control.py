@@ -1,4 +1,4 @@
-"""A control of a picture, which patches and projectors are."""
+"""The base class of controls of an image: patches and projectors."""
 
 from __future__ import annotations
 
@@ -28,8 +28,9 @@ from advsearch.scene.settings import Parameter
 
 
 class PictureControl(Control):
-    """A control of an image, searched or from a file, and of numbers, which are fixed
-    at their defaults if they are not set.
+    """Base class for controls of an image, which is searched or read from a file.
+
+    Other parameters are numbers, which are fixed at their defaults if they are not set.
 
     Its choices are `resolution`, `picture` (an image file), `norm` ("box" for any
     color, "linf" or "l2") and `epsilon`.
@@ -66,8 +67,8 @@ class PictureControl(Control):
     def get_spec(self, parameter: Parameter) -> Spec:
         """Return the spec that the user set for a parameter, or the default one.
 
-        By default a searched image takes all colors, an image from a file is no
-        coordinate of the search, and a number is fixed at its default.
+        By default a searched image may have all colors, and a number is fixed at its
+        default. An image from a file is fixed, so that it has no coordinates.
         """
         if parameter.name in self.specs:
             return self.specs[parameter.name]
@@ -76,20 +77,21 @@ class PictureControl(Control):
         return Range(0.0, 1.0) if self.is_searched_image else Fixed(0.0)
 
     def get_budget(self, parameter: Parameter) -> Budget:
-        """Return how far the image may go from its start; others have no limit.
+        """Return how far the image may go from its start.
 
         That is the radius `epsilon` in the norm, converted from colors to fractions of
-        the range.
+        the range. Parameters other than the image have no limit, and the norm "box" has
+        none either.
         """
         norm = self.chosen["norm"]
         if parameter.name != self.image_parameter or norm == "box":
             return FULL_RANGE
         spec = self.get_spec(parameter)
         assert isinstance(spec, Range)
-        n_colors = 3 * math.prod(self.sides)
+        n_values = 3 * math.prod(self.sides)  # three channels for each pixel
         radius = self.chosen["epsilon"]
         if radius is None:
-            radius = compute_default_radius(norm, n_colors, self.default_epsilon)
+            radius = compute_default_radius(norm, n_values, self.default_epsilon)
         return Budget(norm, radius / (spec.high - spec.low))
 
     def values(self, u: Tensor) -> dict[str, Tensor]:

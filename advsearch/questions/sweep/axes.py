@@ -163,9 +163,8 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"choose one of {', '.join(parameters)}"
         )
     # A colon without a name after it is rejected.
-    families.check_instance_name(
-        where, parameter_instance or kind_instance, parameter_colon or kind_colon
-    )
+    if parameter_colon or kind_colon:
+        families.check_instance_name(where, parameter_instance or kind_instance)
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
