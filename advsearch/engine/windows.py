@@ -53,7 +53,8 @@ MOVING_SUFFIXES = (".vertices", ".normals")
 class FullImage(NamedTuple):
     """A full image, traced twice with independent noise.
 
-    Linear radiance has three color channels, and may have a fourth one, alpha.
+    Linear radiance has three color channels. With a backdrop it has a fourth one, the
+    coverage by the scene.
 
     Attributes:
         u: (d,) configuration of the image.
@@ -276,7 +277,7 @@ def _measure_square(
     # for each of the two seeds, differences summed over the squares: (1, 3, h, w)
     difference_sums = []
     for old, new in zip(before.halves, after.halves, strict=True):
-        difference = (new - old)[..., :3]  # without alpha
+        difference = (new - old)[..., :3]  # without coverage
         levels = 255.0 * slope * difference * outside
         difference_sums.append(_sum_over_squares(levels))
     # number of pixels outside of the window in each square, (1, 1, h, w)
@@ -317,7 +318,7 @@ def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
         linear = renderer.finish_image(radiance, inputs, image.u, display=False)
         displayed = renderer.formation.display(linear)
         (slope,) = torch.autograd.grad(displayed.sum(), radiance)
-    return slope[..., :3]  # without alpha
+    return slope[..., :3]  # without coverage
 
 
 def _measure_margin(
