@@ -1,4 +1,4 @@
-"""Load a scene from Python, and make a renderer `render(u, seed, spp)` of it."""
+"""Load a scene from Python, and make a renderer `render(u, seed, spp)` for it."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ PHOTOGRAPH_SETTINGS = (
     *("ground.level", "ground.gloss", "ground.roughness"),
     *("backdrop.noise", "backdrop.blur"),
 )
-"""Settings that only a scene has which is rendered into a photograph."""
+"""Settings that only apply to a scene that is rendered into a photograph."""
 
 SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}
 """A mapping with one of these keys describes one value, and not the settings of a
@@ -123,14 +123,15 @@ class Scene:
         """Return `render(u, seed, spp)` for the space of these controls.
 
         Args:
-            controls: what u varies.
+            controls: controls that u varies.
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
-            seed: root of the noise; the `seed` of each call counts on from it.
+            seed: root of the noise; the `seed` of each call is added to it.
             estimators: how derivatives are computed, by "control.parameter", "control"
-                or "*". `advsearch check` shows which estimators there are.
-            sampler: "multijitter", or "independent", which has more noise; the first
-                rounds sample counts up to products of two near numbers.
+                or "*". `advsearch check` lists the estimators.
+            sampler: "multijitter", or "independent", which has more noise.
+                "multijitter" rounds sample counts up to products of two similar
+                numbers.
 
         Raises:
             InputError: a control is unknown or impossible in this scene, or an argument
@@ -332,7 +333,7 @@ def load_scene(
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
     has_environment = environment is not None
-    # In a folder, each photograph has its own light, which is read with it below.
+    # In a folder, each photograph has its own light, which is read below.
     if environment is None and not is_photograph_folder(backdrop):
         environment = find_photographed_light(backdrop)
     description = load_description(
@@ -387,7 +388,7 @@ def _put_into_photographs(
     """
     is_folder = is_photograph_folder(spec)
     if not is_folder:
-        # The scene has its light already: `load_scene` found it.
+        # `load_scene` has given the scene the light next to a single photograph.
         view = read_photograph_view(spec)
         return put_into_photograph(description, view, camera, occluder)
     if occluder is not None:
@@ -396,9 +397,13 @@ def _put_into_photographs(
             "one photograph; state it as `occluder` in the camera file beside that"
         )
     scenes: dict[str, SceneDescription] = {}
+    # Files that are opened here belong to the folder.
     with track_opened_files(spec):
-        # a file with the cameras of all photographs is parsed only once
-        cameras = read_photograph_cameras(camera) if camera is not None else None
+        # A file with the cameras of all photographs is parsed only once. `camera` may
+        # also be the name of a camera, and stays.
+        photograph_camera: Any = camera
+        if camera is not None:
+            photograph_camera = read_photograph_cameras(camera) or camera
         views = read_photograph_folder(spec, has_camera=camera is not None)
         for name, view in views.items():
             light = None if has_environment else find_photographed_light(view.spec)
@@ -406,7 +411,7 @@ def _put_into_photographs(
             if light is not None:
                 environment = import_environment(light)
                 lit_scene = Scene(description).with_environment(environment).description
-            scenes[name] = put_into_photograph(lit_scene, view, cameras or camera)
+            scenes[name] = put_into_photograph(lit_scene, view, photograph_camera)
     folder = PhotographFolder(str(spec), camera, scenes)
     # The scene shows the first photograph, until a control chooses another one.
     return replace(next(iter(scenes.values())), photographs=folder)
@@ -462,13 +467,19 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
 def scene_to_settings(scene: Scene) -> dict[str, Any]:
     """Return the settings by which a configuration names a loaded scene.
 
-    The keys are those of `SceneConfig`. Of a scene with `is_session_only` these
+    The keys are those of `SceneConfig`. For a scene with `is_session_only` these
     settings are incomplete, since no file can name its Python objects.
     """
     description = scene.description
     photograph = description.backdrop_photograph
-    backdrop = photograph.spec if photograph is not None else None
+    backdrop = None
+    occluder = None
+    if photograph is not None:
+        backdrop = photograph.spec
+        # file of the mask of what is in front of the object; "" without one
+        occluder = photograph.front_spec or None
     camera = _camera_setting(description)
+    # In a folder, the scene shows one of its photographs. The settings name the folder.
     if description.photographs is not None:
         backdrop = description.photographs.path
         camera = description.photographs.camera
@@ -482,7 +493,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "camera": camera,
         "things": description.things_spec or None,
         "backdrop": backdrop,
-        "occluder": (photograph.front_spec or None) if photograph is not None else None,
+        "occluder": occluder,
         "set": description.requested_values,
     }
 
@@ -490,8 +501,8 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
 def _camera_setting(description: SceneDescription) -> str | None:
     """Return the value of the `camera` setting that names a scene's camera.
 
-    The first that the scene has decides: a rig of several cameras, a preset such as
-    "dashcam", a lens such as "fisheye", or a camera of the scene file. None stands for
+    It is the first of these that the scene has: a rig of several cameras, a preset such
+    as "dashcam", a lens such as "fisheye", or a camera of the scene file. None means
     the default, a pinhole that orbits the object.
     """
     if description.rig:
@@ -558,14 +569,15 @@ def fit_camera(
             raise InputError(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
-        # Drops bend the ray of each pixel. So they need a camera model, which has the
-        # rays as a table. A model without a name was made here by an earlier call,
-        # perhaps for another aspect, and is replaced.
+        # Drops bend the ray of each pixel, so they need a camera model, which has a
+        # table of rays. A camera model without a name was made by an earlier call of
+        # this function, perhaps for another aspect, and is replaced.
         if camera_model is None or not camera_model.name:
             camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
     if camera_model is not None:
-        # bundled lenses depend on the aspect; any other model stays
-        camera_model = make_bundled_models(aspect).get(camera_model.name, camera_model)
+        # A bundled lens depends on the aspect, and is made again; others stay.
+        bundled_models = make_bundled_models(aspect)
+        camera_model = bundled_models.get(camera_model.name, camera_model)
         scaling_remarks = camera_model.describe_scaling((height, width))
         remarks = tuple(dict.fromkeys((*remarks, *scaling_remarks)))
     return replace(
@@ -604,8 +616,9 @@ def make_renderer(
     """Load a described scene, with what the space's controls need, into Mitsuba.
 
     Args:
-        description: the scene; that of the space, if it has one, takes its place.
-        space: what varies.
+        description: the scene. If a control of the space has changed the scene, the
+            changed one is loaded instead.
+        space: controls that vary.
         resolution: side, or (height, width), in pixels.
         denoise: "oidn" or "none".
         seed: root of the noise.
@@ -639,30 +652,31 @@ def make_renderer(
     )
     has_exposure_time = any(space.exposure)
     _check_rig_times(description, space)
-    # `Motion` tells how points move in the image. Derivatives at outlines need it, and
-    # the number of moments for motion blur.
+    # `Motion` computes how points move in the image. It is needed for derivatives at
+    # outlines, and for the moments of an exposure.
     motion = None
-    if differentiated or has_exposure_time:
+    if differentiated:
         motion = Motion(description, size, scene.assembly)
-    # moments of the exposure; their images together are one with motion blur
+    # images at these moments are averaged to an image with motion blur
     moments: tuple[Moment, ...] = ()
-    if has_exposure_time and motion is not None:
-        moments = choose_moments(space, motion, scene.assembly, size[0])
+    if has_exposure_time:
+        exposure_motion = motion or Motion(description, size, scene.assembly)
+        moments = choose_moments(space, exposure_motion, scene.assembly, height=size[0])
     return Renderer(
         scene,
         space,
         formation,
         seed,
-        motion=motion if differentiated else None,
+        motion=motion,
         estimators=estimators,
         moments=moments,
     )
 
 
 def _check_rig_times(description: SceneDescription, space: Space) -> None:
-    """Check a rig of which some cameras take their image later than others.
+    """Check a rig in which some cameras take their image later than others.
 
-    Such a rig is pointless unless something in the scene changes with time. It cannot
+    Such a rig only makes sense if something in the scene changes with time. It can't
     have motion blur or a rolling shutter.
 
     Args:
@@ -672,8 +686,8 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     Raises:
         InputError: nothing changes with time, or an image has motion blur.
     """
-    takes_turns = any(mount.delay for mount in description.rig)
-    if not takes_turns:
+    has_delays = any(mount.delay for mount in description.rig)
+    if not has_delays:
         return
     prefix = (
         f"camera: the pictures of {description.rig_spec} are taken one after the other"
@@ -721,10 +735,13 @@ def choose_moments(
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)
     max_pixels_moved = _measure_max_motion(space, motion, assembly, duration)
+    # `flashes` is a number per second
     n_flashes = max(control.flashes for control in space.controls) * duration
     n_for_motion = math.ceil(MOMENTS_PER_PIXEL * max_pixels_moved)
     n_for_flashes = math.ceil(MOMENTS_PER_FLASH * n_flashes)
     n_moments = min(max(MIN_MOMENTS, n_for_motion, n_for_flashes), MAX_MOMENTS)
+    # time of each moment, the rows that are exposed at it, and the fraction of samples,
+    # which is equal for all moments
     offsets, rows, samples = divide_exposure(shutter, rolling, height, n_moments)
     return tuple(
         Moment(space.advance_time(float(offset)), rows_of_moment, samples)
@@ -747,6 +764,7 @@ def _measure_max_motion(
         assembly: turns the inputs of the space into those of the scene.
         duration: length of the exposure in seconds.
     """
+    # only a control that moves has an exposure: (shutter, rolling) in seconds
     moving_controls = tuple(
         control for control in space.controls if any(control.exposure)
     )
@@ -756,7 +774,8 @@ def _measure_max_motion(
     configurations = torch.rand(
         N_MOTION_SAMPLES,
         len(moving_space.start),
-        # a fixed seed: the number of moments must not differ between two runs
+        # A fixed seed, as the number of moments, which follows from the result, must
+        # not differ between two runs.
         generator=torch.Generator().manual_seed(0),
     )
     max_moved = 0.0
@@ -775,20 +794,24 @@ def _measure_max_motion(
 
 
 def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
-    """Return the settings of controls by name, as a file holds them.
+    """Return the settings of controls by name, as a file stores them.
 
     Controls may be given as names, instances or a mapping. An instance is written with
     all of its settings, a name only with those that the caller stated.
     """
+    # an instance or the stated settings, which are empty for a bare name
     control_by_name = normalize_controls(controls)
     if not isinstance(controls, Mapping):
-        # The result is dropped: this only raises errors, as for an unknown name.
-        # Settings of a mapping are checked later, when its controls are made.
+        # This only checks the controls, e.g. for an unknown name. Settings of a mapping
+        # are checked later, when its controls are made.
         make_controls(control_by_name)
-    return {
-        name: control.to_settings() if isinstance(control, Control) else dict(control)
-        for name, control in control_by_name.items()
-    }
+    settings_of_control = {}
+    for name, control in control_by_name.items():
+        if isinstance(control, Control):
+            settings_of_control[name] = control.to_settings()
+        else:
+            settings_of_control[name] = dict(control)
+    return settings_of_control
 
 
 def make_controls(controls: Controls) -> tuple[Control, ...]:
@@ -813,7 +836,8 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
     # several names may state parameters of one control
     settings_by_control = merge_control_settings(named_settings)
     for name in instances:
-        # an instance has brought an empty mapping; anything in it came by a name
+        # An instance was entered with empty settings. If there are some now, a name has
+        # stated them.
         if settings_by_control[name]:
             raise InputError(
                 f"controls: {name} is given twice, by an instance and by "
@@ -844,10 +868,10 @@ def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, o
         for name, control in control_by_name.items()
         if isinstance(control, Control)
     }
-    all_settings = check_control_settings(
-        # an instance counts as no settings here, and is put back below
-        {**control_by_name, **dict.fromkeys(instances)}
-    )
+    # Settings are checked. An instance is replaced by None, which means no settings,
+    # and put back afterwards. So the order of the controls stays.
+    without_instances = {**control_by_name, **dict.fromkeys(instances)}
+    all_settings = check_control_settings(without_instances)
     return {
         name: instances.get(name, control_settings)
         for name, control_settings in all_settings.items()
@@ -875,14 +899,22 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             )
         if isinstance(control, Control):
             control_by_name[name] = control
-        # a mapping with one of these keys is the value of a single parameter
-        elif isinstance(control, Mapping) and not control.keys() & SINGLE_VALUE_KEYS:
+        elif _is_settings_of_control(control):
             control_by_name[name] = {
                 key: distribution_to_setting(value) for key, value in control.items()
             }
         else:
+            # the value of a single parameter, as for the name "camera.azimuth"
             control_by_name[name] = distribution_to_setting(control)
     return control_by_name
+
+
+def _is_settings_of_control(value: Any) -> bool:
+    """Return whether a value is a mapping of settings, and not that of one parameter.
+
+    The value of a parameter may be a mapping as well, such as {"range": [0, 30]}.
+    """
+    return isinstance(value, Mapping) and not value.keys() & SINGLE_VALUE_KEYS
 
 
 def _read_control_list(
@@ -941,7 +973,7 @@ def list_session_only_controls(controls: Controls) -> list[str]:
     for name, control_settings in controls_to_settings(controls).items():
         for parameter, value in control_settings.items():
             if isinstance(value, PythonQuantiles):
-                # a distribution may be given as "control.parameter" at once
+                # the name of a control, or already "control.parameter"
                 full_name = name if "." in name else f"{name}.{parameter}"
                 session_only.append(f"{full_name} (drawn by {value['name']})")
     return session_only

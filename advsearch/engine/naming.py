@@ -88,6 +88,7 @@ def collect_scene_parameters(config: SceneConfig) -> SettingValues:
         InputError: both state an exposure.
     """
     parameters: dict[str, Any] = dict(config.set_)
+    # 0 stops of exposure is the default, and changes nothing
     if config.exposure:
         if "camera.exposure" in parameters:
             raise InputError(
@@ -143,7 +144,7 @@ def load_models(
                 model,
                 task_of_model,
                 config,
-                # False for the tasks of an `EnsembleTask`
+                # an `EnsembleTask` has other tasks as its parts
                 is_only_task=task_of_model is task,
             )
             for model, task_of_model in zip(models, tasks, strict=True)
@@ -171,18 +172,19 @@ def _load_for_task(
         task: task of the model.
         config: states labels, prompt and range of values.
         is_only_task: whether all models have this task. If each model has its own task,
-            the labels and the prompt of the configuration are only for tasks that take
-            labels and have no names of classes by themselves.
+            the labels and the prompt of the configuration are only for those tasks that
+            need names of classes from the user.
     """
     single_image_task = task.single_image_task
     labels = None
     prompt = None
-    # whether the task reads classes whose names the user has to give
+    # A task may have classes, whose names may have another source.
     needs_names = single_image_task.labelled and not single_image_task.names_source
     if is_only_task or needs_names:
         labels = config.labels
         prompt = config.prompt
     if isinstance(model, str):
+        # The name may be that of an object that a Python caller passed.
         model = config.python_object(MODEL, model) or model
     return load_model(
         model,
@@ -266,9 +268,10 @@ def get_model_name(model: AnyModel) -> str:
 def is_session_only(model: AnyModel) -> bool:
     """Return whether a model exists in this session only.
 
-    Then no file and no command can name it.
+    Then it can't be named in a file or a command.
     """
     if isinstance(model, Model):
+        # `spec` is the name or path from which it was loaded
         return model.spec is None
     return not isinstance(model, (str, Path))
 
@@ -385,7 +388,7 @@ def make_configured_controls(
         if not isinstance(control, Control):
             control = config.python_object(CONTROL, name) or control
         control_by_name[name] = control
-    # Unknown controls are rejected here, before settings are read.
+    # This only checks the controls: an unknown one is rejected before settings are read.
     make_controls(control_by_name)
     completed: dict[str, Control | Mapping[str, object]] = {}
     for name, control in control_by_name.items():
@@ -393,8 +396,9 @@ def make_configured_controls(
             _check_takes_no_run_setting(run_settings, control)
             completed[name] = control
         else:
-            settings_of_control = _select_settings(run_settings, name, control)
-            completed[name] = {**settings_of_control, **control}
+            defaults_from_run = _select_settings(run_settings, name, control)
+            # what the user stated for the control itself wins
+            completed[name] = {**defaults_from_run, **control}
     return make_controls(completed)
 
 
@@ -487,20 +491,22 @@ def check_run_settings(config: SceneConfig) -> None:
             # only some commands have controls that vary by chance
             random_controls = getattr(config, "over", {})
         controls = merge_control_settings({**config.controls, **random_controls})
-        # kind of each control that does not take the setting
-        rejecting_kinds = {
-            name: parse_control_name(name, control_settings)[0]
-            for name, control_settings in controls.items()
-            if not takes_setting(name, control_settings, setting)
-        }
+        # kind of each control that does not take the setting, by its name
+        rejecting_kinds = {}
+        for name, control_settings in controls.items():
+            if not takes_setting(name, control_settings, setting):
+                kind, _ = parse_control_name(name, control_settings)
+                rejecting_kinds[name] = kind
+        # a mapping from names of controls to values, such as {"key": 0.1}
         if isinstance(value, Mapping):
             _check_named_controls(setting, value, controls, rejecting_kinds)
             continue
-        # A curve (several values, one for each run) has to be taken by all controls; a
-        # single value by any of them.
+        # A tuple of values is a curve, with a run for each value: all controls have to
+        # take the setting. For a single value it is enough if one of them does.
         is_curve = isinstance(value, tuple)
         is_rejected_by_all = len(rejecting_kinds) == len(controls)
-        if rejecting_kinds and (is_curve or is_rejected_by_all):
+        is_unsupported = is_rejected_by_all or is_curve
+        if rejecting_kinds and is_unsupported:
             name, kind = next(iter(rejecting_kinds.items()))
             raise _make_unsupported_error(setting, name, kind)
 
@@ -579,21 +585,24 @@ def _list_active_choices(
 ) -> list[Choice]:
     """List the choices of a control that have an effect with these settings.
 
-    A choice is an option of a control besides its parameters, such as `epsilon`, which
-    bounds a parameter. It has no effect if that parameter is not searched. A parameter
-    is not searched if it is set to a number, if another choice fixes it, or if it has
-    no default range and none is set.
+    A choice is an option of a control besides its parameters. `Choice.bounds` names the
+    parameter that a choice bounds, as `epsilon` does; the choice has no effect if that
+    parameter is not searched. A parameter is not searched if it is set to a number, if
+    another choice fixes it (`Choice.fixes`), or if it has no default range and none is
+    set.
 
     Args:
         kind: class of the control.
-        settings: settings that the user stated for it.
+        settings: settings that the user stated for it: values of parameters and of
+            choices, by name.
     """
-    # names of parameters that do not vary: a choice fixes them, or a number is set
+    # names of parameters that a choice fixes, or that are set to a number
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
-    # names of parameters that are searched: with a default range, or with a range set
+    # names of parameters with a default range, or with a range that is set; names of
+    # choices are among these as well, but no choice bounds a choice
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
@@ -612,11 +621,12 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
     Args:
         setting: name of the setting, such as "epsilon".
         name: name of the control.
-        kind: kind of the control, which decides what is advised.
+        kind: kind of the control, on which the advice depends.
     """
     if setting == "epsilon":
         choices = CONTROLS[kind].choices if kind in CONTROLS else ()
-        # parameters that an epsilon would bound if they were searched
+        # Some controls take an epsilon for a parameter (`Choice.bounds`), but only if
+        # it is searched. The first such parameter is suggested.
         bounded_parameters = [
             choice.bounds
             for choice in choices
