@@ -75,8 +75,8 @@ from advsearch.trust.foreign_code import use_plain_switches
 from advsearch.trust.stored_files import track_opened_files
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
-"""One control or several, by name or instance; a mapping gives each name its settings
-or its instance, and ``mitsuba:KEY`` a range.
+"""One control or several, by name or instance, or a mapping from names to settings or
+instances. A name ``mitsuba:KEY`` has a range instead of settings.
 """
 
 Texture = str | Path | npt.ArrayLike | Tensor
@@ -98,12 +98,12 @@ DEFAULT_RESOLUTION = 128
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """An object under an environment, with some parameters fixed. Made by `load_scene`.
+    """An object under an environment, with some parameters fixed. See `load_scene`.
 
     Attributes:
         description: the scene as data.
-        is_session_only: whether it holds Python objects that no file and no command can
-            name.
+        is_session_only: whether it contains Python objects that can't be named in a
+            file or a command.
     """
 
     description: SceneDescription
@@ -185,7 +185,7 @@ class Scene:
         return Scene(add_lamps(with_requested_ground(relit)), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
-        """Explain what takes the place of `render`; called for missing attributes only."""
+        """Explain what to use instead of `render`; called for missing attributes only."""
         if name == "render":
             raise AttributeError(
                 "a scene has no `render`: advsearch.render(scene) makes a picture and "
@@ -278,45 +278,47 @@ def load_scene(
         object: a bundled name ("mug"), a path to a mesh (`advsearch.files.MESHES`), or
             an asset.
         environment: a bundled name, a path to an .hdr or .exr file or to the .yaml file
-            of a place, an asset; default "studio".
-        scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which
-            `object` is a node or the id of a shape; a file may as well be written
-            before it: "scene.glb#chair", "box.xml#large-box".
-        up: the up axis of a mesh file, "y" or "z"; by default what its format or else
-            its shape states.
+            of a place, or an asset; default "studio".
+        scene: a scene file, or a scene dictionary of Mitsuba (`mi.cornell_box()`).
+            `object` is then a node or the id of a shape in it. The file may also be
+            written before the object: "scene.glb#chair", "box.xml#large-box".
+        up: the up axis of a mesh file, "y" or "z"; by default that of its format, or
+            else one that is guessed from its shape.
         facing: the axis of a mesh file that its front faces, "+x", "-x", "+y", "-y",
-            "+z" or "-z"; by default what its format states: +z of glTF and VRM 1, -z of
-            VRM 0, and +x of others. It is rotated towards +x.
+            "+z" or "-z". By default that of its format: +z for glTF and VRM 1, -z for
+            VRM 0, and +x for others. The front is rotated towards +x.
         size: size of the object, its longest side in metres, 1e-4 to 1e4. Distances of
-            the camera, paths of files and the height of a photograph are in metres
-            where the size of the object is known, and in object sizes elsewhere.
-        unit: unit of the coordinates of the object's file, "mm", "cm", "m" or "in",
-            which gives it its size; by default bundled objects and glTF have one, and
-            of other files it is not known.
-        settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a
-            picture belongs to none of them but to what makes it: `resolution` of
-            `attack`, `sweep`, `render` and `Scene.renderer`.
-        camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose
-            lens the camera around the object then has; for a `backdrop`, COLMAP's
-            images.txt or a transforms.json, which names it; "dashcam" or "robot", mounted at
-            its height above the ground; the name of a camera of a scene file; "orbit"
-            or None for a pinhole.
-        texture: texture of the object in place of its own: a picture file, or (h, w, 3)
-            sRGB in [0, 1] or of 8 bits, row 0 on top; `result.artifacts["texture"]`,
-            say.
-        things: what stands beside the object, in metres from it, x forwards and y to
-            its left: a text such as "car@12,3.5,heading=180; person@6,-2", or a list of
-            such texts or of mappings, {"object": "car", "x": 12, "y": 3.5, "heading":
-            180}; `size` (metres), `name` and `label` are optional.
-        backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
-            picture file, taken by `camera`; of a part of it,
+            the camera, paths of files and the height of a photograph are in metres if
+            the size of the object is known, and otherwise in object sizes.
+        unit: unit of the coordinates of the object's file, "mm", "cm", "m" or "in", by
+            which its size is known. By default bundled objects and glTF files have a
+            unit, and other files have none.
+        settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of an
+            image is not among them: it is `resolution` of `attack`, `sweep`, `render`
+            and `Scene.renderer`.
+        camera: a camera file (docs/cameras.md); "fisheye" or "equirectangular", the
+            lens of the camera that orbits the object; "dashcam" or "robot", a camera at
+            its height above the ground; the name of a camera of a scene file; for a
+            `backdrop`, the images.txt of COLMAP or a transforms.json that contains the
+            photograph; "orbit" or None for a pinhole that orbits the object.
+        texture: texture that replaces that of the object: an image file, or (h, w, 3)
+            sRGB in [0, 1] or of 8 bits, row 0 on top, for example
+            `result.artifacts["texture"]`.
+        things: other objects of the scene. Positions are in metres from the object, x
+            forwards and y to its left: a text such as "car@12,3.5,heading=180;
+            person@6,-2", or a list of such texts or of mappings, {"object": "car", "x":
+            12, "y": 3.5, "heading": 180}; `size` (metres), `name` and `label` are
+            optional.
+        backdrop: a photograph that the scene is rendered into (docs/cameras.md): an
+            image file, taken by `camera`; a part of it,
             ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels; or a folder of photographs, of
-            which the control `backdrop` chooses one. By default it is lit by the .hdr
-            or .exr file of its name beside it, and seen by the camera of the .yaml or
-            .json file of its name, if there is one.
-        occluder: a mask of the photograph's size, white where it shows what is before
-            the object; or its depth, an .exr or .npy file in metres, or a picture with
-            the metres of a level behind its name, ``depth.png#0.001``.
+            which the control `backdrop` selects one. If there is an .hdr or .exr file
+            of the same name next to it, that is its default light; a .yaml or .json
+            file of the same name is its default camera.
+        occluder: a mask of the size of the photograph, white where the photograph shows
+            something in front of the object; or the depth of the photograph: an .exr or
+            .npy file in metres, or an image with the metres of a level after its name,
+            ``depth.png#0.001``.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -431,8 +433,8 @@ def _check_no_photograph(
         stated.append("occluder")
     if stated:
         raise InputError(
-            f"{stated[0]}: is about a photograph that the scene is rendered into, and "
-            "there is none; give a `backdrop`, or leave it out"
+            f"{stated[0]}: only applies to a scene that is rendered into a photograph; "
+            "set `backdrop`, or leave it out"
         )
 
 
@@ -705,7 +707,7 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     )
     if not changes_with_time:
         raise InputError(
-            f"{prefix}, and show the same: nothing knows a time; add a `path`"
+            f"{prefix}, but nothing in the scene changes with time; add a `path`"
         )
 
 

@@ -46,7 +46,7 @@ from advsearch.trust.foreign_code import use_plain_switches
 CONTROL = "control"
 MODEL = "model"
 SCENE = "scene"
-"""Roles of objects that a Python caller may pass in place of a name."""
+"""Roles of objects that a Python caller may pass instead of a name."""
 
 
 def load_configured_scene(
@@ -331,20 +331,20 @@ def check_no_worker_settings(settings: Mapping[str, object]) -> None:
             raise InputError(
                 f"{name}: other processes load objects, models, controls and the "
                 "objective by name, and some were "
-                "given as loaded objects; give their names or files"
+                "passed as loaded objects; pass their names or files"
             )
 
 
 RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path", "shutter", "rolling")
 """Settings that a configuration states for all of its controls.
 
-Each control declares which of them it takes (`Choice.run_setting`). A configuration
-without such a setting counts as one that does not state it.
+Each control declares which of them it takes (`Choice.run_setting`). Not every
+configuration has all of these settings.
 """
 
 
 SETTINGS_OF_SEARCHES = frozenset({"epsilon"})
-"""Those that only searched controls take; one that varies by chance has none."""
+"""Settings of these that only searched controls take, not those that vary by chance."""
 
 
 def collect_run_settings(
@@ -436,7 +436,7 @@ def _select_settings(
     """
     selected: dict[str, object] = {}
     choices = _list_choices(qualified_name, control_settings)
-    for choice in choices or ():  # None of a control that is not known
+    for choice in choices or ():  # None for an unknown control
         value = run_settings.get(choice.run_setting)
         if isinstance(value, Mapping):
             _, instance_name = parse_control_name(qualified_name, control_settings)
@@ -651,18 +651,17 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
 
 
 _PROCESS_LOCK = threading.RLock()
-"""Held by the experiment that runs.
-
-The threads of torch and Dr.Jit, and warnings that are caught, belong to the process.
+"""Lock that is held by the running experiment. The number of threads of torch and Dr.Jit
+and the recording of warnings are shared by the process.
 """
 
 
 @contextmanager
 def hold_process_lock() -> Iterator[None]:
-    """Run the block while no other thread of the process runs an experiment.
+    """Run a block while no other thread of the process runs an experiment.
 
-    Derivatives are on in it, whatever the caller has switched off (`torch.no_grad`,
-    `torch.inference_mode`). torch and Dr.Jit have their threads again after it.
+    Gradients are enabled in it, even if the caller has disabled them (`torch.no_grad`,
+    `torch.inference_mode`). Afterwards torch and Dr.Jit have as many threads as before.
     """
     with _PROCESS_LOCK, threads.restore_threads(), use_plain_switches():
         yield

@@ -317,27 +317,28 @@ def render(
     """Render a scene and predict with a model what it shows.
 
     Args:
-        scene: scene from `load_scene`, or what that takes.
-        model: model from `load_model`, or what that takes.
-        task: reads the model's predictions: a name, a mapping with a `name` and
-            options, an instance, or a function.
-        label: the right labels, for a task that draws what is true; None for the
-            object's own.
+        scene: scene from `load_scene`, or the first argument of that.
+        model: model from `load_model`, or the first argument of that.
+        task: task that reads the model's predictions: a name, a mapping with a `name`
+            and options, an instance, or a function.
+        label: the right labels, for a task that draws the truth; None for those of the
+            object.
         judge: the thing whose truth is drawn: "object", the name of another thing of
             the scene, or "all".
         controls: changes of the scene: names, instances, or a mapping from names to
             settings. A parameter with a range has the value where a search would start.
-        around: number of views, from azimuths all around the object; None for one, from
-            the scene's own camera.
-        texture: texture of the object in place of its own, as `load_scene` takes it.
-        resolution: side, or (height, width), in pixels; None for what the model takes.
+        around: number of views, from azimuths all around the object; None for one view,
+            from the camera of the scene.
+        texture: texture that replaces that of the object, as in `load_scene`.
+        resolution: side, or (height, width), in pixels; None for the input size of the
+            model.
         spp: samples per pixel.
         denoise: "oidn" or "none".
         sampler: "multijitter" or "independent".
         seed: root of the noise.
-        aov: store what each pixel shows, for `Rendering.save_aov`.
-        at: (d,) in [0, 1], the configuration of `controls` in place of their start:
-            `result.u`, say.
+        aov: whether to store what each pixel shows, for `Rendering.save_aov`.
+        at: (d,) in [0, 1], configuration of `controls`, for example `result.u`; None
+            for their start.
         progress: True shows a progress bar, False shows none, None shows one on a
             terminal; or an object that receives the progress.
 
