@@ -108,7 +108,8 @@ def distribution_to_setting(value: object) -> object:
     if is_of_torch and kind.__name__ in TORCH_DISTRIBUTIONS:
         name, get_parameters = TORCH_DISTRIBUTIONS[kind.__name__]
         return _make_setting(name, get_parameters(value))
-    # A frozen distribution of scipy, such as norm(0, 1), has its family, norm, in `dist`.
+    # A frozen distribution of scipy, such as norm(0, 1), has its family, norm, in
+    # `dist`.
     family = getattr(value, "dist", value)
     is_frozen = family is not value
     # In scipy only distributions of integers have a probability mass function.
@@ -169,8 +170,8 @@ def _is_family_of_scipy(family: Any) -> bool:
 def _frozen_to_setting(frozen: Any) -> dict[str, object]:
     """Return a frozen distribution of scipy as a setting."""
     family = frozen.dist
-    # Parameters may have been passed by position or by name. scipy sorts them: first the
-    # shape parameters, such as `a` and `b` of the beta distribution.
+    # Parameters may have been passed by position or by name. scipy sorts them: first
+    # the shape parameters, such as `a` and `b` of the beta distribution.
     shape_values, loc, scale = family._parse_args(*frozen.args, **frozen.kwds)
     # their names in the same order, such as "a, b"; None if there are none
     shape_names = [

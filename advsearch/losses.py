@@ -41,7 +41,7 @@ __all__ = [
 Labels = Tensor | Sequence[int]
 
 
-# ---- of logits (N, C), to be maximised
+# ---- of logits (N, C), to be maximized
 
 
 def margin(logits: Tensor, labels: Labels) -> Tensor:

@@ -70,7 +70,8 @@ fixed sequence: Maurer, Hothorn and Lehmacher 1995).
 """
 # Largest number of rows for which it is computed whether a rule would be accepted.
 MAX_NEEDED = 1_000_000
-# The rate of right predictions has to be lower by this much under a rule than elsewhere.
+# The rate of right predictions has to be lower by this much under a rule than
+# elsewhere.
 MIN_GAP = 0.1
 MIN_ANGLE_RANGE = 270.0
 """If the values of an angle span at least this many degrees, they cover a full turn. A
@@ -119,7 +120,8 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     if "outcome" in rows:
         # a factor may have this name, and stays
         columns.setdefault("outcome", rows["outcome"])
-    # In `rows.attrs` units are those of measurement; column "unit" is the group of rows.
+    # In `rows.attrs` units are those of measurement; column "unit" is the group of
+    # rows.
     table = pd.DataFrame(
         {**columns, "correct": rows["correct"] == 1, "unit": rows["unit"]}
     )

@@ -678,7 +678,8 @@ Sampler = Literal["sobol", "random"]
 SAMPLERS: tuple[str, ...] = get_args(Sampler)
 
 POINTS_PER_NET = 1 << 16  # of a scrambled Sobol sequence; a power of two
-# largest number of dimensions of a Sobol point: Joe and Kuo give directions for so many
+# largest number of dimensions of a Sobol point: Joe and Kuo give directions for this
+# many
 MAX_DIMENSIONS = 21201
 # Largest number of values in a block of points, unless a single point has more.
 MAX_BLOCK_VALUES = 1 << 18

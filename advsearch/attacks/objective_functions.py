@@ -39,8 +39,8 @@ There its slope is about exp(log-odds). In float32 this rounds to 0 at -103, and
 negligible next to other gradients long before.
 """
 
-# It is added to the denominator of `dlr`, as a fraction of the distance from the largest
-# to the smallest logit.
+# It is added to the denominator of `dlr`, as a fraction of the distance from the
+# largest to the smallest logit.
 RELIEF = 1e-4
 # If all logits lie within this distance, `dlr` treats them as equal.
 SAME = 1e-12

@@ -67,7 +67,7 @@ class Objective(Protocol):
     def __call__(
         self, output: Any, images: Tensor, truth: Any, more: ReadInput = ..., /
     ) -> Tensor:
-        """Return (N,) values to maximise."""
+        """Return (N,) values to maximize."""
         ...
 
 
@@ -657,7 +657,7 @@ def get_objective(
 ) -> Objective:
     """Return an objective by its name, or a user's function wrapped as one.
 
-    The result is always called with the truth, and is to be maximised. If the task has
+    The result is always called with the truth, and is to be maximized. If the task has
     a target, a named objective uses its targeted form, and a user's function gets the
     target in place of the truth. If the task minimises, the values are negated. The
     mistakes of a user's function are explained.
@@ -815,7 +815,7 @@ def _has_slope_by_class(values: Tensor, output: Any) -> bool:
 def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
     """Warn if a user's function falls, for every image, as the target's logit rises.
 
-    It probably has the wrong sign: maximising it leads away from the target.
+    It probably has the wrong sign: maximizing it leads away from the target.
 
     Args:
         name: name of the function.
@@ -903,7 +903,7 @@ def _check_kind(
             f"got {kind.name}, which takes outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
-        # A distance from the clean image can only be maximised.
+        # A distance from the clean image can only be maximized.
         setting = "minimise"
         reason = "its minimum is at the start already"
         if targeted:

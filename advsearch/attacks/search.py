@@ -41,7 +41,7 @@ from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.seeds import stream
 
-# A search ends after so many objectives in a row that are not finite.
+# A search ends after this many objectives in a row that are not finite.
 NON_FINITE_LIMIT = 3
 
 

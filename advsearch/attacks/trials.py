@@ -214,7 +214,7 @@ def choose_spp(
         ladder: sample counts, rising. A single one is returned unmeasured.
         trials: number of trials that will follow under the same conditions; 0 if the
             trials are of another kind. If it is not too large, there is one more look
-            after so many renders (`list_look_sizes`).
+            after this many renders (`list_look_sizes`).
 
     Raises:
         InputError: the ladder is empty, not rising, or has a count below 1.

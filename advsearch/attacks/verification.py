@@ -136,7 +136,7 @@ class Rule:
         """
         n_required = self.count_percent(trials)
         if early and self.is_conditional:
-            # an early look is always after exactly so many trials that count
+            # an early look is always after exactly this many trials that count
             n_required = OVER_EARLY[trials]
         # with fewer trials than `min_trials`, even all successes are not enough
         return max(n_required, self.min_trials)
@@ -384,8 +384,8 @@ def verify(
 
     `trials` may be several ascending numbers, such as `TRIAL_LOOKS`. They are looks:
     after that many trials the successes are counted, and if they suffice, no more
-    trials follow. If conditions vary, a look is after so many trials that count, which
-    are those with a right clean prediction (`OVER_LOOKS`). The last number is the
+    trials follow. If conditions vary, a look is after this many trials that count: those
+    with a right clean prediction (`OVER_LOOKS`). The last number is the
     maximum of all trials.
 
     Curtailed trials end as soon as more have failed than the rule allows: the remaining

@@ -34,10 +34,11 @@ from advsearch.trust.stored_files import scale_limit
 
 # initial number of conditions in the bank, as a multiple of those of an evaluation
 INITIAL_CONDITIONS = 8
-# While the bank grows, one condition is added for so many that evaluations draw.
+# While the bank grows, one condition is added for each `DRAWS_PER_CONDITION` that are
+# drawn.
 DRAWS_PER_CONDITION = 4
 COMPARISON_INTERVAL = 100  # number of evaluations from one comparison to the next
-# A comparison traces so many new conditions, and predicts so many of the bank.
+# A comparison traces this many new conditions, and predicts as many of the bank.
 N_COMPARED = 16
 # The bank grows if the objective under unseen conditions is smaller by this number of
 # standard errors.

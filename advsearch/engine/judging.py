@@ -530,12 +530,12 @@ def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> b
 
 
 # ---- domain and objective
-# The domain and the objective of a search, and the terms that `printable` subtracts from
-# the objective: the variation of colors, and their distance from printable ones. Both
-# are after Sharif et al. 2016, *Accessorize to a Crime*, sections 5.2.2 and 5.2.3. There
-# they are sums over pixels, and the distance is a product over all printable colors.
-# Here they are means, and the distance is that to the nearest printable color, which is
-# zero at the same colors.
+# The domain and the objective of a search, and the terms that `printable` subtracts
+# from the objective: the variation of colors, and their distance from printable ones.
+# Both are after Sharif et al. 2016, *Accessorize to a Crime*, sections 5.2.2 and 5.2.3.
+# There they are sums over pixels, and the distance is a product over all printable
+# colors. Here they are means, and the distance is that to the nearest printable color,
+# which is zero at the same colors.
 
 
 def make_domain(
@@ -708,8 +708,8 @@ def mean_variation(colors: Tensor) -> Tensor:
         # the step's first pixel is masked at the end, its second one here
         right = right * mask[:, 1:]
         down = down * mask[1:]
-    # Zeros are added for the last column and the last row, which have no neighbor. `pad`
-    # takes the zeros before and after, from the last axis (color) to the first.
+    # Zeros are added for the last column and the last row, which have no neighbor.
+    # `pad` takes the zeros before and after, from the last axis (color) to the first.
     squared_right = F.pad(right.square(), (0, 0, 0, 1))
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
@@ -832,12 +832,12 @@ def make_objective(
     seed: int,
     ensemble: EnsembleReduction | None = None,
 ) -> tuple[Objective, str]:
-    """Return the function that a search maximises, and a remark about it or "".
+    """Return the function that a search maximizes, and a remark about it or "".
 
     Args:
         requested: name of an objective, or a function.
         task: task of the model.
-        model: whose output is maximised.
+        model: model whose output is evaluated.
         renderer: renders the clean image for an objective that compares features.
         seed: seed of the noise of that image.
         ensemble: how the objectives of several models become one, "mean" or "worst".

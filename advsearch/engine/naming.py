@@ -388,7 +388,8 @@ def make_configured_controls(
         if not isinstance(control, Control):
             control = config.python_object(CONTROL, name) or control
         control_by_name[name] = control
-    # This only checks the controls: an unknown one is rejected before settings are read.
+    # This only checks the controls: an unknown one is rejected before settings are
+    # read.
     make_controls(control_by_name)
     completed: dict[str, Control | Mapping[str, object]] = {}
     for name, control in control_by_name.items():

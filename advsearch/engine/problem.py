@@ -75,7 +75,7 @@ from few that are exact.
 """
 
 MAX_CACHED_COORDINATES = 64
-"""The truth of a configuration is cached if it has at most so many coordinates besides
+"""The truth of a configuration is cached if it has at most this many coordinates besides
 base colors.
 """
 

@@ -113,7 +113,8 @@ class RunState:
         # why a better method was not used: matrices for a crop, or light on surfaces
         # for matrices
         better_method_refusal = self.predictor_refusal or self.surface_light_refusal
-        # If the predictor was given up, its summary has that as the reason, which stays.
+        # If the predictor was given up, its summary has that as the reason, which
+        # stays.
         was_given_up = bool(summary.reason)
         if was_given_up or not better_method_refusal:
             return summary
@@ -179,7 +180,8 @@ def add_judgement(row: Row, judgement: Judgement) -> Row:
         score=_none_if_nan(judgement.score),
         correct=judgement.right,
         margin=_none_if_nan(judgement.margin),
-        # None where the output was NaN: its index and probability are None by themselves
+        # None where the output was NaN: its index and probability are None by
+        # themselves
         label=None if judgement.is_non_finite else prediction.label,
         label_index=prediction.index,
         probability=prediction.probability,

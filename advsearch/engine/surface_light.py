@@ -591,9 +591,10 @@ class SurfaceLight(PredictedSearch):
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
             ]
-            # The margin may be off by a fraction of the change that the search has made.
-            # Random coordinates are no such change. If colors are not searched, only
-            # cameras and environments are, so that all coordinates count as random.
+            # The margin may be off by a fraction of the change that the search has
+            # made. Random coordinates are no such change. If colors are not searched,
+            # only cameras and environments are, so that all coordinates count as
+            # random.
             is_random = self._moving
             if not self._searches_colors:
                 is_random = torch.ones_like(self._moving)

@@ -50,13 +50,13 @@ MIN_STEPS = 16
 """Smallest number of evaluations of a search for which the matrix pays. It costs as much
 as about 6 rendered evaluations with gradients (`benchmarks/transport.py`).
 """
-# Smallest number of evaluations for each light for which basis images pay. A basis image
-# shows the scene under a single light; images under all lights are weighted sums.
+# Smallest number of evaluations for each light for which basis images pay. A basis
+# image shows the scene under a single light; images under all lights are weighted sums.
 MIN_STEPS_PER_LIGHT = 8
 COMPARISON_INTERVAL = 20  # number of evaluations from one comparison to the next
 SURROUNDINGS_SPP = 16  # samples per pixel of the surroundings of a matrix's window
 MIN_SCORES = 4  # smallest number of trials to estimate a standard deviation
-# 19 of 20 normally distributed scores lie above the mean minus so many standard
+# 19 of 20 normally distributed scores lie above the mean minus this many standard
 # deviations.
 LOWER_END_DEVIATIONS = 1.64
 ADVICE = {

@@ -52,7 +52,7 @@ from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.formation import round_sample_count
 from advsearch.tasks import Judgement
 
-# The row of a trial has the values of its configuration if these are at most so many.
+# The row of a trial has the values of its configuration if these are at most this many.
 MAX_DESCRIBED_COORDINATES = 64
 
 

@@ -149,7 +149,7 @@ def estimate_rate(
     """Return the rate of an event over all rows, and its 95 % interval over units.
 
     Rows of one unit may depend on each other, but units are independent. First the
-    effective number of rows is computed: so many independent rows would give the rate
+    effective number of rows is computed: this many independent rows would give the rate
     the same variance. Then the interval is Clopper and Pearson's for that number (Korn
     and Graubard 1998, "Confidence intervals for proportions with small expected number
     of positive counts estimated from survey data"). If the event happens in all rows or

@@ -388,7 +388,8 @@ class MapElites(Policy[ArchiveState]):
             )
         seed = policies.draw_seed(generator)
         measure_indices = self._find_measure_indices(domain)
-        # A choice has a cell for each option. A number has 0 options, and `cells` cells.
+        # A choice has a cell for each option. A number has 0 options, and `cells`
+        # cells.
         cells_of_axes = [
             n_options or self.cells
             for n_options in domain.options[measure_indices].tolist()

@@ -42,8 +42,8 @@ from advsearch.attacks.policies.surrogate import (
 )
 from advsearch.errors import InputError
 
-# Fraction of the renders that the screen takes. The screen are evenly spread points that
-# are evaluated first. "Mixed" domains have norm balls besides box coordinates.
+# Fraction of the renders that the screen takes. The screen are evenly spread points
+# that are evaluated first. "Mixed" domains have norm balls besides box coordinates.
 SCREEN_FRACTION = 0.5
 SCREEN_FRACTION_MIXED = 0.25
 # fraction of the renders after which the gradient ascent begins, if there is one

@@ -205,7 +205,8 @@ class Race:
         renders_left = runner.renders_left
         has_later_round = self.round + 1 < self.n_rounds
         # `limit_cost` drops a gradient that uses up the renders, because no step could
-        # follow it. With a later round a step does follow, so one render more is stated.
+        # follow it. With a later round a step does follow, so one render more is
+        # stated.
         if has_later_round:
             renders_left += 1
         return proposal.limit_cost(runner.domain, renders_left)

@@ -497,8 +497,8 @@ class Mixture(Policy[MixtureState]):
         mixture = state.mixtures[-1]  # that of the current generation
         with policies.limit_to_single_thread():
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
-        # Without a mixture the density is 1. With one, the fraction `even` of samples is
-        # uniform, so that the density is at least `even`.
+        # Without a mixture the density is 1. With one, the fraction `even` of samples
+        # is uniform, so that the density is at least `even`.
         max_weight = 1.0 if mixture is None else 1.0 / self.even
         # A success of the search is a failure of the model, the column "failed". The
         # values are in the order of the columns of `log`.
@@ -669,8 +669,8 @@ class Mixture(Policy[MixtureState]):
             # The logged weights are those of a sample's own generation. Here the mean
             # density of all generations is used instead.
             weights = 1.0 / torch.stack(densities).mean(dim=0)
-            # Scaled so that their sum is the effective sample size, (sum w)^2 / sum w^2.
-            # It is compared with the `PRIOR_COUNT` samples of the prior.
+            # Scaled so that their sum is the effective sample size, (sum w)^2 / sum
+            # w^2. It is compared with the `PRIOR_COUNT` samples of the prior.
             weights *= weights.sum() / weights.square().sum()
             center_index = policies.select_diverse(
                 points,

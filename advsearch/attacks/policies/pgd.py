@@ -27,7 +27,8 @@ from advsearch.attacks.evaluation import (
 from advsearch.errors import InputError
 
 # An element of an l-infinity block is an outlier if it exceeds this many medians of the
-# elements. A gradient is too long if it exceeds this many medians of the latest lengths.
+# elements. A gradient is too long if it exceeds this many medians of the latest
+# lengths.
 CLIP = 3.0
 MEMORY = 15  # number of the latest gradients whose lengths are compared
 # The same as `CLIP` for the elements of an l2 block. It is larger, because the true
@@ -97,8 +98,8 @@ def _find_element_limit(block: Block, gradient: Tensor) -> float:
     return n_medians * float(magnitudes[magnitudes > 0].median())
 
 
-# The steps of a search are divided into windows. At the end of a window, the checkpoint,
-# the step size may be halved.
+# The steps of a search are divided into windows. At the end of a window, the
+# checkpoint, the step size may be halved.
 
 FIRST_WINDOW = 0.22
 WINDOW_DECREASE = 0.03
@@ -119,9 +120,9 @@ MIN_WINDOW_EXACT = 5
 # Without noise, the best objective of a window must exceed that of the window before by
 # this fraction of the gain of the whole search.
 MIN_WINDOW_GAIN = 1e-3
-# The search ends after so many windows in a row that gain less.
+# The search ends after this many windows in a row that gain less.
 MAX_IDLE_WINDOWS = 3
-# The search ends after so many gradients of zero in a row.
+# The search ends after this many gradients of zero in a row.
 MAX_FLAT_GRADIENTS = 5
 
 

@@ -184,8 +184,8 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
         if block.options:
             u[part] = option_center(x[part], block.options)
         elif block.norm == "l2" and block.epsilon is not None:
-            # Normal quantiles of uniform numbers are a normal vector, whose direction is
-            # uniform. They are infinite at 0 and 1, hence the clamp.
+            # Normal quantiles of uniform numbers are a normal vector, whose direction
+            # is uniform. They are infinite at 0 and 1, hence the clamp.
             direction = torch.special.ndtri(x[part].double().clamp(1e-9, 1.0 - 1e-9))
             # volume grows with distance**size, so this is uniform in the ball
             length = block.epsilon * next(distance_numbers) ** (1.0 / block.size)

@@ -26,8 +26,8 @@ from advsearch.scene.gradients import STEP_RANGE, Group, select_compared
 # Errors are relative to the size of a derivative, but at least to this fraction of the
 # largest derivative of the same control.
 MIN_SIZE_FRACTION = 0.1
-# Groups of at most this many coordinates get a probe for each of them. Larger groups get
-# a single "mixed" probe, along which all coordinates change.
+# Groups of at most this many coordinates get a probe for each of them. Larger groups
+# get a single "mixed" probe, along which all coordinates change.
 MAX_SINGLE_PROBES = 8
 # Up to this size of a group, the planned step for one coordinate is also that of the
 # mixed probe. Larger groups have the step `MIXED_STEP` there.
@@ -39,7 +39,7 @@ MAX_BIAS = 0.05
 MAX_NOISE = 0.2
 # A reference gets more seeds until its standard error, relative to its size, is this.
 MAX_REFERENCE_ERROR = 0.02
-N_STANDARD_ERRORS = 2.5  # two means agree within so many standard errors
+N_STANDARD_ERRORS = 2.5  # two means agree within this many standard errors
 N_WAVES = 6  # number of waves of a smooth loss
 MAX_FREQUENCY = 1.2  # largest number of periods of a wave in the image
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)

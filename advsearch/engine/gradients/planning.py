@@ -46,7 +46,7 @@ is only tried if no other reaches the goal: it smooths away everything but the c
 shape of the loss.
 """
 SAMPLE_COUNTS = (8, 16, 32, 64, 128)
-ADJOINT_RENDERS = 3.0  # an adjoint takes about as long as so many renders
+ADJOINT_RENDERS = 3.0  # an adjoint takes about as long as this many renders
 CONVERGED_SPP = 128
 CONVERGED_SPP_FACTOR = 4
 """Samples per pixel of a converged gradient. They are multiplied by the factor if such
@@ -57,10 +57,10 @@ gradients do not agree, or if a working gradient has more samples.
 N_CONVERGED = 3
 MIN_AGREEMENT = 0.5
 """Smallest cosine c of two converged gradients at which they are a usable reference.
-Below it the cosine of the mean of three with the true gradient is at most about sqrt(3 c
-/ (1 + 2 c)) = 0.87 (Spearman and Brown). Above it the noise of the converged gradient,
-which is independent of that of the working one, can only reduce the measured cosine. So
-a status of "ok" is right.
+Below it the cosine of the mean of three with the true gradient is at most about
+sqrt(3 c / (1 + 2 c)) = 0.87 (Spearman and Brown). Above it the noise of the converged
+gradient, which is independent of that of the working one, can only reduce the measured
+cosine. So a status of "ok" is right.
 """
 
 
@@ -341,7 +341,8 @@ def measure_cosines(
             if is_fallback and is_reached:
                 break
             plan = restrict_plan(base_plan.scale_steps(factor), group_names)
-            # Widths have an upper limit, so that a larger factor can give the same plan.
+            # Widths have an upper limit, so that a larger factor can give the same
+            # plan.
             if plan in tried_plans:
                 continue
             tried_plans.append(plan)
