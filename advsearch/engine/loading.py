@@ -139,6 +139,7 @@ class Scene:
         """
         resolution = to_python(resolution)
         description = fit_camera(self.description, resolution)
+        # global switches of torch that the caller has set do not change the result
         with use_plain_switches():
             space = make_space(make_controls(controls), description)
             return make_renderer(
@@ -182,7 +183,10 @@ class Scene:
             }
             folder = replace(description.photographs, scenes=relit_scenes)
             relit = replace(relit, photographs=folder)
-        return Scene(add_lamps(with_requested_ground(relit)), self.is_session_only)
+        # The lamps of a place are on if the environment is dark, so that ground and lamps
+        # are added again.
+        grounded = with_requested_ground(relit)
+        return Scene(add_lamps(grounded), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
         """Explain what to use instead of `render`; called for missing attributes only."""
@@ -231,24 +235,26 @@ class Scene:
         Raises:
             InputError: a name is unknown or a value out of range.
         """
+        # `resolved` has a value for every parameter, of which those of `overrides` count
         resolved = settings.resolve_settings(overrides)
         description = self.description
         check_mesh_names(description, overrides)
         if description.camera_model is not None:
+            # it has its own focal lengths
             description.camera_model.check_no_fov(overrides)
         values = {**description.values, **{name: resolved[name] for name in overrides}}
         # A camera that has a height gets its elevation from that. So a stated elevation
         # removes the height.
         if "camera.elevation" in overrides:
             values["camera.height"] = None
-        changed = with_requested_ground(
-            replace(
-                description,
-                values=values,
-                requested=description.requested | set(overrides),
-            )
+        changed = replace(
+            description,
+            values=values,
+            requested=description.requested | set(overrides),
         )
-        return Scene(add_lamps(changed), self.is_session_only)
+        # The settings may request another ground, or switch lamps on or off.
+        grounded = with_requested_ground(changed)
+        return Scene(add_lamps(grounded), self.is_session_only)
 
 
 @with_checked_arguments
