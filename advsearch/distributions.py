@@ -16,8 +16,9 @@ from advsearch.errors import InputError
 DISTRIBUTION = "distribution"
 CHOICES = "choices"
 WEIGHTS = "weights"
-FROM_PYTHON = "from Python"  # the name of one that no file can hold
-# probabilities at which settings distinguish functions of one name
+FROM_PYTHON = "from Python"  # the name of a distribution that no file can store
+# A function is stored as its values at these probabilities, so that a changed function
+# of the same name is noticed.
 QUANTILES = (0.05, 0.5, 0.95)
 
 
@@ -48,7 +49,7 @@ class PythonQuantiles(dict[str, object]):
             ]
         except Exception as error:  # the user's code may raise anything
             raise InputError(
-                f"distribution {name}: expected a function from a share in [0, 1] to a "
+                f"distribution {name}: expected a function from a probability to a "
                 "value (an inverse CDF), or an object with such an `icdf` or `ppf`; it "
                 f"raised {type(error).__name__}: {error}"
             ) from error
@@ -82,17 +83,19 @@ TORCH_DISTRIBUTIONS: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] =
     "StudentT": ("t", lambda d: {"df": d.df, **_loc_scale(d)}),
     "Weibull": ("weibull_min", lambda d: {"c": d.concentration, "scale": d.scale}),
 }
-"""Name in scipy and parameters there of each class of `torch.distributions`."""
+"""For each class of `torch.distributions` its name in scipy, and a function that returns
+its parameters there.
+"""
 
 
 def distribution_to_setting(value: object) -> object:
     """Return a parameter's distribution as a setting that a file can hold.
 
     Args:
-        value: a distribution of torch, a frozen one of scipy, anything else with an
+        value: a distribution of torch, a frozen one of scipy, another object with an
             `icdf` or a `ppf`, an inverse CDF (a function from a probability to a
-            value), or a mapping from choices to their weights. Anything else is
-            returned as it is.
+            value), or a mapping from choices to their weights. Any other value, also a
+            mapping that is a setting already, is returned unchanged.
 
     Raises:
         InputError: the distribution is of vectors or of integers, or a function is not
@@ -105,8 +108,11 @@ def distribution_to_setting(value: object) -> object:
     if is_of_torch and kind.__name__ in TORCH_DISTRIBUTIONS:
         name, get_parameters = TORCH_DISTRIBUTIONS[kind.__name__]
         return _make_setting(name, get_parameters(value))
-    # A frozen distribution of scipy, such as norm(0, 1), has its family in `dist`.
+    # A frozen distribution of scipy, such as norm(0, 1), has its family, norm, in
+    # `dist`.
     family = getattr(value, "dist", value)
+    is_frozen = family is not value
+    # In scipy only distributions of integers have a probability mass function.
     is_of_integers = hasattr(family, "pmf") and hasattr(family, "ppf")
     if is_of_integers:
         raise InputError(
@@ -114,17 +120,18 @@ def distribution_to_setting(value: object) -> object:
             "real numbers, got one of whole ones; give its values as {choices: [...], "
             "weights: [...]}"
         )
-    if family is not value and _is_family_of_scipy(family):
+    if is_frozen and _is_family_of_scipy(family):
         return _frozen_to_setting(value)
-    quantile = getattr(value, "icdf", None) or getattr(value, "ppf", None)
-    if quantile and kind.__module__.startswith("torch"):
-        torch = sys.modules["torch"]  # it is there: the distribution is one of its own
-        return PythonQuantiles(
-            kind.__name__,
-            lambda share: float(quantile(torch.tensor(share, dtype=torch.float64))),
-        )
-    if quantile:
-        return PythonQuantiles(kind.__name__, quantile)
+    inverse_cdf = getattr(value, "icdf", None) or getattr(value, "ppf", None)
+    if inverse_cdf and kind.__module__.startswith("torch"):
+        torch = sys.modules["torch"]  # imported, as the value is an object of it
+
+        def evaluate_inverse_cdf(probability: float) -> float:
+            return float(inverse_cdf(torch.tensor(probability, dtype=torch.float64)))
+
+        return PythonQuantiles(kind.__name__, evaluate_inverse_cdf)
+    if inverse_cdf:
+        return PythonQuantiles(kind.__name__, inverse_cdf)
     if callable(value) and not isinstance(value, type):
         return PythonQuantiles(str(getattr(value, "__name__", kind.__name__)), value)
     return value
@@ -151,8 +158,9 @@ def _choices_to_setting(value: Mapping[Any, Any]) -> object:
 
 
 def _is_family_of_scipy(family: Any) -> bool:
-    """Return whether a family of distributions is one of scipy's; one of the user may
-    have the name of one of these, but is of another class.
+    """Return whether a family of distributions is one of scipy's.
+
+    A user's family may have the same name, but has another class.
     """
     name = str(getattr(family, "name", ""))
     family_of_scipy = getattr(sys.modules.get("scipy.stats"), name, NotImplemented)
@@ -161,13 +169,16 @@ def _is_family_of_scipy(family: Any) -> bool:
 
 def _frozen_to_setting(frozen: Any) -> dict[str, object]:
     """Return a frozen distribution of scipy as a setting."""
-    # parameters by position or name, in scipy's own order
-    shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
-    names = [
-        name.strip() for name in (frozen.dist.shapes or "").split(",") if name.strip()
+    family = frozen.dist
+    # Parameters may have been passed by position or by name. scipy sorts them: first
+    # the shape parameters, such as `a` and `b` of the beta distribution.
+    shape_values, loc, scale = family._parse_args(*frozen.args, **frozen.kwds)
+    # their names in the same order, such as "a, b"; None if there are none
+    shape_names = [
+        name.strip() for name in (family.shapes or "").split(",") if name.strip()
     ]
-    parameters = {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale}
-    return _make_setting(frozen.dist.name, parameters)
+    parameters = dict(zip(shape_names, shape_values, strict=True))
+    return _make_setting(family.name, {**parameters, "loc": loc, "scale": scale})
 
 
 def _make_setting(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:

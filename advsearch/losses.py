@@ -1,12 +1,13 @@
-"""Losses for an objective or a loop of the user, `advsearch.losses`.
+"""Losses for the objective of a user, or for a training loop, `advsearch.losses`.
 
     def smooth(logits, images, labels, texture):
         return losses.margin(logits, labels) - 10.0 * losses.total_variation(texture)
 
-Those of logits are **maximised**. Each takes logits (N, C) and labels: (N,) int64, or
-the indices of a label set of which every label is right; each is an objective by
-itself. Those of colours are a **cost**. All return (N,) and are differentiable;
-formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.judging`.
+The losses of logits are **maximized**; each is an objective by itself. They take logits
+(N, C) and labels: (N,) int64, or the indices of a label set of which every label is
+right. The losses of colors are a **cost**, to be subtracted. All return (N,) and are
+differentiable. The formulas are in `advsearch.attacks.objective_functions` and
+`advsearch.engine.judging`.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ __all__ = [
     "total_variation",
 ]
 
-# (N,) int64, the right label of each picture; or indices, all of which are right
+# (N,) int64, the right label of each image; or indices of a label set for all images
 Labels = Tensor | Sequence[int]
 
 
-# ---- of logits (N, C), to be maximised
+# ---- of logits (N, C), to be maximized
 
 
 def margin(logits: Tensor, labels: Labels) -> Tensor:
@@ -64,8 +65,8 @@ def carlini_wagner(
 ) -> Tensor:
     """Return `margin`, clipped at a confidence (Carlini and Wagner 2017, f_6).
 
-    Where it is clipped it has no gradient: there a search improves what else the
-    objective consists of.
+    Where it is clipped it has no gradient, so that a search improves the other terms of
+    the objective there.
     """
     return margin(logits, labels).clamp(max=confidence)
 
@@ -80,8 +81,8 @@ def targeted_carlini_wagner(
 def cross_entropy(logits: Tensor, labels: Labels) -> Tensor:
     """Return minus the logarithm of the probability of the right labels, (N,), in nats.
 
-    It is that of torch for one right label, but with a gradient where the model is
-    sure.
+    For one right label it equals the loss of torch, but it keeps a gradient where the
+    model is sure.
     """
     return _by_label(of_logits.cross_entropy, logits, labels)
 
@@ -118,18 +119,19 @@ def targeted_dlr(logits: Tensor, target: Labels) -> Tensor:
     return _by_label(of_logits.targeted_dlr, logits, target)
 
 
-# ---- of colours (N, h, w, 3), a cost
+# ---- of colors (N, h, w, 3), a cost
 
 
 def total_variation(colors: Tensor) -> Tensor:
     """Compute the mean difference of a pixel from its right and lower neighbors, (N,).
 
-    It is the total variation of Sharif et al. 2016, section 5.2.2, in sRGB. Their sum
-    over pixels is a mean here, so that a weight means the same at every resolution.
+    It is the total variation of Sharif et al. 2016, section 5.2.2, in sRGB. They take
+    the sum over pixels. Here it is the mean, so that a weight has the same effect at
+    every resolution.
 
     Args:
-        colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of
-            which only pixels with a last channel over 0 count.
+        colors: (N, h, w, 3) sRGB in [0, 1], a texture or images; or (N, h, w, 4), where
+            only pixels whose last channel is over 0 count.
     """
     return torch.stack([judging.mean_variation(image) for image in _to_batch(colors)])
 
@@ -137,14 +139,14 @@ def total_variation(colors: Tensor) -> Tensor:
 def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     """Return the mean sRGB distance of pixels from the nearest printable color, (N,).
 
-    After the non-printability score of Sharif et al. 2016, section 5.2.3, which is a
-    product of distances to all printable colours: it is zero at the same colours.
+    The non-printability score of Sharif et al. 2016, section 5.2.3, is a product of the
+    distances to all printable colors. Both are zero at the same colors.
 
     Args:
-        colors: (N, h, w, 3) sRGB in [0, 1], a texture or images; or (N, h, w, 4), of
-            which only pixels with a last channel over 0 count.
-        palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the
-            125 of `printable`.
+        colors: (N, h, w, 3) sRGB in [0, 1], a texture or images; or (N, h, w, 4), where
+            only pixels whose last channel is over 0 count.
+        palette: (P, 3) sRGB in [0, 1], the colors that can be printed; None for the 125
+            of `printable`.
     """
     return torch.stack(
         [judging.printable_distance(image, palette) for image in _to_batch(colors)]
@@ -160,7 +162,7 @@ nps = non_printability  # its usual short name
 def check_direction(objective: object, *, targeted: bool) -> None:
     """Check that a loss function fits a search with or without a target.
 
-    A search maximises its objective. With a target, the loss must rise towards the
+    A search maximizes its objective. With a target, the loss must rise towards the
     target, and most losses fall towards it. Only losses of this module and of torch are
     checked; any other objective passes.
 

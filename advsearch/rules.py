@@ -1,20 +1,23 @@
 """Where a model is wrong, as rules over a table of rows.
 
-Rules are nodes of decision trees (Breiman et al. 1984) of one half of the rows, the
-best by weighted relative accuracy (Lavrac, Flach and Zupan 1999), made shorter where
-that costs nothing, one after the other (sequential covering; Friedman and Fisher 1999).
-The other half says whether a rule holds.
+A rule is a combination of conditions, such as "distance over 10 and light.power at most
+0.3". Candidates are the nodes of decision trees (Breiman et al. 1984) that are fitted
+to one half of the rows. The best candidate by weighted relative accuracy (Lavrac, Flach
+and Zupan 1999) is shortened where that costs little, and tested on the other half. Then
+the rows that it covers are removed, and the next rule is searched (sequential covering;
+Friedman and Fisher 1999).
 
     table = rules.make_table(rows, ["pose.yaw", "light.power"])
     choosing, counting = rules.split_in_halves(table, seed=0)
     for rule in rules.find_rules(choosing, counting, seed=0).accepted:
         print([condition.row.text for condition in rule.conditions])
-        print(rules.estimate_share(rule.inside))
+        print(rules.estimate_rate(rule.inside))
 
-A *table* is a pandas frame with a column for each factor, float64 or a category of
-names in alphabetical order; `correct`, whether the model was right; and `unit`, of what
-draw a row is: rows of one unit are not independent (`runs.tables.Units`).
-``attrs["units"]`` has the unit of each factor, so its keys are the factors.
+A *table* is a pandas frame. A *factor* is a parameter of the scene; its column is
+float64, or a category of names in alphabetical order. Column `correct` says whether the
+model was right. Column `unit` is the index of a group of rows that are not independent,
+such as the frames of a drive (`runs.tables.Units`). ``attrs["units"]`` is something
+else: the unit of measurement of each factor. Its keys are the factors.
 """
 
 from __future__ import annotations
@@ -42,37 +45,43 @@ from advsearch.statistics.clustered import (
     sum_per_unit,
 )
 
-MIN_ROWS = 100  # rows of which one half can choose and the other can count
+# smallest number of rows that can be divided into a half to choose rules and a half to
+# test them
+MIN_ROWS = 100
 MAX_RULES = 5
 MAX_CONDITIONS = 3  # of a rule
 N_TREES = 24
-MIN_COVERED_SHARE = 0.01
+MIN_COVERED_FRACTION = 0.01
 MIN_COVERED_ROWS = 12
 MIN_COVERED_UNITS = 3
-"""Of the rows that choose, a rule covers at least so many, and as many as so many units
-have.
+"""A rule has to cover this fraction and this number of the rows on which it is chosen,
+and as many rows as this number of units have on average (`find_min_rows`).
 """
 RETAINED_ACCURACY = 0.97
-"""Share of its weighted relative accuracy that a rule retains when a condition is left
-out.
+"""A condition is removed from a rule if the rule retains this fraction of its weighted
+relative accuracy.
 """
 N_ADJUSTMENTS = 3  # how often all bounds of a rule are adjusted
-N_BOUNDS = 250  # to how many quantiles of their factor
+N_BOUNDS = 250  # number of quantiles of a factor that are tried as a bound
 SIGNIFICANCE = 0.01
-"""Probability that any rule is accepted that is none. Rules are tested one after the
-other, each only where all before it were accepted, so that each may be tested at all of
-it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995).
+"""Largest probability that any rule is accepted by chance. Rules are tested in order,
+each only if all before it were accepted. So each may be tested at the full level (a
+fixed sequence: Maurer, Hothorn and Lehmacher 1995).
 """
-MAX_NEEDED = 1_000_000  # rows up to which it is said how many a rule would take
-MIN_GAP = 0.1  # by how much more often the model is wrong under a rule than elsewhere
+# Largest number of rows for which it is computed whether a rule would be accepted.
+MAX_NEEDED = 1_000_000
+# The rate of right predictions has to be lower by this much under a rule than
+# elsewhere.
+MIN_GAP = 0.1
 MIN_ANGLE_RANGE = 270.0
-"""Degrees that the values of an angle span where it goes all the way round: a grid of
-four values does.
+"""If the values of an angle span at least this many degrees, they cover a full turn. A
+grid of four values does.
 """
 ARCS = ((360.0, 180.0), (180.0, 0.0), (180.0, 90.0))
-"""Of an angle that goes all the way round, trees have it once more by turn and zero,
-degrees: an arc through 0 is one interval there, and so is what lies end-on, at 0 and at
-180.
+"""(turn, zero) of the further columns of an angle that covers a full turn, in degrees.
+In such a column the angle is measured from `zero`, modulo `turn`. With a zero of 180 an
+arc through 0 degrees is one interval. With a turn of 180 opposite directions, such as
+the front and the back at 0 and 180 degrees, are the same value.
 """
 
 Mask = npt.NDArray[np.bool_]
@@ -109,16 +118,19 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
             columns[name] = column
             units[name] = "" if has_names else rows.attrs["units"][name]
     if "outcome" in rows:
+        # a factor may have this name, and stays
         columns.setdefault("outcome", rows["outcome"])
+    # In `rows.attrs` units are those of measurement; column "unit" is the group of
+    # rows.
     table = pd.DataFrame(
         {**columns, "correct": rows["correct"] == 1, "unit": rows["unit"]}
     )
-    table.attrs["units"] = units  # of measurement, by factor
+    table.attrs["units"] = units
     return table
 
 
 def is_in_view(rows: pd.DataFrame) -> Mask:
-    """Return in which rows of a sweep (n,) the judged object is in the image."""
+    """Return in which rows of a sweep (n,) the evaluated object is in the image."""
     return np.asarray(rows["label"] != OUT_OF_VIEW)
 
 
@@ -139,15 +151,16 @@ def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
 
 
 def estimate_interval(table: pd.DataFrame) -> tuple[float, float]:
-    """Return the 95 % interval of `estimate_rate`; 0 to 1 where there is no row."""
+    """Return the 95 % interval of `estimate_rate`; 0 to 1 without rows."""
     if table.empty:
         return 0.0, 1.0
     return rate_interval(*count_per_unit(table))
 
 
 def estimate_rate(table: pd.DataFrame) -> float:
-    """Return the mean over units of the share of right predictions of each; NaN where
-    there is no row.
+    """Return the rate of right predictions: the mean over units of each unit's rate.
+
+    It is NaN without rows.
     """
     return mean_rate(*count_per_unit(table))
 
@@ -237,16 +250,18 @@ def split_in_halves(
 
 @dataclass(frozen=True)
 class RuleCondition:
-    """A part of the values of one factor: over `low` and at most `high`, or some of its
-    names.
+    """A condition on the value of one factor.
+
+    A number has to be over `low` and at most `high`; a name has to be one of `options`.
 
     Attributes:
-        factor: its name.
-        unit: unit of the factor.
-        low, high: bounds of numbers.
-        options: names; None for numbers.
-        turn: 360 or 180 degrees after which values of an angle repeat; then, where
-            `low` is over `high`, the part goes through 0. Else 0.
+        factor: name of the factor.
+        unit: unit of measurement of the factor.
+        low, high: bounds of numbers; infinite without a bound.
+        options: names that fulfil the condition; None for numbers.
+        turn: for an angle, the degrees after which it repeats, 360 or 180: the bounds
+            are those of the angle modulo `turn`. If `low` is over `high`, the range
+            goes through 0. Otherwise 0.
     """
 
     factor: str
@@ -299,7 +314,7 @@ class RuleCondition:
             over=self.low if np.isfinite(self.low) else None,
             at_most=self.high if np.isfinite(self.high) else None,
             options=sorted(self.options or ()),
-            turn=self.turn or None,
+            turn=self.turn or None,  # 0 means that it is no angle
             text=f"{self.factor} {self._values_text}",
         )
 
@@ -308,27 +323,29 @@ class RuleCondition:
         """The values that fulfil the condition, as text: names, arcs of a turn, or bounds."""
         if self.options:
             return " or ".join(sorted(self.options))
-        bounds = []
-        if self.turn:
+        is_angle = self.turn > 0.0
+        if is_angle:
             arcs = [
                 f"from {start % 360:g} to {end % 360:g}" for start, end in self.arcs
             ]
-            bounds.append(" or ".join(arcs))
+            values_text = " or ".join(arcs)
         else:
+            bounds = []
             if np.isfinite(self.low):
                 bounds.append(f"over {self.low:g}")
             if np.isfinite(self.high):
                 bounds.append(f"at most {self.high:g}")
-        has_unit = self.unit not in ("", "1")  # "1" is that of a plain number
-        return " and ".join(bounds) + (f" {self.unit}" if has_unit else "")
+            values_text = " and ".join(bounds)
+        has_unit = self.unit not in ("", "1")  # "1" means a number without a unit
+        return f"{values_text} {self.unit}" if has_unit else values_text
 
 
-# all of which hold, at most one for each factor
+# The conditions of a rule, at most one for each factor. All of them have to hold.
 RuleConditions = tuple[RuleCondition, ...]
 
 
 def find_covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
-    """Return which rows (n,) lie under all conditions."""
+    """Return which rows (n,) fulfil all conditions."""
     mask = np.ones(len(table), dtype=bool)
     for condition in conditions:
         mask &= condition.holds(table)
@@ -337,8 +354,14 @@ def find_covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class CountedRule:
-    """A rule, and the rows inside it and elsewhere, of those that did not choose it and
-    lie under no rule before.
+    """A rule, and the rows on which it is tested.
+
+    The rule was not chosen on these rows, and no earlier rule covers them.
+
+    Attributes:
+        conditions: conditions of the rule.
+        inside: table of the rows that the rule covers.
+        elsewhere: table of the other rows.
     """
 
     conditions: RuleConditions
@@ -347,8 +370,10 @@ class CountedRule:
 
     @property
     def gap(self) -> float:
-        """How much higher the rate of right predictions is elsewhere than under the
-        rule; all units weigh the same. 0 without rows in either.
+        """Rate of right predictions elsewhere minus that under the rule.
+
+        In both rates all units, which are groups of dependent rows, have equal weights
+        (`estimate_rate`). The gap is 0 if there are no rows on one side.
         """
         if self.inside.empty or self.elsewhere.empty:
             return 0.0
@@ -356,14 +381,17 @@ class CountedRule:
 
     @cached_property
     def p_value(self) -> float:
-        """The probability of so few right predictions under it, or fewer, if they were
-        spread by chance.
+        """Probability of at most as many right predictions under the rule, if chance
+        decided which predictions are right.
         """
-        return self._compute_p_value(1.0)
+        return self._compute_p_value(factor=1.0)
 
     @property
     def holds(self) -> bool:
-        """Whether rows that did not choose it show it, and more than chance would."""
+        """Whether the rows on which it is tested confirm the rule.
+
+        The gap has to be large enough, and not explained by chance.
+        """
         return self.gap >= MIN_GAP and self.p_value <= SIGNIFICANCE
 
     def find_needed_factor(self) -> float | None:
@@ -387,8 +415,8 @@ class CountedRule:
         """Return the p-value of the rule for a larger number of rows.
 
         Args:
-            factor: how many times as many rows there would be, with the same rates of
-                right rows; 1 for the present ones.
+            factor: factor of the number of rows, with the same rates of right rows; 1
+                for the rows of the rule.
         """
         units = np.concatenate([self.inside["unit"], self.elsewhere["unit"]])
         is_right = np.concatenate([self.inside["correct"], self.elsewhere["correct"]])
@@ -404,11 +432,12 @@ class CountedRule:
 
 @dataclass(frozen=True)
 class FoundRules:
-    """Rules, and the best one that is none.
+    """The result of a search for rules.
 
     Attributes:
-        accepted: the rules that hold, the weightiest first.
-        best_rejected: the best one after these, if there is one to test.
+        accepted: rules that hold, in the order in which they were chosen, the best
+            first.
+        best_rejected: the next candidate, which does not hold; None if there was none.
     """
 
     accepted: list[CountedRule]
@@ -476,34 +505,41 @@ def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
 def find_min_rows(table: pd.DataFrame) -> int:
     """Return how many rows a rule has to cover at least.
 
-    Rows of one unit are not independent: if units have several rows, it is also at
-    least as many rows as `MIN_COVERED_UNITS` units have on average.
+    There are up to three lower limits: a number of rows, a fraction of the table, and,
+    if units have several rows, the average number of rows of `MIN_COVERED_UNITS` units.
+    The last is because the rows of a unit are not independent.
     """
-    min_rows = max(MIN_COVERED_ROWS, round(MIN_COVERED_SHARE * len(table)))
+    min_rows = max(MIN_COVERED_ROWS, round(MIN_COVERED_FRACTION * len(table)))
     if table["unit"].is_unique:
         return min_rows
-    rows_of_units: float = MIN_COVERED_UNITS * len(table) / table["unit"].nunique()
+    n_units = table["unit"].nunique()
+    rows_of_units: float = MIN_COVERED_UNITS * len(table) / n_units
     return max(min_rows, round(rows_of_units))
 
 
 class ConditionScorer:
-    """Scores conditions by their weighted relative accuracy in a table: of the model's
-    being wrong.
+    """Scores conditions by their weighted relative accuracy: how well they select the
+    rows of a table in which the model is wrong.
     """
 
     def __init__(self, table: pd.DataFrame, min_rows: int) -> None:
         self.table = table
         self._min_rows = min_rows
         is_wrong = ~table["correct"].to_numpy()
+        # (n,) whether a row is wrong, 1 or 0, minus the rate of wrong rows in the table
         self._excess = is_wrong - is_wrong.mean()
 
     def score(self, conditions: RuleConditions) -> float:
-        """Return the score: the fraction of rows that lie under the conditions, times by
-        how much more of them are wrong than of all; -1 if they are too few.
+        """Return the weighted relative accuracy of conditions; -1 for too few rows.
+
+        It is a product: the fraction of rows that the conditions cover, times the rate
+        of wrong rows among these minus that in the table.
         """
         is_covered = find_covered(conditions, self.table)
         if int(is_covered.sum()) < self._min_rows:
             return -1.0
+        # The product is equal to the sum of the excess over the covered rows, divided
+        # by the number of all rows.
         return float(self._excess[is_covered].sum()) / len(self.table)
 
 
@@ -512,12 +548,13 @@ def shorten_conditions(
 ) -> RuleConditions:
     """Remove conditions that add little to the score, one at a time.
 
-    In each step the condition is removed whose removal costs least. The steps end when
-    the loss exceeds a fraction of the score and its own standard error.
+    In each step the condition is removed whose removal costs least. The loss is that
+    from the score of all conditions. The steps end when it exceeds both a fraction of
+    this score and the standard error of the loss.
     """
     table = scorer.table
-    score = scorer.score(conditions)
-    variance = float(table["correct"].to_numpy().var())
+    full_score = scorer.score(conditions)
+    variance = float(table["correct"].to_numpy().var())  # of a single row
     while len(conditions) > 1:
         candidates = [
             conditions[:index] + conditions[index + 1 :]
@@ -526,11 +563,12 @@ def shorten_conditions(
         shorter = max(candidates, key=scorer.score)
         is_added = find_covered(shorter, table) & ~find_covered(conditions, table)
         n_added = int(is_added.sum())
-        # A loss below its standard error may be chance. It depends on the rows that the
-        # shorter conditions cover in addition.
+        # A loss below its standard error may be chance. Every row that is covered in
+        # addition changes the score by its excess / len(table); these are summed.
         standard_error = math.sqrt(n_added * variance) / len(table)
-        loss = score - scorer.score(shorter)
-        if loss > max((1.0 - RETAINED_ACCURACY) * score, standard_error):
+        loss = full_score - scorer.score(shorter)
+        tolerated_loss = (1.0 - RETAINED_ACCURACY) * full_score
+        if loss > max(tolerated_loss, standard_error):
             break
         conditions = shorter
     return conditions
@@ -559,11 +597,10 @@ def adjust_bounds(
 def list_adjusted(
     condition: RuleCondition, table: pd.DataFrame
 ) -> Iterator[RuleCondition]:
-    """Yield copies of a condition with one bound moved to a quantile of its factor.
+    """Yield copies of a condition, each with one bound changed to a quantile.
 
-    A tree chooses each bound for the bounds that it chose before. After these were
-    adjusted, another bound may be better. A condition on names has no bounds, and
-    nothing is yielded for it.
+    They are quantiles of the factor in the table. A condition on names has no bounds,
+    and nothing is yielded for it.
 
     Args:
         condition: condition on a factor.
@@ -573,10 +610,10 @@ def list_adjusted(
         return
     values = table[condition.factor].to_numpy()
     if condition.turn:
-        values = values % condition.turn
+        values = values % condition.turn  # bounds of an angle are modulo its turn
     # without the smallest and the largest value, which bound nothing
     quantiles = np.quantile(values, np.linspace(0, 1, N_BOUNDS + 1)[1:-1])
-    # a bound that is infinite stays so
+    # an infinite bound is not changed
     has_low = condition.low > -np.inf
     has_high = condition.high < np.inf
     is_angle = bool(condition.turn)  # its low bound may be over the high one
@@ -593,12 +630,14 @@ def list_adjusted(
 
 
 class TreeColumn(NamedTuple):
-    """What a column of the trees' data is of.
+    """A column of the data that trees are fitted to.
 
     Attributes:
-        full_condition: full condition of the factor, without bounds.
-        name: name that the column is 1 of; None for numbers.
-        zero: zero of an angle, degrees.
+        full_condition: condition on the column's factor that all rows fulfil: without
+            bounds, or with all names. For an angle it has the column's `turn`.
+        name: for a factor of names, the name whose rows have a 1 in the column; None
+            for numbers.
+        zero: for an angle, the degrees from which the column measures it.
     """
 
     full_condition: RuleCondition
@@ -606,8 +645,11 @@ class TreeColumn(NamedTuple):
     zero: float = 0.0
 
     def read_values(self, table: pd.DataFrame) -> FloatArray:
-        """Return the values (n,) of the column: for a name, 1 in rows that have it and
-        0 in others; for numbers these, for an angle measured from `zero`.
+        """Return the values (n,) of the column.
+
+        - For a name: 1 in rows that have it and 0 in others.
+        - For an angle with a turn: the angle measured from `zero`, modulo the turn.
+        - For other numbers: the values of the factor.
         """
         column = table[self.full_condition.factor]
         if self.name is not None:
@@ -620,19 +662,22 @@ class TreeColumn(NamedTuple):
     def to_factor(self, condition: RuleCondition) -> RuleCondition:
         """Convert a condition on the column to a condition on its factor.
 
-        A column of an angle measures it from `zero`, such as 90 degrees, so that the
+        A column of an angle measures it from `zero`, such as 180 degrees, so that the
         bounds of an arc through 0 degrees are ordered there. The bounds of the result
-        are measured from 0 degrees.
+        are measured from 0 degrees. For an arc through 0 the lower one is larger than
+        the upper one, which `RuleCondition.holds` allows.
         """
         turn = self.full_condition.turn
         if not turn:
             return condition
+        # An infinite bound is that of the full turn.
         low = max(condition.low, 0.0) + self.zero
         high = min(condition.high, turn) + self.zero
+        start = low % turn
         end = high % turn
         if end == 0.0:  # the arc ends at the full turn, which modulo makes 0
             end = turn
-        return replace(condition, low=low % turn, high=end)
+        return replace(condition, low=start, high=end)
 
 
 def find_candidates(
@@ -650,31 +695,36 @@ def find_candidates(
     """
     # the root has no conditions, and is left out
     yielded_conditions: set[RuleConditions] = {()}
+    factors = list(table.attrs["units"])
     for tree, columns in grow_trees(table, min_rows, seed):
-        for node in walk_tree(tree, columns):
-            for conditions in _list_rules_of_node(node, table.attrs["units"]):
+        for condition_of_column in walk_tree(tree, columns):
+            # several, if the path has conditions on several columns of an angle
+            for conditions in _list_rules_of_node(condition_of_column, factors):
                 if conditions not in yielded_conditions:
                     yielded_conditions.add(conditions)
                     yield conditions
 
 
 def _list_rules_of_node(
-    node: Mapping[TreeColumn, RuleCondition], factors: Iterable[str]
+    condition_of_column: Mapping[TreeColumn, RuleCondition], factors: Iterable[str]
 ) -> Iterator[RuleConditions]:
     """Yield the conditions that lead to a node, with at most one for each factor.
 
-    A path may have conditions on several columns of the same angle. A rule can have
-    only one of them, so each is tried; its bounds are adjusted later.
+    A path may have conditions on several columns of the same angle, but a rule can only
+    have one of them. So a rule is yielded for each combination that takes one condition
+    of every factor. Bounds are adjusted later.
 
     Args:
-        node: conditions on the path to the node, by column.
+        condition_of_column: conditions on the path to the node, by column of the tree's
+            data.
         factors: names of all factors; they determine the order of the conditions.
     """
     conditions_of_factor: dict[str, list[RuleCondition]] = {
         name: [] for name in factors
     }
-    for column, condition in node.items():
+    for column, condition in condition_of_column.items():
         conditions_of_factor[condition.factor].append(column.to_factor(condition))
+    # factors without a condition are left out
     yield from product(*filter(None, conditions_of_factor.values()))
 
 
@@ -728,6 +778,7 @@ def grow_trees(
     shape = {"max_depth": MAX_CONDITIONS, "min_samples_leaf": min_rows}
     random_state = seed % 2**32  # scikit-learn takes 32 bits
     single_tree = make_tree(**shape, random_state=random_state).fit(data, is_right)
+    # each split of the forest may use a random 60 % of the columns
     forest = make_forest(
         N_TREES, **shape, max_features=0.6, random_state=random_state
     ).fit(data, is_right)
@@ -735,8 +786,9 @@ def grow_trees(
         (estimator.tree_, columns) for estimator in (single_tree, *forest.estimators_)
     ]
     for index, column in enumerate(columns):
-        if column.full_condition.turn:
-            # alone, since in a tree of all columns other splits of the angle come first
+        is_shifted_angle = column.full_condition.turn > 0.0
+        if is_shifted_angle:
+            # A tree of all columns would first split another column of the same angle.
             tree = make_tree(**shape).fit(data[:, [index]], is_right).tree_
             trees.append((tree, [column]))
     return trees
@@ -747,8 +799,10 @@ def walk_tree(
 ) -> Iterator[dict[TreeColumn, RuleCondition]]:
     """Yield the conditions on the path to each node of a tree, by column.
 
-    A factor of names has a column for each name, but a single condition, which lists
-    the names that remain. It is stored under the column with the name None.
+    A node splits the rows by a threshold of one column. A condition on numbers has
+    bounds, and each split tightens one of them. A factor of names has a column for each
+    name, but one condition, with the set of remaining names; each split removes names
+    from it. So the columns of such a factor share a key: the column without its `name`.
 
     Args:
         tree: `tree_` of scikit-learn, which has arrays with the split of each node.
@@ -766,12 +820,13 @@ def walk_tree(
         column = columns[tree.feature[node]]
         key = column._replace(name=None)  # shared by all names of the factor
         condition = conditions.get(key, column.full_condition)
+        # Numbers have neither a name nor options, and factors of names have both.
         if column.name is None or condition.options is None:
             threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported
             below = replace(condition, high=min(condition.high, threshold))
             above = replace(condition, low=max(condition.low, threshold))
         else:
-            # a row with the name has 1 in the column, and is above; others have 0
+            # Rows with the name have a 1 in the column and are above the threshold.
             below = replace(condition, options=condition.options - {column.name})
             above = replace(condition, options=condition.options & {column.name})
         open_nodes.append((left, {**conditions, key: below}))

@@ -1,8 +1,11 @@
-"""What a search may end with: the few best configurations, rendered again with seeds it
-has not used, as the largest of many noisy values is mostly a lucky one (the winner's
-curse); many different failures; and the smallest change, a bracket of scales of all
-budgets: at its upper end a configuration passed the trials, at its lower end a search
-found nothing.
+"""The possible results of a search.
+
+- The best configurations (`Candidate`). They are rendered again with new seeds, because
+  the largest of many noisy values is mostly a lucky one (the winner's curse).
+- Many different failures (`Failures`), and how frequent failures are (`FailureRate`).
+- The smallest change that makes the model fail (`Bracket`), as a scale of all budgets.
+  At the upper bound of the bracket a configuration passed the trials, at its lower
+  bound a search found nothing.
 """
 
 from __future__ import annotations
@@ -30,11 +33,12 @@ class Candidate:
 
     Attributes:
         u: (d,) the configuration.
-        objective: objective of the render that admitted it, biased upwards.
-        success: whether the model was wrong in that render.
-        repeat_objectives: objectives of its renders since then; -inf for one that is
-            not finite.
-        successes: in how many of these the model was wrong.
+        objective: objective of its first render. It is biased upwards, because the
+            candidate was selected for this value.
+        success: whether the model was wrong in the first render.
+        repeat_objectives: objectives of its later renders; -inf for one that is not
+            finite.
+        successes: number of later renders in which the model was wrong.
     """
 
     u: Tensor
@@ -45,19 +49,22 @@ class Candidate:
 
     @property
     def mean_objective(self) -> float:
-        """Mean objective of the new renders; the raw one if there are none."""
+        """Mean objective of the later renders; without any, that of the first."""
         if not self.repeat_objectives:
             return self.objective
         return math.fsum(self.repeat_objectives) / len(self.repeat_objectives)
 
     @property
     def success_rate(self) -> float:
-        """Fraction of the new renders that are a success; of the raw one if there are
-        none.
+        """Fraction of the later renders in which the model was wrong.
+
+        Without later renders, it is 1 or 0: whether the first one was a success.
         """
         if not self.repeat_objectives:
             return float(self.success)
-        return self.successes / len(self.repeat_objectives)
+        # each later render has an entry in `repeat_objectives`, a success or not
+        n_later_renders = len(self.repeat_objectives)
+        return self.successes / n_later_renders
 
     def with_repeat(self, objective: float, success: bool) -> Candidate:
         return replace(
@@ -72,18 +79,20 @@ def add_candidate(
 ) -> tuple[Candidate, ...]:
     """Return the best `size` distinct candidates of the pool and `new`, best first.
 
-    A success is better than none; then the larger objective is better. Of two that are
-    nearly the same configuration (`SAME`) only the better is stored. If exactly the
-    same configuration is in the pool, `new` counts as a repeated render of it: it was
-    not selected for its value, so it is unbiased.
+    A success is better than none; then the larger objective is better. Both are those
+    of a candidate's first render. Of two that are nearly the same configuration
+    (`SAME`) only the better is stored. If exactly the same configuration is in the
+    pool, `new` counts as a later render of it. The value of a later render is unbiased,
+    because the configuration was not selected for it.
 
     Args:
-        pool: candidates so far, best first.
+        pool: candidates so far, best first, of which no two are nearly the same.
         new: candidate to add.
         size: largest number of candidates.
     """
     for old in pool:
         if torch.equal(old.u, new.u):
+            # The order stays, as it only depends on the first render.
             updated = old.with_repeat(new.objective, new.success)
             return tuple(
                 updated if candidate is old else candidate for candidate in pool
@@ -112,7 +121,8 @@ def replace_worst(
     Args:
         pool: candidates, best first.
         last: the last configuration that was evaluated, or None.
-        size: largest number of candidates; the worst makes room if there are so many.
+        size: largest number of candidates. If the pool has as many, its worst is left
+            out.
     """
     if last is None or any(torch.equal(candidate.u, last.u) for candidate in pool):
         return pool
@@ -133,7 +143,7 @@ def select_contenders(
         n_shared: number of the latest renders for which all candidates had the same
             seeds, so that they can be compared seed by seed.
     """
-    # one render says nothing of the noise, and one candidate has no rival
+    # One render does not show the noise, and one candidate has no rival.
     if n_shared < 2 or len(pool) < 2:
         return pool
     leader = select_best(pool)
@@ -180,14 +190,15 @@ def _is_clearly_worse(candidate: Candidate, leader: Candidate, n_shared: int) ->
 def select_best(pool: tuple[Candidate, ...]) -> Candidate:
     """Return the best candidate: by success rate, then by mean objective.
 
-    Only renders after the one that admitted a candidate count, as that one is biased.
-    If a candidate has none, the first of the pool is returned: the pool is sorted by
-    the renders that admitted them.
+    Both are computed from later renders only, because a candidate was selected for the
+    value of its first one. If a candidate has no later render, the candidates are
+    compared by their first renders instead.
 
     Args:
-        pool: at least one candidate.
+        pool: at least one candidate, sorted by first renders, the best first.
     """
-    if all(candidate.repeat_objectives for candidate in pool):
+    have_later_renders = all(candidate.repeat_objectives for candidate in pool)
+    if have_later_renders:
         return max(
             pool,
             key=lambda candidate: (candidate.success_rate, candidate.mean_objective),
@@ -196,10 +207,11 @@ def select_best(pool: tuple[Candidate, ...]) -> Candidate:
 
 
 def _sort_key(candidate: Candidate) -> tuple[bool, float]:
+    """Return the key by which a pool is sorted, from a candidate's first render."""
     return candidate.success, candidate.objective
 
 
-# with fewer effective failures than this no estimate is stated
+# No estimate is made from fewer effective failures than this.
 MIN_EFFECTIVE_FAILURES = 10.0
 # number of sizes of a bet, 1, 1/2, 1/4, ...; the capital is divided equally among them
 N_BETS = 8
@@ -234,18 +246,20 @@ def estimate_failure_rate(
     Sample t comes from a density q_t that may depend on all samples before it. Its
     weight is w_t = 1 / q_t, relative to the uniform density. Let x_t be w_t if the
     sample failed, otherwise 0. Given the samples before, the mean of x_t is the rate p.
+    Let b_t be an upper bound of the weights that q_t can give.
 
     The interval is by betting (Waudby-Smith and Ramdas 2024, "Estimating means of
-    bounded random variables by betting"). A gambler bets that the rate is over p, or
-    that it is under p, with the fraction c of the capital. The capital starts at 1 and
-    becomes
+    bounded random variables by betting"). For each p in [0, 1], one gambler bets that
+    the rate is over p, another one that it is under p. Both bet the fraction c of their
+    capital on each sample. The capital starts at 1. After all samples it is
 
-        prod_t (1 - c + c x_t / p)
-        prod_t (1 + c (p - x_t) / (b_t - p)),  b_t the largest weight that q_t gives.
+        prod_t (1 - c + c x_t / p)               for the bet that the rate is over p;
+        prod_t (1 + c (p - x_t) / (b_t - p))     for the bet that it is under p.
 
-    If the rate is p, both bets are fair, and the mean over several c exceeds 2 / 0.05
-    with a probability of at most 0.025 (Ville 1939). So the p at which neither exceeds
-    it are a 95 % interval. Both products are monotone in p.
+    If the rate is p, both bets are fair. Then the mean of the capital over several c
+    exceeds 2 / 0.05 with a probability of at most 0.025 (Ville 1939). So the values of
+    p at which neither bet exceeds this limit are a 95 % interval. The first capital
+    falls with p and the second grows, so the interval has one lower and one upper end.
 
     Args:
         weights: (n,) w_t, over 0; n is at least 1.
@@ -256,35 +270,43 @@ def estimate_failure_rate(
     """
     weights = weights.double()
     bounds = bounds.double()
-    # x_t if no unknown sample failed, and if all of them did
-    lower_x = weights * (failed & ~unknown)
-    upper_x = weights * (failed | unknown)
+    # The lower bound of the rate assumes that no unknown sample failed, the upper bound
+    # that all of them did. Each has its own x_t.
+    x_if_unknown_pass = weights * (failed & ~unknown)
+    x_if_unknown_fail = weights * (failed | unknown)
     # c of the formulas: 1, 1/2, 1/4, ...; (bets, 1)
     bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
-    # The sum over bets below is `N_BETS` times the capital, which is their mean.
+    # The mean capital is compared with 2 / 0.05. Below, `logsumexp` gives the logarithm
+    # of the sum over all bets, which is `N_BETS` times the mean.
     log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
 
     def is_too_low(p: float) -> bool:
-        """Return whether the bets that the rate is over p have won (first product)."""
-        log_factors = torch.log(1.0 - bet_sizes + bet_sizes * lower_x / p)  # (bets, n)
-        return float(log_factors.sum(dim=1).logsumexp(dim=0)) >= log_limit
+        """Return whether the bets that the rate is over p have won."""
+        factors = 1.0 - bet_sizes + bet_sizes * x_if_unknown_pass / p  # (bets, n)
+        log_capital = torch.log(factors).sum(dim=1)
+        return float(log_capital.logsumexp(dim=0)) >= log_limit
 
     def is_too_high(p: float) -> bool:
-        """Return whether the bets that the rate is under p have won (second one)."""
-        log_factors = torch.log1p(bet_sizes * (p - upper_x) / (bounds - p))
-        return float(log_factors.sum(dim=1).logsumexp(dim=0)) >= log_limit
+        """Return whether the bets that the rate is under p have won."""
+        gains = bet_sizes * (p - x_if_unknown_fail) / (bounds - p)  # (bets, n)
+        log_capital = torch.log1p(gains).sum(dim=1)
+        return float(log_capital.logsumexp(dim=0)) >= log_limit
 
-    total = float(lower_x.sum())
+    n_samples = len(weights)
+    total = float(x_if_unknown_pass.sum())
     # number of equally weighted failures that are worth as much (Kish 1965)
-    effective = total**2 / float(lower_x.square().sum()) if total else 0.0
+    effective = 0.0
+    if total:
+        effective = total**2 / float(x_if_unknown_pass.square().sum())
     estimate = None
     if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
-        # the mean of weighted samples may exceed 1 by chance, a rate can't
-        estimate = min(1.0, total / len(lower_x))
-    # `find_threshold` returns where a condition on p in [0, 1] begins to hold.
+        # The mean of x_t may exceed 1 by chance, as weights do; a rate can't.
+        estimate = min(1.0, total / n_samples)
+    # `find_threshold` returns where a condition on p begins to hold. It tries only p
+    # between 0 and 1, exclusive, so that neither p nor `bounds - p` is 0.
     lower = find_threshold(lambda p: not is_too_low(p))
     upper = find_threshold(is_too_high)
-    return FailureRate(estimate, (lower, upper), effective, draws=len(lower_x))
+    return FailureRate(estimate, (lower, upper), effective, draws=n_samples)
 
 
 MAX_FAILURES = 24  # maximum number of failures in a result
@@ -292,12 +314,13 @@ MAX_FAILURES = 24  # maximum number of failures in a result
 
 @dataclass(frozen=True, eq=False)
 class FoundFailure:
-    """A failure that a search claims, and the others that it stands for.
+    """A failure that a search claims, and the similar ones that it represents.
 
     Attributes:
         u: (d,) the configuration.
         objective: objective of its single render, biased upwards.
-        ranges: (low, high) of the failures that it stands for, by index in u.
+        ranges: (low, high) of each parameter over the failures that it represents, by
+            index in u.
     """
 
     u: Tensor
@@ -307,15 +330,18 @@ class FoundFailure:
 
 @dataclass(frozen=True, eq=False)
 class Failures:
-    """What a search knows of different failures.
+    """The different failures that a search has met.
+
+    A policy may divide the domain into cells, which are counted; otherwise samples are.
 
     Attributes:
-        examples: at most `MAX_FAILURES` of them.
+        examples: at most `MAX_FAILURES` failures.
         over: indices in u of the parameters that span the cells.
-        n_failures: number of cells that fail; of samples, if there are no cells.
+        n_failures: number of cells, or samples, with a failure.
         n_visited: number of cells, or samples, that were evaluated.
-        n_cells: number of cells in all; None if there are none.
-        failure_rate: fraction of all configurations that fail, if it can be estimated.
+        n_cells: number of cells of the domain; None without cells.
+        failure_rate: fraction of all configurations that fail; None if it was not
+            estimated.
     """
 
     examples: tuple[FoundFailure, ...]
@@ -368,7 +394,8 @@ def select_diverse(
     return [order[rank] for rank in selected]
 
 
-RATIO = 1.05  # the bracket is closed once high / low is at most this
+# The bracket of the smallest change is closed once high / low is at most this.
+RATIO = 1.05
 SMALLEST_SCALE = 1e-3  # no smaller scale than this is tried
 
 MAX_SEARCHES = 12
@@ -376,8 +403,8 @@ MAX_SEARCHES = 12
 MAX_CONFIRMATIONS = 6  # steps outwards of `confirm_bracket`
 
 LENGTH_RATIO = 1.0 + (RATIO - 1.0) / 5.0
-"""Ratio of the bounds at which the bisection of a configuration's length ends; it
-exceeds 1 by a fifth of what `RATIO` does.
+"""Ratio of the bounds at which the bisection of a configuration's length ends. It is
+1.01, five times closer to 1 than `RATIO`.
 """
 
 MAX_CHECKS = 1 + math.ceil(
@@ -388,16 +415,17 @@ one, and those of the bisection.
 """
 
 Search = Callable[[Domain, int], Tensor]
-"""(domain, round) -> the best configuration a search finds there; seeds depend on the
-round.
+"""(domain, round) -> the best configuration that a search finds in the domain. Its
+seeds depend on the round.
 """
 
 Passes = Callable[[Tensor, int], bool]
-"""(u, check) -> whether a configuration passes the trials; seeds depend on the check.
+"""(u, check) -> whether a configuration passes the trials. Their seeds depend on the
+index of the check.
 """
 
 Guess = Callable[[Tensor], bool]
-"""u -> whether a configuration would probably pass, without trials."""
+"""u -> whether a configuration would probably pass. It is predicted without trials."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -490,8 +518,8 @@ def find_smallest_change(
         passes: runs the trials of a configuration; returns whether it passes.
         domain: domain with the full budgets.
         likely: predicts cheaply whether a configuration would pass. The bisection of
-            step 2 begins where this says, and goes on in growing steps. None to bisect
-            from the full length.
+            step 2 begins at the length that this predicts to be the shortest. None to
+            bisect from the full length.
 
     Returns:
         The bracket. It is not `is_closed` if the searches did not suffice. If nothing
@@ -509,14 +537,17 @@ def find_smallest_change(
         and bracket.high > SMALLEST_SCALE
     ):
         scale = _choose_next_scale(bracket)
+        # The counts so far are the indices of the next search and the next check.
         search_index = bracket.searches
+        check_index = bracket.checks
         u = search(scale_domain(domain, scale), search_index)
-        has_passed = passes(u, bracket.checks)
-        bracket = replace(bracket, searches=search_index + 1, checks=bracket.checks + 1)
+        has_passed = passes(u, check_index)
+        bracket = replace(bracket, searches=search_index + 1, checks=check_index + 1)
         if has_passed:
             bracket = replace(bracket, found_by=search_index)
             bracket = _shorten(bracket, u, scale, passes, domain, likely)
         else:
+            # This search found nothing at `scale`, so nothing smaller is expected.
             bracket = replace(bracket, low=scale)
     return bracket
 
@@ -525,13 +556,16 @@ def _choose_next_scale(bracket: Bracket) -> float:
     """Return the scale of the budgets at which to search next, inside the bracket.
 
     It is the geometric mean of both bounds, or half the upper one if no search has
-    failed yet. If the bounds are close, it is larger: so large that the bracket is
-    closed if this search finds nothing.
+    failed yet. If the bounds are close, it is high / `RATIO` instead. If the search
+    finds nothing there, this becomes the lower bound, and the bracket is closed.
     """
-    if bracket.low == 0.0:
+    has_failed_search = bracket.low > 0.0
+    if not has_failed_search:
         return bracket.high / 2.0
     scale = math.sqrt(bracket.low * bracket.high)
-    if bracket.high <= RATIO**2 * bracket.low:
+    # high / `RATIO` is at or below the mean of the bounds only if they are this close
+    can_close = bracket.high <= RATIO**2 * bracket.low
+    if can_close:
         scale = max(scale, bracket.high / RATIO)
     return scale
 
@@ -542,13 +576,14 @@ def confirm_bracket(
     """Enlarge the change at the bracket's upper bound until it passes reliably.
 
     A configuration exactly at the limit passes its trials by chance. So it is tried
-    with new seeds. If it does not pass, its change is made longer by the square root of
-    `RATIO`, about 2.5 %, and it is tried again. After `MAX_CONFIRMATIONS` attempts the
-    bracket is returned unconfirmed, with a configuration that was made longer once more
-    and not tried.
+    with new seeds. If it does not pass, its change is made 2.5 % longer, which is half
+    of `RATIO` on a logarithmic scale, and it is tried again. After `MAX_CONFIRMATIONS`
+    attempts the bracket is returned unconfirmed, with a configuration that was made
+    longer once more and not tried.
 
     Args:
-        bracket: result of `find_smallest_change`; without a `u` it is returned as is.
+        bracket: result of `find_smallest_change`. If it has no configuration (`u`), it
+            is returned unchanged.
         passes: runs the trials of a configuration; returns whether it passes.
         domain: domain with the full budgets; the scale never exceeds 1.
         times: how many times in a row the configuration has to pass.
@@ -559,7 +594,8 @@ def confirm_bracket(
     shortest_scale = bracket.high
     growth = 1.0  # factor of the change since the shortest that passed
     for _ in range(MAX_CONFIRMATIONS):
-        # The seeds of a check's trials follow from its index, so all indices are new.
+        # The seeds of a check's trials follow from its index. Every attempt takes
+        # `times` new indices, even if it ends at the first failure.
         check_indices = range(bracket.checks, bracket.checks + times)
         if all(passes(bracket.u, check_index) for check_index in check_indices):
             return replace(bracket, checks=bracket.checks + times, confirmed=True)
@@ -581,18 +617,23 @@ def _shorten(
 ) -> Bracket:
     """Move a configuration towards the start as far as it still passes its trials.
 
-    Lengths are scales of the budgets. They are bisected in their logarithm until the
-    bounds are within `LENGTH_RATIO` of each other. With `likely`, the first length is
-    about the shortest that it predicts to pass; from there the steps grow, squared each
-    time, but never beyond the geometric mean of the bounds.
+    A length is the scale of the budgets that a configuration needs. The logarithm of
+    the length is bisected until the bounds are within `LENGTH_RATIO` of each other.
+
+    With `likely`, the first trial is at the shortest length that is predicted to pass.
+    The prediction is nearly right, so the next trial is only a factor of `LENGTH_RATIO`
+    away. The factor is squared after each trial, until a step of bisection (to the
+    geometric mean of the bounds) is shorter.
 
     Args:
-        bracket: bracket so far; its lower bound is that of the length.
+        bracket: bracket so far. No length below its lower bound is tried, because a
+            search found nothing there.
         u: (d,) a configuration that passes.
-        length: scale of the budgets that u needs.
+        length: length of u.
         passes: runs the trials of a configuration; returns whether it passes.
         domain: domain with the full budgets.
-        likely: predicts cheaply whether a configuration passes, or None.
+        likely: predicts cheaply whether a configuration passes; None to bisect from the
+            first trial on.
 
     Returns:
         The bracket with the shortest configuration that passed at its upper bound.
@@ -606,24 +647,24 @@ def _shorten(
         # u has the scale `length`, so that its change is multiplied by this ratio
         return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
-    # The next length is the geometric mean of the bounds, but differs from the bound
-    # that was set last by at most the factor `max_step`. With a guess the factor is
-    # small at first, and squared after each trial.
-    max_step = math.inf
-    trial_length = math.sqrt(high * low)
-    if likely is not None:
-        max_step = LENGTH_RATIO
+    if likely is None:
+        max_step_factor = math.inf  # plain bisection; its square is infinite, too
+        trial_length = math.sqrt(high * low)
+    else:
+        max_step_factor = LENGTH_RATIO
         trial_length = _guess_shortest(likely, shrink_to, low, high)
     while high > LENGTH_RATIO * low:
         shorter_u = shrink_to(trial_length)
         if passes(shorter_u, checks):
             shortest_u = shorter_u
             high = trial_length
-            trial_length = max(math.sqrt(high * low), high / max_step)
+            geometric_mean = math.sqrt(high * low)
+            trial_length = max(geometric_mean, high / max_step_factor)
         else:
             low = trial_length
-            trial_length = min(math.sqrt(high * low), low * max_step)
-        max_step = max_step * max_step
+            geometric_mean = math.sqrt(high * low)
+            trial_length = min(geometric_mean, low * max_step_factor)
+        max_step_factor = max_step_factor * max_step_factor
         checks = checks + 1
     return replace(bracket, high=high, u=shortest_u, checks=checks)
 

@@ -1,5 +1,5 @@
-"""Where a search may look: a start, norm budgets around it, and bounds. All in the unit
-box.
+"""The domain of a search: a start, norm budgets around it, and bounds, all in the unit
+box. Also sequences of points by number, for sweeps.
 """
 
 from __future__ import annotations
@@ -22,43 +22,46 @@ Norm = Literal["linf", "l2", "box"]
 NORMS: tuple[str, ...] = get_args(Norm)
 
 TOLERANCE = 2e-6
-"""How far outside its budget float32 rounding may put a configuration, absolute in u
-and relative to the radius; besides `Block.rounding_error`, which adds up in an l2
-norm.
+"""Largest distance outside its budget at which a configuration still counts as inside,
+because it may be rounding of float32. It is absolute in u, and relative to the radius.
+`Block.rounding_error` is allowed in addition, as rounding adds up in an l2 norm.
 """
 
 
 @dataclass(frozen=True)
 class Block:
-    """One contiguous slice of u and how far it may go.
+    """One contiguous slice of u, which holds a parameter, and how far it may go.
+
+    Attributes:
+        size: number of elements, at least 1.
+        norm: "linf" or "l2" for a ball around the start, cut by the bounds; "box" for
+            the bounds alone.
+        epsilon: radius of the ball in units of u, over 0 and finite; None for "box".
+            For "l2" it is the norm of the whole block, not a norm per element, so a
+            sensible value grows with the square root of the size.
+        low: lower bound of each element, at least 0.
+        high: upper bound of each element, over `low` and at most 1.
+        periodic: whether `low` and `high` mean the same value, as for an angle. Then
+            projecting wraps around. Only for "box".
+        name: name of the parameter, e.g. "pose.yaw".
+        options: number of options of a discrete choice; 0 for numbers. An element u
+            means option floor(u * options). A choice has size 1, norm "box" and the
+            bounds [0, 1], and no gradient.
+        reach: length of one unit step in a "box", over 0; None for half the diagonal of
+            the bounds.
 
     Raises:
-        InputError: a value is outside the limits below.
+        InputError: a value is outside these limits.
     """
 
-    size: int  # number of elements, at least 1
-    # "linf" or "l2" for a ball around the start cut by the bounds; "box" for the bounds
-    # alone
+    size: int
     norm: Norm = "box"
     epsilon: float | None = None
-    """Radius of the ball in units of u, over 0 and finite; None for "box". For "l2" it
-    is the norm of the whole block, not a norm per element, so a sensible value grows
-    with the square root of the size.
-    """
     low: float = 0.0
-    high: float = 1.0  # 0 <= low < high <= 1
+    high: float = 1.0
     periodic: bool = False
-    """Whether `high` and `low` are the same place (an angle): projecting wraps around.
-    Only for "box".
-    """
-    name: str = ""  # name of its parameter, e.g. "pose.yaw"
+    name: str = ""
     options: int = 0
-    """Number of options of a discrete choice; 0 for numbers. u means option
-    floor(u * options). A choice has size 1, norm "box" and the bounds [0, 1]; it has no
-    uphill direction.
-    """
-    # length of one unit step in a "box", over 0; None for half the diagonal of the
-    # bounds
     reach: float | None = None
 
     def __post_init__(self) -> None:
@@ -80,7 +83,8 @@ class Block:
         self._check_budget(where)
         has_full_range = self.low == 0.0 and self.high == 1.0 and not self.periodic
         is_plain_number = self.size == 1 and self.norm == "box" and has_full_range
-        if self.options and (self.options < 0 or not is_plain_number):
+        is_choice = self.options != 0  # 0 options mean numbers
+        if is_choice and (self.options < 0 or not is_plain_number):
             raise InputError(
                 f"block{where}: expected a discrete choice to have at least one "
                 f"option, size 1, norm 'box' and bounds [0, 1], got {self}"
@@ -135,46 +139,54 @@ class Block:
 
     @property
     def rounding_error(self) -> float:
-        """How much rounding all elements of u to float32 may add to the l2 norm.
+        """The largest amount that rounding of u to float32 may add to the l2 norm.
 
-        It is half of the last bit of 1 for each element: they may all be rounded the
-        same way, as in a texture of one colour.
+        An element in [0, 1] is rounded by at most half the spacing of float32 at 1. In
+        the worst case all elements are rounded by that much in the same direction, as
+        in a texture of one color. The l2 norm of these errors is sqrt(size) times one.
         """
-        return 0.5 * torch.finfo(torch.float32).eps * math.sqrt(self.size)
+        error_per_element = 0.5 * torch.finfo(torch.float32).eps
+        return error_per_element * math.sqrt(self.size)
 
 
 @dataclass(frozen=True, eq=False)
 class Domain:
-    """The set of configurations a search may propose: the product of its blocks.
+    """The set of configurations that a search may propose: the product of its blocks.
+
+    Attributes:
+        start: (d,) float32, the clean configuration, inside the bounds of every block.
+            It is copied.
+        blocks: consecutive slices of u, whose sizes add up to d.
+        gradient_cost: number of renders that a full gradient costs, besides the render
+            of the configuration itself: 0 for an adjoint, two for each number with
+            central differences.
+        partial_gradients: whether a search can request a "free" gradient: only those
+            elements that cost no render.
+        exact: whether evaluations have no noise, so that equal configurations have
+            equal objectives and gradients. This is so if a matrix predicts the images
+            (docs/transport.md).
+        draws_conditions: whether evaluations have no noise of their own, but each one
+            draws new conditions from a bank (docs/transport.md).
+        restart_point: (d,) where a policy should begin instead of at the start, for
+            policies that begin several times. Norm balls stay around the start.
+        lower: (d,) float32 lower bounds, of the intersection of the block's bounds and
+            its l-infinity ball.
+        upper: (d,) float32 upper bounds of the same.
 
     Raises:
         InputError: sizes do not add up, a cost is under 0, the start is not finite or
             outside the bounds, or `restart_point` lies outside.
     """
 
-    # (d,) float32, the clean configuration, inside every block's bounds; it is copied
     start: Tensor
-    blocks: tuple[Block, ...]  # consecutive slices of u that add up to d
+    blocks: tuple[Block, ...]
     gradient_cost: int = 0
-    """Renders that one full gradient costs besides that of the configuration itself: 0
-    for an adjoint, two for each number with central differences.
-    """
-    # whether `evaluate` understands "free", the part of a gradient that costs nothing
     partial_gradients: bool = False
     exact: bool = False
-    """Whether evaluations are free of noise: equal configurations have equal objectives
-    and gradients, as where a matrix predicts the pictures (docs/transport.md).
-    """
-    # whether evaluations are free of noise, but each draws its conditions anew from a
-    # bank (docs/transport.md)
     draws_conditions: bool = False
     restart_point: Tensor | None = None
-    """(d,) where a policy should begin, if not at the start; norm balls stay around the
-    start. For policies that begin several times.
-    """
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)
-    """(d,) float32 bounds; those of an l-infinity ball are cut into them already."""
 
     def __post_init__(self) -> None:
         """Copy the start, compute the bounds of each element, and check all of them."""
@@ -223,15 +235,11 @@ class Domain:
         start = self.start
         lower = torch.empty_like(start)
         upper = torch.empty_like(start)
-        # the dataclass is frozen
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
         for block, part in self.list_block_slices():
             lower[part] = block.low
             upper[part] = block.high
-            if not bool(
-                ((start[part] >= lower[part]) & (start[part] <= upper[part])).all()
-            ):
+            is_inside = (start[part] >= lower[part]) & (start[part] <= upper[part])
+            if not bool(is_inside.all()):
                 low = float(start[part].min())
                 high = float(start[part].max())
                 raise InputError(
@@ -240,8 +248,12 @@ class Domain:
                     f"[{block.low}, {block.high}], got {low:.6g} to {high:.6g}"
                 )
             if block.norm == "linf" and block.epsilon is not None:
+                # A slice is a view, so this changes `lower` and `upper` in place.
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
+        # the dataclass is frozen
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
 
     @property
     def initial_point(self) -> Tensor:
@@ -255,8 +267,10 @@ class Domain:
 
     @property
     def names(self) -> list[str]:
-        """The name of each element of u: "pose.yaw"; "camera.target.0" of several
-        numbers.
+        """The name of each element of u.
+
+        It is that of the block ("pose.yaw"). If the block has several elements, their
+        index is added ("camera.target.0").
         """
         names = []
         for block in self.blocks:
@@ -327,6 +341,8 @@ class Domain:
         l2 norm. The excess is the norm minus the radius and minus what rounding may add
         to a norm; it is relative to the radius if that is over 1.
         """
+        # It is infinite for an infinite element. `torch.maximum` and `amax` return NaN
+        # if an element is NaN; so does `max` below, if its first argument is NaN.
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
         for block, part in self.list_block_slices():
             if block.norm == "l2" and block.epsilon is not None:
@@ -377,20 +393,27 @@ class Domain:
             generator: source of randomness; it advances.
             extreme: whether a norm ball is sampled at its corners or surface.
         """
-        noise = torch.rand(block.size, generator=generator)
-        if block.options:
-            noise = option_center(noise, block.options)
-        elif extreme and block.norm != "box":
-            noise.round_()  # 0 or 1: a corner, or the signs of a direction
-        if block.norm != "l2" or block.epsilon is None:
-            return torch.lerp(self.lower[part], self.upper[part], noise)
+        uniform = torch.rand(block.size, generator=generator)
+        is_l2_ball = block.norm == "l2" and block.epsilon is not None
+        if not is_l2_ball:
+            # fraction of the way from the lower to the upper bound
+            fraction = uniform
+            if block.options:
+                fraction = option_center(uniform, block.options)
+            elif extreme and block.norm != "box":
+                fraction = uniform.round()  # 0 or 1: a corner
+            return torch.lerp(self.lower[part], self.upper[part], fraction)
+        assert block.epsilon is not None
         if extreme:
-            # far beyond the ball in a direction of random signs, so that the projection
-            # brings it to the surface
+            # A point in a direction of random signs, outside of the ball: it is farther
+            # away than the radius and the diagonal of the unit box. The projection
+            # brings it to the surface.
+            signs = uniform.round() * 2.0 - 1.0
             far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
-            return self.start[part] + (noise * 2.0 - 1.0) * far_distance
+            return self.start[part] + signs * far_distance
+        # one uniform number decides the distance from the center
         return self.start[part] + _sample_ball(
-            block.size, block.epsilon, float(noise[0]), generator
+            block.size, block.epsilon, float(uniform[0]), generator
         )
 
     def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
@@ -457,11 +480,11 @@ def option_center(u: Tensor, options: Tensor | int) -> Tensor:
     return (torch.floor(u * options).clamp_(max=options - 1) + 0.5) / options
 
 
-# elements worked on at once: small enough for a core's cache, and torch uses one thread
-# below it
+# Number of elements that are processed at once. They fit into the cache of a core, and
+# torch uses a single thread for so few.
 CHUNK = 32768
-# a norm at most this fraction over the radius counts as inside, so that projecting
-# twice changes nothing
+# A norm that exceeds the radius by at most this fraction counts as inside, so that
+# projecting twice changes nothing.
 ROUNDING_SLACK = 1e-6
 
 _MAX_ITERATIONS = 100
@@ -605,7 +628,9 @@ class Distribution:
 
 
 def compute_half_widths(domain: Domain) -> Tensor:
-    """Return how far each element of u may change if all of its block change equally.
+    """Return how far each element of u may change if its block changes as a whole.
+
+    All elements of the block change by the same amount, which is:
 
     - "box": half the width of the bounds; if the block has a reach, at most reach /
       sqrt(size);
@@ -618,10 +643,11 @@ def compute_half_widths(domain: Domain) -> Tensor:
     half_widths = (domain.upper - domain.lower) / 2.0
     for block, part in domain.list_block_slices():
         if block.norm == "l2" or block.reach is not None:
-            # (x, x, ..., x) has the norm x sqrt(size)
-            in_ball = block.radius / math.sqrt(block.size)
-            half_widths[part] = min(in_ball, (block.high - block.low) / 2.0)
-    # an epsilon below the resolution of float32 leaves no width
+            # The norm of (x, x, ..., x) is x sqrt(size). The radius is the epsilon of a
+            # ball, or the reach of a box.
+            largest_change = block.radius / math.sqrt(block.size)
+            half_widths[part] = min(largest_change, (block.high - block.low) / 2.0)
+    # With an epsilon below the resolution of float32, the width is 0.
     return half_widths.clamp_(min=torch.finfo(torch.float32).tiny)
 
 
@@ -639,10 +665,10 @@ def find_periodic(domain: Domain) -> Tensor:
 #
 # Draw number n is the same point in whatever order draws are requested:
 #
-# - "sobol": scrambled Sobol points (Owen 1998; Joe and Kuo 2008) in nets of 65,536,
-#   each scrambled by a seed of its own, so that no draw is far from the beginning of
-#   its net;
-# - "random": independent uniform points, in blocks with a seed of their own.
+# - "sobol": scrambled Sobol points (Owen 1998; Joe and Kuo 2008). They are divided into
+#   nets of 65,536 points, each scrambled with its own seed, so that a point is reached
+#   by skipping few others.
+# - "random": independent uniform points, in blocks with their own seeds.
 #
 # A product is never built. Its last axis runs fastest, as the digits of a number do:
 #
@@ -651,12 +677,13 @@ def find_periodic(domain: Domain) -> Tensor:
 Sampler = Literal["sobol", "random"]
 SAMPLERS: tuple[str, ...] = get_args(Sampler)
 
-NET = 1 << 16  # points of one scrambled net
-# numbers of a Sobol point, at most: for so many Joe and Kuo give directions
+POINTS_PER_NET = 1 << 16  # of a scrambled Sobol sequence; a power of two
+# largest number of dimensions of a Sobol point: Joe and Kuo give directions for this
+# many
 MAX_DIMENSIONS = 21201
-# numbers that are drawn at once, at most (unless one point has more)
+# Largest number of values in a block of points, unless a single point has more.
 MAX_BLOCK_VALUES = 1 << 18
-SEEDS = 1024  # seeds that are made at once
+SEEDS_PER_BLOCK = 1024  # number of seeds that are generated at once
 
 Float64Array = NDArray[np.float64]
 
@@ -664,15 +691,17 @@ Float64Array = NDArray[np.float64]
 class SampleSequence:
     """Points of [0, 1)^dimensions by number.
 
-    The latest block of points is cached, and so is the engine of its Sobol net.
+    Points are sampled in blocks. Each block lies in a single Sobol net, because both
+    sizes are powers of two. The latest block is cached, and so is SciPy's generator of
+    its net, which is called the engine there.
 
     Attributes:
-        dimensions: numbers of a point.
-        _rows: points of a block, a power of two.
+        dimensions: number of values of a point.
+        _rows: number of points of a block, a power of two, at most `POINTS_PER_NET`.
         _block: (rows, dimensions) the latest block.
         _block_index: its index; -1 before the first.
-        _engine: generator of the Sobol net with the index `_net`.
-        _n_sampled: points that it has generated so far.
+        _engine: generator of the points of the Sobol net with the index `_net`.
+        _n_sampled: number of points of the net that it has generated or skipped so far.
     """
 
     def __init__(
@@ -681,7 +710,7 @@ class SampleSequence:
         """Prepare a sequence of points, of which none is computed yet.
 
         Args:
-            dimensions: numbers of a point; may be 0.
+            dimensions: number of values of a point; may be 0.
             sampler: one of `SAMPLERS`.
             seed: seed of the points.
             name: name of the stream of random numbers; other names have other points.
@@ -702,10 +731,11 @@ class SampleSequence:
         self._sampler = sampler
         self._seed = seed
         self._name = name
-        # rounded down to a power of two, so that blocks divide a net
-        rows = max(1, min(NET, MAX_BLOCK_VALUES // max(1, dimensions)))
-        self._rows = 1 << (rows.bit_length() - 1)
-        self._block_index = -1
+        max_rows_of_values = MAX_BLOCK_VALUES // max(1, dimensions)
+        max_rows = max(1, min(POINTS_PER_NET, max_rows_of_values))
+        # rounded down to a power of two, so that a net is divided into full blocks
+        self._rows = 1 << (max_rows.bit_length() - 1)
+        self._block_index = -1  # none is loaded yet
         self._block = np.empty((0, dimensions))
         self._engine: Any = None
         self._net = -1
@@ -755,7 +785,9 @@ class SampleSequence:
         # imported here, as it takes a quarter of a second and few runs need it
         from scipy.stats import qmc
 
-        net_index, first_row = divmod(block_index * self._rows, NET)
+        # A block never crosses the end of a net.
+        first_point = block_index * self._rows
+        net_index, first_row = divmod(first_point, POINTS_PER_NET)
         is_behind = first_row < self._n_sampled  # the engine only goes forward
         if net_index != self._net or self._engine is None or is_behind:
             seed = stream(self._seed, self._name, net_index)
@@ -769,10 +801,10 @@ class SampleSequence:
 
 
 class SeedSequence:
-    """Seeds of one stream by number, many at once: much faster than
-    `advsearch.seeds.stream` for every one.
+    """The seeds of a stream, by number.
 
-    The latest block of `SEEDS` seeds is cached.
+    Seeds are generated in blocks of `SEEDS_PER_BLOCK`, which is much faster than to
+    call `advsearch.seeds.stream` for each of them. The latest block is cached.
     """
 
     def __init__(self, root: int, name: str) -> None:
@@ -783,13 +815,13 @@ class SeedSequence:
 
     def __call__(self, index: int) -> int:
         """Return seed number `index`, in [0, 2**32)."""
-        block_index, position = divmod(index, SEEDS)
+        block_index, position = divmod(index, SEEDS_PER_BLOCK)
         if block_index != self._block_index:
             sequence = np.random.SeedSequence(
                 stream(self._root, self._name, block_index)
             )
             self._block_index = block_index
-            self._block = sequence.generate_state(SEEDS, dtype=np.uint32)
+            self._block = sequence.generate_state(SEEDS_PER_BLOCK, dtype=np.uint32)
         return int(self._block[position])
 
 

@@ -1,6 +1,9 @@
-"""What passes between a scene, a search and a trial: a query, its evaluation, and the
-contract of a policy: three functions over a state that is passed and never stored, so
-that it can be shared, wrapped, replayed and resumed.
+"""The types that a scene, a search and a trial share.
+
+A `Query` is a configuration to evaluate, an `Evaluation` its result. A `Policy` decides
+what is evaluated next. It has three methods, `start`, `propose` and `update`, that take
+and return a state and store nothing, so that a search can be wrapped, replayed and
+resumed.
 """
 
 from __future__ import annotations
@@ -34,8 +37,8 @@ Phase = Literal["search", "ranking"]
 
 MAX_QUERIES = 1024
 MAX_COORDINATES = 2**21
-"""Largest number of queries in a batch, and of the elements of all their
-configurations together.
+"""Largest number of queries in a batch, and largest number of elements that all their
+configurations have together.
 """
 
 
@@ -49,88 +52,101 @@ def max_batch_size(dim: int) -> int:
 class Query:
     """A configuration to render and evaluate, under the noise of a seed.
 
-    A query of a search is about the picture as it is rendered, at the search's own
-    samples and light paths, and over the conditions that it draws. A trial is about the
-    picture as a file would hold it, rounded to 8 bits.
+    There are queries of a search and trials. A search evaluates the image as it is
+    rendered, with the samples and light paths of the search, and under conditions that
+    it draws. A trial evaluates the image as a file would store it, rounded to 8 bits.
+
+    Attributes:
+        u: (d,) float32 in [0, 1], the configuration; must not be written to.
+        seed: seed of the noise, and of the conditions that are drawn. Equal seeds mean
+            equal noise.
+        kind: kind of the rows that the evaluation is stored in, such as "search" or
+            "verification".
+        index: index of the row among those of its kind.
+        phase: phase of a search; None for a trial.
+        gradient: which gradient is requested; "free" only if the domain has
+            `partial_gradients`.
+        samples: multiple of the search's samples per pixel to render with, at least 1.
+            The evaluation costs samples * (1 + gradient_cost) renders with a gradient,
+            and samples without.
+        spp: for a trial, the samples per pixel.
+        draws_conditions: for a trial, whether conditions are drawn. Otherwise the scene
+            stays as it is.
+        values: for a trial, values that its row states of the configuration. Trials of
+            one kind may share them.
+        has_success: for a trial, whether a search seeks a certain prediction, so that
+            the evaluation can be a success.
+        product: what is computed: a judgement; only an image ("picture"); or "light",
+            from which images can be predicted (`advsearch.scene.transport`), for a u of
+            the full space.
+        with_image: whether the evaluation contains the image, too. For a row of a sweep
+            it is the bytes of a small JPEG file.
     """
 
-    u: Tensor  # (d,) float32 in [0, 1], the configuration; must not be written to
-    # Seed of the noise, and of the conditions that are drawn; equal seeds mean equal
-    # noise.
+    u: Tensor
     seed: int
-    # which rows the evaluation belongs to, such as "search" or "verification"
     kind: str = "search"
-    index: int = 0  # its place among these
-    phase: Phase | None = None  # phase of a search; None for a trial
-    # "free" only ever comes where the domain has `partial_gradients`
+    index: int = 0
+    phase: Phase | None = None
     gradient: WhichGradient = False
     samples: int = 1
-    """Multiple of the search's samples per pixel to render with, at least 1. The
-    evaluation costs samples * (1 + gradient_cost) renders with a gradient, and samples
-    without.
-    """
-    spp: int = 1  # samples per pixel of a trial
-    # of a trial: whether conditions are drawn; else the scene has those that it comes
-    # with
+    spp: int = 1
     draws_conditions: bool = True
     values: Mapping[str, Value] = field(default_factory=dict)
-    """Of a trial: what its row says of the configuration, which trials of one kind may
-    have in common.
-    """
-    # of a trial: whether a search seeks some prediction there, so that there is a
-    # success
     has_success: bool = True
     product: Literal["judgement", "picture", "light"] = "judgement"
-    """What the evaluation is: a judgement; a picture alone; or "light", from which
-    pictures can be predicted (`advsearch.scene.transport`), at u of the whole space.
-    """
-    # whether it has the picture, too; of a row of a sweep, the bytes of a small one
     with_image: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The answer to a query."""
+    """The result of a query.
 
-    objective: float  # what is maximised; a noisy number, because a render is
-    # (d,) float32, of the objective by u; None where it was not asked for
+    Attributes:
+        objective: value to maximize; it has noise, as a render has.
+        gradient: (d,) float32, gradient of the objective by u; None if it was not
+            requested.
+        success: whether the model predicts what is sought. The task decides this, not
+            the objective.
+        non_finite: number of gradient elements that were NaN or infinite and were set
+            to zero.
+        cost: number of images that were rendered for it: one, and those that finite
+            differences took, each times `samples`. An adjoint is not an image and
+            counts 0; `SearchResult.gradients` counts it. At least 1, but 0 for a row of
+            a sweep whose image was predicted, or rendered for another model.
+        judgement: the full result of the task, for the log; None without a task. No
+            policy reads it.
+        picture: (H, W, 3) image of 8-bit values in [0, 1]; None if not requested.
+        light: result of a query for "light"; in the last row of a batch of a sweep, the
+            predictions so far.
+        predicted: 0 if the image was rendered; otherwise the samples per pixel of the
+            renders that it was predicted from, 1 for a matrix.
+        jpeg: JPEG file of the image of a row of a sweep; None if it is not stored.
+        layers: layers of ground truth by name, and notes; None if not stored.
+        seconds: time that it took; None if the caller has to measure it.
+        machine: name of the worker's machine that computed it; None for a machine like
+            this one.
+        is_lost: whether every worker that tried it died.
+    """
+
+    objective: float
     gradient: Tensor | None
-    # the model's prediction is what is sought, by the task; never derived from the
-    # objective
     success: bool
-    # gradient elements that were NaN or infinite and were set to zero where they arose
     non_finite: int = 0
     cost: int = 1
-    """Pictures that were rendered for it, at least 1: one, and those that differences
-    took, each times `samples`. An adjoint is not a picture and counts 0;
-    `SearchResult.gradients` counts it. 0 of a row of a sweep whose picture was
-    predicted, or rendered for another model.
-    """
     judgement: Judgement | None = None
-    """What the task says of it, for the log; None where there is no task. No policy
-    looks at it.
-    """
-    # (H, W, 3) 8-bit values in [0, 1], where it was asked for
     picture: Tensor | None = None
-    # what was asked for as "light"; of a sweep's last row of a batch, what was
-    # predicted so far
     light: Any = None
-    # 0 if its picture was rendered; samples a pixel of what predicted it, 1 of a matrix
     predicted: int = 0
-    # JPEG file of the picture of a row of a sweep, where it is kept
     jpeg: bytes | None = None
-    # ground truth by name, and notes, where kept
     layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None
-    # Seconds that it took; None where whoever asks has to look at the clock.
     seconds: float | None = None
-    # Machine on which it was made, by its name among the workers'; None of one like
-    # this.
     machine: str | None = None
-    is_lost: bool = False  # whether every worker that tried it died
+    is_lost: bool = False
 
     @classmethod
     def from_judgement(cls, judgement: Judgement, **more: Any) -> Evaluation:
-        """Return the answer to a query without derivative, from what the task says."""
+        """Return an evaluation without a gradient, from the judgement of the task."""
         value = math.nan if judgement.objective is None else judgement.objective
         return cls(value, None, judgement.success, judgement=judgement, **more)
 
@@ -151,15 +167,16 @@ class Evaluation:
         return math.isfinite(self.objective)
 
     def sanitize(self) -> Evaluation:
-        """Return the evaluation as policies see it, without NaN.
+        """Return the evaluation as it is passed to policies, without NaN.
 
-        - Gradient elements that are NaN or infinite become zero and are added to
-          `non_finite`.
-        - An objective that is NaN or infinite becomes -inf ("the worst there is"), its
-          gradient zero and its success false.
+        - Gradient elements that are NaN or infinite become zero, whether the objective
+          is finite or not. Their number is added to `non_finite`.
+        - If the objective is NaN or infinite, it becomes -inf, the worst value. All of
+          its gradient becomes zero and its success false.
         """
         evaluation = self._sanitize_gradient()
-        if evaluation.is_finite:
+        has_finite_objective = evaluation.is_finite
+        if has_finite_objective:
             return evaluation
         zero_gradient = None
         if evaluation.gradient is not None:
@@ -188,9 +205,9 @@ class Evaluation:
 
 
 Evaluate = Callable[[Sequence[Query]], Iterable[Evaluation]]
-"""Answers queries, in their order, each when it is asked for; whoever stops asking
-leaves the rest undone. Supplied by whoever owns the scene. `functools.partial(map, f)`
-makes one of a function of one query.
+"""Evaluates queries in their order, lazily: each one when its result is requested, so
+that a caller may stop and leave the rest. The owner of the scene supplies it. From a
+function f of one query, `functools.partial(map, f)` makes one.
 """
 
 
@@ -203,14 +220,14 @@ class Proposal:
 
     Attributes:
         u: (d,) float32 inside the domain; the caller must not write to it.
-        gradient: whether the policy wants the derivative there: not, all of it
-            (`Domain.gradient_cost` more pictures), or what is "free" (only where the
-            domain has `partial_gradients`). A wish: the end of a budget gets none.
-        step_size: the step that led here in units of each block's radius, for the log;
-            NaN where there is none.
+        gradient: which gradient the policy requests: none, all of it
+            (`Domain.gradient_cost` more renders), or "free" (only if the domain has
+            `partial_gradients`). At the end of a budget the request may be dropped.
+        step_size: length of the step to u, in units of each block's radius, for the
+            log; NaN if no step led here.
         samples: multiple of the search's samples per pixel to render with, at least 1.
-            It costs as many times the renders. At the end of a budget it is reduced to
-            the renders that are left.
+            Each counts as a render. At the end of a budget it is reduced to the renders
+            that are left.
     """
 
     u: Tensor
@@ -243,7 +260,7 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Counts:
-    """What a policy had to do about evaluations, for the summary of a run.
+    """How often a policy corrected gradients and steps, for the summary of a run.
 
     Attributes:
         cut: gradients of which single elements were outliers and were clipped
@@ -273,14 +290,17 @@ Evaluated = Sequence[tuple[Tensor, Evaluation]]
 
 
 class Policy(ABC, Generic[State]):
-    """Proposes configurations, in batches. Write a new one by implementing the three
-    methods below.
+    """Proposes configurations, in batches.
 
-    Its `name` is for messages and the log. One that `handles_choices` searches discrete
-    choices (`Block.options`) itself; any other is wrapped in `Choices` by `search`, so
-    that it never sees any. Its options are the fields of a dataclass; what is outside
-    their range is an InputError when it is made, and a domain that it cannot search (of
-    too many numbers, say) when it starts.
+    A new policy is a dataclass that implements `start`, `propose` and `update`. Its
+    options are its fields. It raises an InputError for a value outside of its range
+    when it is created, and for a domain that it cannot search (for example one of too
+    many numbers) when it starts.
+
+    Attributes:
+        name: name for messages and the log.
+        handles_choices: whether it searches discrete choices (`Block.options`) itself.
+            Any other policy is wrapped in `Choices` by `search`, and only gets numbers.
     """
 
     name: ClassVar[str]
@@ -300,16 +320,15 @@ class Policy(ABC, Generic[State]):
                 f"policy {cls.__name__}: `answer` is called "
                 "`distribution` now; rename it"
             )
-        # the arguments of which the methods get copies: `domain` of `start`, without the
-        # generator, which has to advance; `evaluated` of `update`
-        hand_copies(cls, start=slice(1), update=slice(1, None))
+        # The methods get copies of the arguments in these slices, which begin to count
+        # after `self`: of `start(domain, generator, steps)` only the domain, as the
+        # generator has to advance; of `update(state, evaluated)` all after the state.
+        hand_copies(cls, start=slice(0, 1), update=slice(1, None))
 
     @property
     @abstractmethod
     def uses_gradient(self) -> bool:
-        """Whether it ever asks for a gradient. A class where that is fixed just sets
-        the attribute.
-        """
+        """Whether it ever requests a gradient. A subclass may set a class attribute."""
 
     @abstractmethod
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> State:
@@ -319,8 +338,8 @@ class Policy(ABC, Generic[State]):
             domain: where to search; begin at `domain.initial_point`.
             generator: the search's source of randomness, to draw a seed from; use
                 `seeded` for numbers later on.
-            steps: how many renders there will be at most, those of gradients included:
-                a plan for schedules, never to be counted on.
+            steps: largest number of renders, including those of gradients. Schedules
+                may be planned with it, but the search may end earlier.
         """
 
     @abstractmethod
@@ -335,43 +354,47 @@ class Policy(ABC, Generic[State]):
             At most n proposals that do not depend on each other's evaluations: many
             samples of a population, but a single step along a gradient. An empty tuple
             means that there is nothing more to propose, because a grid is complete or
-            the objective is flat. With another n, a policy must propose the same
-            configurations in the same order, if all of them are passed to `update`.
+            the objective is flat. The sequence of proposals in a search must not depend
+            on n: two calls with n = 1 have to propose what one call with n = 2 does,
+            provided that each batch is evaluated fully and passed to `update`.
         """
 
     @abstractmethod
     def update(self, state: State, evaluated: Evaluated) -> State:
         """Return the state after the latest proposals were evaluated.
 
-        They are all of these, in their order; where the budget ends, the first of them.
-        Every evaluation is as `Evaluation.sanitize` leaves it: its gradient (None where
-        it was not asked for or could not be paid) is finite, and its objective is
-        finite or -inf, which stands for "could not be evaluated". The objective is
-        noisy: the same u with another seed gives another value, and a maximum over many
-        is biased upwards.
+        Args:
+            state: state that `propose` returned.
+            evaluated: the proposed configurations, in their order, with evaluations. At
+                the end of the budget there may be only the first of them. Evaluations
+                are sanitized (`Evaluation.sanitize`). The gradient is finite; it is
+                None if it was not requested, or if its renders were not left. The
+                objective is finite, or -inf if it could not be evaluated. It is noisy:
+                the same u with another seed gives another value, and the largest of
+                many values is biased upwards.
         """
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
-        """Return whether, in `steps` renders, it may ask for gradients of a domain that
-        cost renders.
+        """Return whether it may request gradients that cost renders, as finite
+        differences do, in a search of `steps` renders.
         """
         return self.uses_gradient and domain.gradient_cost > 0
 
     def counts(self, state: State) -> Counts:
-        """Return what the policy did about the evaluations so far; nothing where it
-        takes them as they come.
-        """
+        """Return how often the policy corrected gradients and steps so far."""
         return NO_COUNTS
 
     def distribution(self, state: State) -> Distribution | None:
-        """Return the distribution that the search has reached, where that is its result
-        beside the best configuration that it met; None where there is none (yet).
+        """Return the distribution that the search has reached.
+
+        It is a result besides the best configuration. None if the policy has no
+        distribution, or none yet.
         """
         return None
 
     def failures(self, state: State) -> Failures | None:
-        """Return the different failures that the policy has met, if it looks for more
-        than one.
+        """Return the different failures that the policy has met, or None if it does not
+        search for different ones.
         """
         return None
 
@@ -393,9 +416,9 @@ def seeded(seed: int, number: int) -> torch.Generator:
 def limit_to_single_thread() -> Iterator[None]:
     """Limit torch to a single thread inside the context.
 
-    This is faster for small matrices, on a busy machine many times so, and the last
-    bits do not depend on the number of threads. Setting it costs less than a
-    microsecond.
+    Small matrices are processed faster this way, on a busy machine many times faster,
+    and the last bits of results do not depend on the number of threads. Setting it
+    takes less than a microsecond.
     """
     n_threads_before = torch.get_num_threads()
     torch.set_num_threads(1)

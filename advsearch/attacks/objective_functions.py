@@ -1,17 +1,18 @@
-"""Objectives as pure functions: of logits margin, log-odds, cross-entropy and DLR; of
-features two distances.
+"""Objectives as pure functions: margin, log-odds, cross-entropy and DLR of logits, and
+two distances of features.
 
-Each of logits comes in two forms over label sets, both to be *maximised*:
+An objective of logits has two forms, both to be *maximized*:
 
 - plain, `f(logits, images, labels)`: away from the label set Y of right labels;
 - targeted, `targeted_f(logits, images, target)`: towards a target T, which is a label
 set as well.
 
-Arguments are logits (N, C), images (N, H, W, 3), which none of these look at, and class
-indices. Values are (N,), of the dtype of the logits, and differentiable. At logits of
-ten thousand, at ties and at probabilities that round to 0 or 1 the gradient is finite,
-and it is not lost. InputError: logits that are not (N, C), indices that the model does
-not have, a label set of all classes.
+The arguments are logits (N, C), images (N, H, W, 3) and class indices. All objectives
+have the images as an argument, but those of logits do not use them. Values are (N,), of
+the dtype of the logits, and differentiable. The gradient is finite and does not vanish,
+also for logits of ten thousand, at ties, and at probabilities that round to 0 or 1.
+InputError: logits that are not (N, C), indices that the model does not have, a label
+set of all classes.
 """
 
 from __future__ import annotations
@@ -33,31 +34,33 @@ from advsearch.tasks.classification import (
 )
 
 MAX_LOG_ODDS = -15.0
-"""Log-odds below which cross-entropy is continued by its tangent. In float32 its own
-slope, exp(log-odds), would be lost at -103 and count for nothing beside other numbers
-long before.
+"""Log-odds of a wrong prediction below which cross-entropy is replaced by its tangent.
+There its slope is about exp(log-odds). In float32 this rounds to 0 at -103, and is
+negligible next to other gradients long before.
 """
 
-# added to a denominator of `dlr`, as a fraction of the distance from the largest to the
-# smallest logit
+# It is added to the denominator of `dlr`, as a fraction of the distance from the
+# largest to the smallest logit.
 RELIEF = 1e-4
-SAME = 1e-12  # logits that lie closer together than this are all the same to `dlr`
+# If all logits lie within this distance, `dlr` treats them as equal.
+SAME = 1e-12
 
 
 def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     """Return the largest wrong logit minus the largest right one, (N,): over 0 exactly
     where the model is wrong.
 
-    max over j not in Y of z_j, minus max over y in Y of z_y. In logits (log-odds),
-    unbounded, and with a gradient of one at every confidence (Carlini and Wagner 2017,
-    f_6 without its hinge). Ties share the gradient.
+    With logits z it is (max over j not in Y of z_j) - (max over y in Y of z_y). It is
+    unbounded, and its gradient is 1 in one logit and -1 in another at every confidence.
+    This is f_6 of Carlini and Wagner 2017 without its hinge, max(., -confidence). If
+    several logits are the largest, the gradient is divided among them.
     """
     return compute_misclassification_margin(logits, labels)
 
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where
-    the prediction is in T.
+    """Return the largest logit in T minus the largest other one, (N,): over 0 exactly
+    where the prediction is in T.
     """
     return compute_target_margin(logits, target)
 
@@ -75,26 +78,30 @@ def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
 
 
 def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """log(p / (1 - p)) with p the total probability of T."""
+    """Return log(p / (1 - p)), (N,), with p the total probability of T."""
     return _compute_log_odds(logits, make_class_mask(logits, target, "target"))
 
 
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     """Return minus the logarithm of the probability of the right labels, (N,) in nats.
 
-    It is computed as -log p = softplus(l), with l the `log_odds`. This form does not
-    overflow for logits of thousands and keeps its digits where p is near 1. Its slope
-    in l is 1 - p, which rounds to 0 where the model is sure. So below l =
-    `MAX_LOG_ODDS`, where the value is 3e-7, it is continued by its tangent: the slope
-    stays 3e-7, and values get slightly under 0. That is enough for policies that
-    normalise their steps; `log_odds` has slope 1 everywhere.
+    Let p be the probability of the right labels, and l the `log_odds` of a wrong
+    prediction, log((1 - p) / p). The value is -log p = softplus(l). This form does not
+    overflow for logits of thousands, and keeps its digits where p is near 1.
+
+    Its slope in l is 1 - p, which rounds to 0 where the model is sure (l very
+    negative). So for l < `MAX_LOG_ODDS` the value is that of the tangent at
+    `MAX_LOG_ODDS`: the slope stays 3e-7, and values get slightly under 0. That is
+    enough for policies that normalize their steps; `log_odds` has slope 1 everywhere.
     """
     return _softplus(log_odds(logits, images, labels))
 
 
 def targeted_cross_entropy(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
-    """log p with p the total probability of T, in nats: 0 at best, continued as
-    `cross_entropy` is.
+    """Return log p, (N,) in nats, with p the total probability of T.
+
+    It is 0 at best. Where p is near 1 it is replaced by a tangent, as in
+    `cross_entropy`.
     """
     return -_softplus(-targeted_log_odds(logits, images, target))
 
@@ -111,8 +118,8 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
 
     The first line is the ratio of Croce and Hein 2020 (Auto-PGD), section 4. The second
     has the denominator of their targeted form, because a search goes on after its first
-    success: with the first denominator the value would be 1, without a gradient,
-    wherever s comes third. Three more things differ from theirs:
+    success. There s may be p_3. Then w - s = p_1 - p_3, so that the first ratio would
+    be 1, without a gradient. Three more things differ from theirs:
 
     - Of several right labels only the one with the largest logit is in the list:
       otherwise three of them at the top would give a denominator of zero.
@@ -128,12 +135,13 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
         InputError: fewer than two wrong classes. Of two numbers only the order is left
             without scale and offset.
     """
-    top_logits, spread = _sort_logits(logits, make_class_mask(logits, labels), "label")
-    difference = margin(logits, images, labels)
-    narrow_gap = top_logits[:, 0] - top_logits[:, 2]
-    wide_gap = _compute_wide_gap(top_logits)
+    is_right_label = make_class_mask(logits, labels)
+    top_logits, spread = _sort_logits(logits, is_right_label, "label")
+    difference = margin(logits, images, labels)  # w - s
+    gap_if_right = top_logits[:, 0] - top_logits[:, 2]  # p_1 - p_3
+    gap_if_wrong = _compute_wide_gap(top_logits)
     is_wrong = difference > 0.0
-    gap = torch.where(is_wrong, wide_gap, narrow_gap)
+    gap = torch.where(is_wrong, gap_if_wrong, gap_if_right)
     return difference / _add_relief(gap, spread)
 
 
@@ -167,55 +175,66 @@ def _softplus(x: Tensor) -> Tensor:
 
 
 def _sort_logits(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, Tensor]:
-    """Return the largest logits, where a group of classes counts as a single class.
+    """Return the largest logits, after a group of classes was merged into one.
+
+    The logit of the merged class is the largest of the group. All other classes keep
+    theirs.
 
     Args:
         logits: (N, C).
-        group: (C,) bool, classes of the group; its logit is the largest of theirs.
+        group: (C,) bool, which classes are merged.
         setting: name of the setting that gave the group, "label" or "target", for
             messages.
 
     Returns:
         The 4 largest logits in descending order, (N, 4), or (N, 3) if there are only 3;
-        and the distance (N,) from the largest to the smallest of all.
+        and the difference (N,) of the largest and the smallest logit.
 
     Raises:
         InputError: there are fewer than two other classes.
     """
-    size = int(group.sum())
-    others = int((~group).sum())
-    if others < 2:
+    n_merged = int(group.sum())
+    n_other = int((~group).sum())
+    if n_other < 2:
         raise InputError(
-            f"`objective` dlr: expected at least 2 classes beside the {size} of "
-            f"`{setting}`, got {others}; "
+            f"`objective` dlr: expected at least 2 classes beside the {n_merged} of "
+            f"`{setting}`, got {n_other}; "
             "its ratio needs a third logit: use `objective=margin`"
         )
-    collapsed = torch.cat(
-        [compute_largest_logit(logits, group)[:, None], logits[:, ~group]], dim=1
-    )
-    top = collapsed.topk(min(4, collapsed.shape[1]), dim=1).values
-    return top, top[:, 0] - collapsed.amin(dim=1)
+    merged_logit = compute_largest_logit(logits, group)[:, None]
+    all_logits = torch.cat([merged_logit, logits[:, ~group]], dim=1)
+    top_logits = all_logits.topk(min(4, all_logits.shape[1]), dim=1).values
+    spread = top_logits[:, 0] - all_logits.amin(dim=1)
+    return top_logits, spread
 
 
-def _compute_wide_gap(top: Tensor) -> Tensor:
-    """p_1 - (p_3 + p_4) / 2, or p_1 - (p_2 + p_3) / 2 where there are three."""
-    return top[:, 0] - top[:, -2:].mean(dim=1)
+def _compute_wide_gap(top_logits: Tensor) -> Tensor:
+    """Return the denominator of the targeted ratio, (N,), from `_sort_logits`.
+
+    It is p_1 - (p_3 + p_4) / 2, or p_1 - (p_2 + p_3) / 2 if there are only three.
+    """
+    return top_logits[:, 0] - top_logits[:, -2:].mean(dim=1)
 
 
 def _add_relief(denominator: Tensor, spread: Tensor) -> Tensor:
-    """Return a denominator that is over 0; 1 where all logits are the same."""
+    """Return a denominator over 0, which is 1 if all logits are equal.
+
+    Args:
+        denominator: (N,) differences of logits, at least 0.
+        spread: (N,) difference of the largest and the smallest logit.
+    """
     return torch.where(
         spread > SAME, denominator + RELIEF * spread, torch.ones_like(spread)
     )
 
 
-# distances under this fraction of the clean features' length count as none: it is
-# rounded off there
+# Below this fraction of the clean features' length, a distance is rounded off, so that
+# it has a gradient at 0.
 NEARBY = 1e-3
 
 ReadFeatures = Callable[[Tensor], Tensor]
-"""From images (N, H, W, 3), display-referred sRGB in [0, 1], to features (N, F): what
-`advsearch.models.features.features_of` returns, say."""
+"""A function from images (N, H, W, 3), display-referred sRGB in [0, 1], to features (N,
+F), for example what `advsearch.models.features.features_of` returns."""
 
 
 def feature_distance(
@@ -314,7 +333,7 @@ def _make_start_direction(reference: Tensor) -> Tensor:
 
 
 def _compute_reference(features: ReadFeatures, clean: Tensor) -> Tensor:
-    """Return the mean features (F,) of the clean pictures."""
+    """Return the mean features (F,) of the clean image, or of several renders of it."""
     with torch.no_grad():
         reference = features(clean if clean.dim() == 4 else clean[None])
     if reference.dim() != 2:

@@ -1,20 +1,19 @@
-"""What a search maximises; what counts as success is defined by the task
-(`advsearch.tasks`, docs/objectives.md).
+"""Objectives: the values that a search maximizes. Whether a prediction is a success is
+decided by the task instead (`advsearch.tasks`, docs/objectives.md).
 
-An objective is a callable `(output, images, truth) -> values`, the larger the nearer to
-what the search is after:
+An objective is a callable `(output, images, truth) -> values`:
 
-- output: of the model for N pictures, as its task takes it; in classification logits
-(N, C) float32;
-- images: (N, H, W, 3) float32 that the model saw, display-referred sRGB in [0, 1];
-- truth: what is true of the scene, as the task has it; in classification the indices of
-  the label set Y, every one of which is a right label;
-- values: (N,), differentiable.
+- output: output of the model for N images, as the task needs it; in classification
+logits (N, C) float32;
+- images: (N, H, W, 3) float32 input of the model, display-referred sRGB in [0, 1];
+- truth: ground truth of the scene, as the task needs it; in classification the indices
+  of the label set Y, every one of which is a right label;
+- values: (N,), differentiable; the larger, the closer to what is sought.
 
-What `get_objective` returns is called with a fourth argument where there is a
-configuration: `more`, which gives what a user's function asks for by the names of its
-parameters: it is called with `(output, images, truth)`, or `(output, labels)` as losses
-of torch are, and asks for more by the names of further ones.
+A user's function takes `(output, images, truth)`, or `(output, labels)` as losses of
+torch do. By the names of further parameters it requests further inputs, such as the
+texture. So what `get_objective` returns takes a fourth argument, `more`: a function
+from the name of such an input to its value.
 """
 
 from __future__ import annotations
@@ -43,20 +42,20 @@ from advsearch.tasks.classification import ClassTask
 from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import EnsembleTask
 
-# what a function may ask for by further parameters
+# names of further parameters by which a user's function can request an input
 REQUESTABLE_INPUTS = ("u", "texture", "textures", "inputs", "configuration")
 
 TRUTH_PARAMETERS = ("target", "targets", "labels", "label", "truth")
-"""What the second of two parameters is called in a loss of outputs and right labels
-alone.
+"""Names of a second parameter that show that a function takes (output, truth), without
+the images.
 """
 
-# what the second of two parameters is called in a function that forgot the third
+# names of a parameter that gets the images
 IMAGE_PARAMETERS = ("images", "image")
 
 ReadInput = Callable[[str], Any]
-"""Gives what is asked for by one of the names in `REQUESTABLE_INPUTS`, at the
-configuration of each picture.
+"""A function from a name in `REQUESTABLE_INPUTS` to that input, at the configuration of
+each image.
 """
 
 
@@ -68,12 +67,15 @@ class Objective(Protocol):
     def __call__(
         self, output: Any, images: Tensor, truth: Any, more: ReadInput = ..., /
     ) -> Tensor:
-        """Return (N,) values to maximise."""
+        """Return (N,) values to maximize."""
         ...
 
 
 def reject_inputs(name: str) -> Any:
-    """Raise InputError: without a configuration there are no further inputs."""
+    """Raise InputError: no further inputs can be read without a configuration.
+
+    It is the default `ReadInput`, of a call without a configuration.
+    """
     raise InputError(
         f"objective: asks for `{name}`, and no configuration was given; "
         "pass `more`, which gives it"
@@ -82,11 +84,12 @@ def reject_inputs(name: str) -> Any:
 
 @dataclass(frozen=True)
 class ObjectiveSignature:
-    """The arguments that a function takes.
+    """The arguments that a user's function takes.
 
     Attributes:
         images: whether it takes (output, images, truth), not (output, truth).
-        requested_inputs: names of `REQUESTABLE_INPUTS` that it takes besides.
+        requested_inputs: names of the inputs that it requests by further parameters, of
+            `REQUESTABLE_INPUTS`.
     """
 
     images: bool = True
@@ -115,15 +118,19 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     callee = function.forward if isinstance(function, nn.Module) else function
     try:
         signature = inspect.signature(callee)
-    except ValueError:  # built in: nothing to look at
+    except ValueError:
+        # A function written in C has no signature: it gets (output, images, truth).
         return ObjectiveSignature()
     by_position = _list_positional(signature)
-    if by_position and by_position[0] in IMAGE_PARAMETERS:  # as a metric takes them
+    takes_images_first = bool(by_position) and by_position[0] in IMAGE_PARAMETERS
+    if takes_images_first:  # like a metric
         raise InputError(
             f"objective {get_name(function)!r}: its first argument is called "
             f"{by_position[0]!r}, but gets what the "
             "model says; write (output, images, truth)"
         )
+    # The first two always get output and truth (or images), even if they are called "u"
+    # or "inputs".
     requested_inputs = tuple(
         name
         for name in signature.parameters
@@ -133,9 +140,8 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         parameter.kind is parameter.VAR_POSITIONAL
         for parameter in signature.parameters.values()
     )
-    takes_images = has_star_args or _has_image_parameter(
-        [name for name in by_position if name not in requested_inputs]
-    )
+    other_names = [name for name in by_position if name not in requested_inputs]
+    takes_images = has_star_args or _has_image_parameter(other_names)
     try:
         _check_arguments(signature, takes_images, requested_inputs)
     except TypeError as error:
@@ -179,17 +185,22 @@ def _has_image_parameter(names: Sequence[str]) -> bool:
     unless the second is named like the truth, e.g. "target": then it is a loss whose
     third parameter is an option.
 
+    A function that is wrong may get True as well. It can't be called with three
+    arguments then, and the caller explains that.
+
     Args:
-        names: names of its positional parameters, in order.
+        names: names of its positional parameters, in order, without requested inputs.
     """
-    if len(names) < 2:  # neither; the caller rejects it whatever is returned
+    if len(names) < 2:  # wrong, since output and truth are always passed
         return True
     second_name = names[1]
     if second_name in TRUTH_PARAMETERS:
         return False
     has_third = len(names) > 2
-    # a function whose second parameter is called like an image has forgotten the truth
-    return has_third or second_name in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS)
+    # Of two parameters, a second one with such a name is not the truth. The function is
+    # wrong, as it has no parameter for the truth.
+    lacks_truth = second_name in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS)
+    return has_third or lacks_truth
 
 
 def wrap_objective(function: Callable[..., Tensor]) -> Objective:
@@ -231,17 +242,20 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
                 raise
             raise InputError(
                 f"objective {name!r}: expected one right label for a loss of torch, "
-                f"got {len(truth)} (indices "
-                f"{truth}); use those of advsearch.losses, or name one with `label`"
+                f"got {len(labels)} (indices "
+                f"{labels}); use those of advsearch.losses, or name one with `label`"
             ) from error
-        if isinstance(result, Tensor) and result.ndim == 0 and count > 1:
+        is_scalar = isinstance(result, Tensor) and result.ndim == 0
+        if is_scalar and count > 1:
+            # This calls `objective` again, with a count of 1.
             result = _evaluate_each_image(objective, output, images, truth, inputs)
         values = _check_values(name, result, count)
         if values.requires_grad and _are_written_into((argument_copies, input_copies)):
             # Writing in place may make torch's backward pass fail. It is tried here, so
-            # that the error names the function.
-            sources = _list_differentiable((output, inputs))
-            _check_differentiable(name, values, sources or [images])
+            # that the error names the function. If neither the output nor an input has
+            # a gradient, it is that of the images.
+            sources = _list_differentiable((output, inputs)) or [images]
+            _check_differentiable(name, values, sources)
         _check_keeps_gradient(name, values, (images, output, *inputs.values()))
         return values
 
@@ -255,8 +269,9 @@ def _are_written_into(copies: Any) -> bool:
 
 
 def _is_label_set_rejected(labels: Any, error: TypeError) -> bool:
-    """Return whether an error is what a loss of torch raises that got a label set, a
-    tuple, in place of a tensor.
+    """Return whether a loss of torch raised the error because it got a label set.
+
+    A set of several labels is a tuple, and such a loss takes a tensor.
     """
     return isinstance(labels, tuple) and "not tuple" in str(error)
 
@@ -418,18 +433,23 @@ def _select_input(inputs: Mapping[str, Any], index: int, name: str) -> Any:
 @final
 @dataclass(frozen=True)
 class ObjectiveKind:
-    """What is known about a named objective.
+    """A named objective: its functions, or how they are made for a run.
 
-    Args:
-        plain: the function of the right labels, which may ask for more as a user's own
-            does; None for one that has to be made for a run.
-        targeted: the same, of a target in their place; None if it has no such form.
-        task: name of the task whose outputs it takes, and of those tasks that are kinds
-            of it; None for any.
-        of_features: what makes it from the model's features and a clean picture; None
-            where nothing does.
-        of_task: what makes it from the task, which knows of target and direction
-            itself; None where nothing does.
+    Exactly one of `plain`, `of_features` and `of_task` is set.
+
+    Attributes:
+        name: name of the objective, e.g. "margin".
+        summary: one line about it.
+        unit: unit of its values.
+        plain: function (output, images, right labels), which may request further inputs
+            as a user's function may.
+        targeted: the same function with a target in place of the labels; None if it has
+            no such form.
+        task: name of the task whose outputs it takes. Tasks that are subclasses of that
+            task fit as well. None for any task.
+        of_features: makes the function from the model's features and a clean image.
+        of_task: makes the objective from the task. The task has the target and the
+            direction, so the objective needs neither.
     """
 
     name: str
@@ -447,11 +467,14 @@ class ObjectiveKind:
         return self.of_features is not None
 
     def fits(self, task: str) -> bool:
-        """Whether it takes the outputs of the task of that name: it is for any task,
-        for this one, or for one of which this is a kind.
+        """Return whether it takes the outputs of a task, by the name of the task.
+
+        An objective without a task fits every task. Otherwise it fits its own task and
+        all subclasses of it.
         """
         if self.task is None or self.task == task:
             return True
+        # The task of another package need not be installed, so it may be unknown.
         are_known = self.task in TASKS and task in TASKS
         return are_known and issubclass(TASKS[task], TASKS[self.task])
 
@@ -467,8 +490,10 @@ class ObjectiveKind:
 
 
 def _ignore_inputs(function: Callable[[Any, Tensor, Any], Tensor]) -> Objective:
-    """Return a function of (output, images, truth) as an objective, which is also
-    called with further inputs; they are ignored.
+    """Make an objective from a function of (output, images, truth).
+
+    An objective is called with a fourth argument as well, which reads further inputs;
+    it is ignored.
     """
 
     def plain(
@@ -541,13 +566,13 @@ _BUILT_IN_KINDS = {
         ),
         ObjectiveKind(
             "feature_distance",
-            "how far the features lie from those of the clean picture",
+            "distance of the features from those of the clean image",
             "lengths of the clean features",
             of_features=functions.feature_distance,
         ),
         ObjectiveKind(
             "distance",
-            "how far the features lie from those of the clean picture, by the angle",
+            "distance of the features from those of the clean image, by the angle",
             "1 - cosine",
             task="similarity",
             of_features=functions.cosine_distance,
@@ -572,8 +597,7 @@ _BUILT_IN_KINDS = {
         ),
         ObjectiveKind(
             EnsembleTask.objective,
-            "of several tasks at once: each task's own objective, "
-            "put together by `ensemble`",
+            "the objectives of several tasks, combined by `ensemble`",
             "those of the tasks",
             task=EnsembleTask.name,
             of_task=_make_score_objective,
@@ -608,12 +632,12 @@ OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
     "an ObjectiveKind whose name is that of the entry point",
     lambda name, entry: isinstance(entry, ObjectiveKind) and entry.name == name,
 )
-"""Every objective that has a name."""
+"""All named objectives, including those of other packages."""
 
 OBJECTIVES: dict[str, Callable[..., Tensor]] = {
     name: kind.plain for name, kind in _BUILT_IN_KINDS.items() if kind.plain is not None
 }
-"""Those of our own that need nothing but logits, in their plain form."""
+"""The built-in objectives of logits, in their plain form."""
 
 
 def objective_summaries() -> dict[str, str]:
@@ -633,7 +657,7 @@ def get_objective(
 ) -> Objective:
     """Return an objective by its name, or a user's function wrapped as one.
 
-    The result is always called with the truth, and is to be maximised. If the task has
+    The result is always called with the truth, and is to be maximized. If the task has
     a target, a named objective uses its targeted form, and a user's function gets the
     target in place of the truth. If the task minimises, the values are negated. The
     mistakes of a user's function are explained.
@@ -660,23 +684,38 @@ def get_objective(
         return _orient_objective(
             function, task, takes_logits_of_task=False, user_function=objective
         )
-    # functions of other packages are called with copies, and their mistakes explained
-    is_built_in = _BUILT_IN_KINDS.get(kind.name) is kind
     if kind.of_task is not None:
-        # The task has target and direction already, so it is not oriented below.
+        # It already has the target and the direction of the task.
         task_objective = kind.of_task(task)
-        return task_objective if is_built_in else _pass_copies(task_objective)
+        return task_objective if _is_built_in(kind) else _pass_copies(task_objective)
     if kind.of_features is not None:
         function = _make_feature_objective(kind, features, clean)
-        if not is_built_in:
-            function = _pass_copies(function)
+        takes_logits_of_task = False
     else:
-        form = kind.form(targeted=targeted)
-        function = _ignore_inputs(form) if is_built_in else wrap_objective(form)
-    takes_logits_of_task = kind.of_features is None and _has_other_outputs(task)
+        function = _make_output_objective(kind, targeted=targeted)
+        takes_logits_of_task = _has_other_outputs(task)
     return _orient_objective(
         function, task, takes_logits_of_task=takes_logits_of_task, user_function=None
     )
+
+
+def _is_built_in(kind: ObjectiveKind) -> bool:
+    """Return whether an objective is part of this package, not of another one."""
+    return any(kind is built_in for built_in in _BUILT_IN_KINDS.values())
+
+
+def _make_output_objective(kind: ObjectiveKind, *, targeted: bool) -> Objective:
+    """Return the objective of a kind that has functions of the model's output.
+
+    A function of another package is wrapped as a user's: it gets copies of its
+    arguments, and its mistakes are explained.
+
+    Args:
+        kind: kind with a `plain` or `targeted` form.
+        targeted: which of these forms to take.
+    """
+    form = kind.form(targeted=targeted)
+    return _ignore_inputs(form) if _is_built_in(kind) else wrap_objective(form)
 
 
 def _make_feature_objective(
@@ -684,13 +723,15 @@ def _make_feature_objective(
 ) -> Objective:
     """Return the objective of a kind that is made from the model's features.
 
+    A function of another package gets copies of its arguments.
+
     Args:
         kind: kind with `of_features`.
-        features: features from images (N, H, W, 3) to features (N, F).
-        clean: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
+        features: function from images (N, H, W, 3) to features (N, F).
+        clean: the clean image (H, W, 3), or renders of it (N, H, W, 3).
 
     Raises:
-        InputError: no features, or no clean picture.
+        InputError: no features, or no clean image.
     """
     assert kind.of_features is not None
     if features is None or clean is None:
@@ -699,15 +740,15 @@ def _make_feature_objective(
             "picture, got none; use get_objective(name, "
             "features=advsearch.models.features.features_of(model), clean=picture)"
         )
-    return _ignore_inputs(kind.of_features(features, clean))
+    objective = _ignore_inputs(kind.of_features(features, clean))
+    return objective if _is_built_in(kind) else _pass_copies(objective)
 
 
 def _has_other_outputs(task: Task) -> bool:
-    """Return whether the model's outputs are not logits of the labels as they are, so
-    that an objective of logits gets what `Task.as_logits` makes of them.
+    """Return whether the model's outputs have to be converted to logits of the labels.
 
-    The outputs may be features that are compared with those of each label, or may have
-    classes that stand for "nothing here".
+    `Task.as_logits` converts them. The outputs may be features that are compared with
+    those of each label, or may have classes that mean "nothing here".
     """
     compares_features = isinstance(task, Classification) and not task.reads_logits
     has_nothing_classes = isinstance(task, ClassTask) and bool(task.nothing_classes)
@@ -721,48 +762,60 @@ def _orient_objective(
     takes_logits_of_task: bool,
     user_function: str | Callable[..., Tensor] | None,
 ) -> Objective:
-    """Return an objective that is called with the truth and is to be maximised.
+    """Return an objective that is called with the truth and is to be maximized.
 
-    So a search needs no case for targets or for minimising.
+    So a search need not distinguish targets or minimizing.
+
+    - If the task has a target, the function gets it in place of the truth.
+    - If the task minimizes, the values of the function are negated.
+    - With a target, a user's function may have the wrong sign: it may fall as the
+      target becomes more likely. This is checked once, in the first call with a
+      gradient. A named objective has the right sign.
 
     Args:
-        function: gets the target in place of the truth if the task has one. Its values
-            are negated if the task minimises.
-        task: judges the model; has the target and the direction.
+        function: function to orient.
+        task: task with the target and the direction.
         takes_logits_of_task: whether the function gets `Task.as_logits` of the output.
         user_function: the user's function that `function` wraps; None for a named
-            objective. With a target, its sign is checked once, at its first gradient.
+            objective.
     """
     targeted = task.target is not None
     # set to False by the first call that has checked it
     must_check_direction = user_function is not None and targeted
 
     def oriented_objective(
-        output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
+        output: Any,
+        images: Tensor,
+        truth: Any,
+        more: ReadInput = reject_inputs,  # reads further inputs by name
+        /,
     ) -> Tensor:
-        """Return the values (N,) of the function, negated if the task minimises."""
+        """Return the values (N,) of the function, negated if the task minimizes."""
         nonlocal must_check_direction
         labels = task.target if targeted else truth
         function_output = output
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
-        value = function(function_output, images, labels, more)
-        # (N, classes); the check needs the slope in each class
-        has_logits = isinstance(output, Tensor) and output.ndim == 2
-        can_check = value.requires_grad and has_logits and output.requires_grad
-        if must_check_direction and can_check:
+        values = function(function_output, images, labels, more)
+        if must_check_direction and _has_slope_by_class(values, output):
             must_check_direction = False
             name = get_name(user_function)  # type: ignore[arg-type]
-            _warn_of_direction(name, value, output, labels)
-        return -value if task.minimise else value
+            _warn_of_direction(name, values, output, labels)
+        return -values if task.minimise else values
 
     return oriented_objective
+
+
+def _has_slope_by_class(values: Tensor, output: Any) -> bool:
+    """Return whether values can be differentiated by an output (N, classes)."""
+    has_logits = isinstance(output, Tensor) and output.ndim == 2
+    return values.requires_grad and has_logits and output.requires_grad
 
 
 def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -> None:
     """Warn if a user's function falls, for every image, as the target's logit rises.
 
-    It probably has the wrong sign: maximising it leads away from the target.
+    It probably has the wrong sign: maximizing it leads away from the target.
 
     Args:
         name: name of the function.
@@ -850,12 +903,12 @@ def _check_kind(
             f"got {kind.name}, which takes outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
-        # A distance from the clean image can only be maximised.
+        # A distance from the clean image can only be maximized.
         setting = "minimise"
-        reason = "it is least at the start already"
+        reason = "its minimum is at the start already"
         if targeted:
             setting = "target"
-            reason = "it leads away from the clean picture, to no class in particular"
+            reason = "it leads away from the clean image, to no class in particular"
         raise InputError(
             f"{setting}: expected `objective` {' or '.join(OBJECTIVES)}, "
             f"got {kind.name}; {reason}"
@@ -863,8 +916,10 @@ def _check_kind(
 
 
 def list_requested_inputs(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:
-    """Return the names of what an objective, checked already, asks for besides output,
-    images and truth (of `REQUESTABLE_INPUTS`).
+    """Return the names of the further inputs that an objective requests.
+
+    They are some of `REQUESTABLE_INPUTS`. The objective must have been checked already
+    (`check_objective`).
     """
     kind = _find_kind(objective)
     function = objective if kind is None else kind.plain
@@ -872,8 +927,11 @@ def list_requested_inputs(objective: str | Callable[..., Tensor]) -> tuple[str, 
 
 
 def _find_kind(objective: object) -> ObjectiveKind | None:
-    """Return the kind of objective of a name, or of a function of ours (`OBJECTIVES`);
-    None for a user's function.
+    """Return the kind of a named objective, or None for a user's function.
+
+    Args:
+        objective: a name, or a function; the plain form of a named objective, such as
+            `margin`, counts as named.
     """
     if isinstance(objective, str):
         return OBJECTIVE_KINDS[objective]

@@ -1,5 +1,6 @@
-"""The one search loop: it owns the budget, stopping, the best so far and the log.
-Policies only propose.
+"""The search loop, which is the same for all policies. A policy only proposes
+configurations; the loop spends the budget, decides when to stop, and keeps the best
+configurations and the log.
 """
 
 from __future__ import annotations
@@ -40,83 +41,115 @@ from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
 from advsearch.seeds import stream
 
-NON_FINITE_LIMIT = 3  # non-finite objectives in a row after which a search gives up
+# A search ends after this many objectives in a row that are not finite.
+NON_FINITE_LIMIT = 3
 
 
 @dataclass(frozen=True)
 class StepRecord:
-    """One evaluation, without its tensors."""
+    """The record of an evaluation, without its tensors.
 
-    step: int  # number of the evaluation, from 0; ranking goes on counting
-    seed: int  # seed that it was rendered with
-    phase: Phase  # "search", or "ranking" for a candidate rendered again at the end
-    objective: float  # raw; NaN where it was not finite
-    # best raw objective of the search so far, biased upwards; NaN before there is one
+    Attributes:
+        step: index of the evaluation, from 0; the ranking continues counting.
+        seed: seed that it was rendered with.
+        phase: "search", or "ranking" for a candidate that is rendered again at the end.
+        objective: objective of this single render; NaN if it was not finite.
+        best: largest objective of the search so far, biased upwards; NaN before there
+            is one.
+        success: whether the model was wrong in this render.
+        step_size: step size of the policy, in units of each block's radius; NaN if it
+            has none.
+        gradient_norm: l2 norm of the gradient, after elements that are not finite were
+            set to zero; NaN without a gradient.
+        non_finite: number of gradient elements that were set to zero.
+        seconds: time that the evaluation took.
+        renders: number of renders of all evaluations so far, including this one.
+        samples: multiple of the search's samples per pixel; see `Proposal`.
+    """
+
+    step: int
+    seed: int
+    phase: Phase
+    objective: float
     best: float
-    success: bool  # whether the model was wrong on this render
-    # the policy's, in units of each block's radius; NaN where it has none
+    success: bool
     step_size: float
-    gradient_norm: float  # l2 norm of the gradient after cleaning; NaN without one
-    non_finite: int  # gradient elements that had to be set to zero
-    seconds: float  # seconds that the evaluation took
-    # renders that all evaluations so far took together, this one included
+    gradient_norm: float
+    non_finite: int
+    seconds: float
     renders: int = 0
-    samples: int = 1  # multiple of the search's samples per pixel; see `Proposal`
+    samples: int = 1
 
 
 IsOutOfTime = Callable[[int], bool]
-"""Number of evaluations so far -> whether the time is over."""
+"""(number of evaluations so far) -> whether the time is over."""
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
-"""Called after every evaluation, ranking included, with its record, u, and the (usable)
-evaluation.
+"""Called after every evaluation, also of the ranking, with its record, u, and the
+sanitized evaluation.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search claims. Only `verify` turns a claim into a finding (docs/design.md,
-    "Verification").
+    """The result of a search. It is a claim, which `verify` has to confirm
+    (docs/design.md, "Verification").
+
+    Attributes:
+        best_u: (d,) float32 the best configuration; the start if nothing could be
+            evaluated.
+        best_objective: mean objective of `best_u` in the renders of the ranking; that
+            of its first render if it was not ranked. NaN if nothing could be evaluated,
+            or one of these renders was not finite.
+        claimed_objective: objective of the first render of `best_u`. It is biased
+            upwards, as the configuration was selected for this value.
+        success_rate: fraction of the renders of `best_u` in the ranking in which the
+            model was wrong; without a ranking, that of its first render, 0 or 1.
+        ending: INTERRUPTED if the search was; else FOUND if the success rate is at
+            least a half; else the same as `stopped`.
+        stopped: why the loop stopped, whatever it had found.
+        history: records of the evaluations of the search itself.
+        ranking: records of the renders of the ranking.
+        renders: number of images that were rendered, including those for finite
+            differences and those of the ranking.
+        gradients: number of evaluations with a gradient.
+        non_finite_objectives: number of evaluations whose objective was NaN or
+            infinite.
+        non_finite_elements: number of gradient elements that were set to zero, over all
+            evaluations.
+        seconds: total time, including evaluations.
+        agreement: cosine similarity of each gradient with the one before, in order. It
+            is 1 if neither noise nor the step between them changed the direction.
+            Gradients of zero are left out.
+        counts: how often the policy corrected gradients and steps.
+        distribution: distribution that the policy reached; None if it has none.
+        failures: different failures that the policy met; None if it does not search for
+            them.
     """
 
-    # (d,) float32, what the search found; the start if nothing could be evaluated
     best_u: Tensor
     best_objective: float
-    """Mean objective of `best_u` in its new renders; its raw one if it had none. NaN if
-    nothing could be evaluated, or one of these renders was not finite.
-    """
-    claimed_objective: float  # the raw objective in the search, biased upwards
-    # fraction of its new renders (else of its single raw render) that the model got
-    # wrong
+    claimed_objective: float
     success_rate: float
-    # INTERRUPTED; FOUND if that rate is at least a half; else why the search stopped
     ending: Ending
-    stopped: Ending  # why the loop stopped, whatever it had found
-    history: tuple[StepRecord, ...]  # one record per evaluation of the search itself
-    ranking: tuple[StepRecord, ...]  # one record per new render of a candidate
-    # pictures in all, those that differences took and those of the ranking included
+    stopped: Ending
+    history: tuple[StepRecord, ...]
+    ranking: tuple[StepRecord, ...]
     renders: int
-    gradients: int  # how many of them included a gradient
-    non_finite_objectives: int  # evaluations whose objective was NaN or infinite
-    # gradient elements that were set to zero, over all evaluations
+    gradients: int
+    non_finite_objectives: int
     non_finite_elements: int
-    seconds: float  # total time, evaluations included
+    seconds: float
     agreement: tuple[float, ...] = ()
-    """Cosine similarities of each gradient with the one before, in their order: 1 less
-    what noise and the step between them changed. Gradients of zero are left out.
-    """
-    # what the policy had to do about gradients and steps
     counts: Counts = field(default_factory=Counts)
-    # what the policy found besides `best_u`, if it finds a distribution
     distribution: Distribution | None = None
-    # what the policy knows of different failures, if it looks for them
     failures: Failures | None = None
 
 
 def count_planned_renders(
     steps: int, candidates: int = 4, repeats: int = 2, max_extra_repeats: int = 0
 ) -> int:
-    """Return how many pictures `search` renders at most with these arguments."""
+    """Return the largest number of images that `search` renders with these arguments."""
     return steps + candidates * (repeats + max_extra_repeats)
 
 
@@ -141,24 +174,24 @@ def search(
     1. Until `steps` renders are spent, the policy proposes a batch of configurations
        that do not depend on each other's results. Each is checked against the domain
        and evaluated with a new seed (docs/design.md, "The search"); then the policy is
-       updated. An evaluation costs `Proposal.max_cost` renders at most. What the budget
-       cannot pay is not requested.
-    2. The `candidates` best distinct configurations are rendered `repeats` times again,
-       without gradient, all with the same new seeds. The best by these renders is what
-       the search found: the best of step 1 is partly a lucky one. With `candidates=0`,
-       for an objective without noise, the best of step 1 is returned.
+       updated. An evaluation costs at most `Proposal.max_cost` renders. A gradient or
+       samples that exceed the budget are not requested.
+    2. The `candidates` best distinct configurations are ranked: they are rendered
+       `repeats` times again, without gradient, all with the same new seeds. The best by
+       these renders is returned, because the best of step 1 is partly a lucky one. With
+       `candidates=0`, for an objective without noise, the best of step 1 is returned.
        If every evaluation draws conditions (`Domain.draws_conditions`), the best of
-       step 1 had conditions that made it easy to fail. So the last configuration of the
-       policy replaces the worst candidate.
+       step 1 had conditions under which it is easy to fail. So the last configuration
+       of the policy, which depends on many evaluations, replaces the worst candidate.
        Candidates that are not clearly worse than the best one are then rendered again,
        up to `max_extra_repeats` times (`candidates.select_contenders`).
 
-    A policy that does not handle discrete choices is wrapped in `Choices` where the
-    domain has some.
+    If the domain has discrete choices and the policy does not handle them, it is
+    wrapped in `Choices`.
 
-    A non-finite objective is counted, is never best, and reaches the policy as -inf.
-    `NON_FINITE_LIMIT` of them in a row end the search. KeyboardInterrupt ends it at any
-    time, and the result is made of the evaluations until then.
+    A non-finite objective is counted, is never best, and is passed to the policy as
+    -inf. The search ends after `NON_FINITE_LIMIT` of them in a row. KeyboardInterrupt
+    ends it at any time; the result then contains the evaluations so far.
 
     Args:
         evaluate: renders queries and yields their evaluations, one by one.
@@ -174,8 +207,8 @@ def search(
             most `candidates * (repeats + max_extra_repeats)` renders.
         on_step: called after every evaluation.
         seconds: time limit of step 1, over 0; None for no limit. It is checked after
-            each evaluation, so there is always one, and step 2 comes on top. Policies
-            still plan for `steps`.
+            each evaluation, so there is always at least one. Step 2 is not limited.
+            Policies still plan for `steps`.
         is_out_of_time: returns whether the time is over, by the number of evaluations.
             It replaces `seconds` in a run that is resumed, which must stop where it
             stopped before.
@@ -190,26 +223,34 @@ def search(
     """
     _check_limits(steps, candidates, repeats, max_extra_repeats, seconds)
     started = time.perf_counter()
-    # one candidate is stored even if none is rendered again: it is the result
-    log = _Log(evaluate, domain, on_step, max(1, candidates), kind, render_seed)
+    log = _Log(
+        evaluate,
+        domain,
+        on_step,
+        # without a ranking the best candidate is stored as well: it is the result
+        size=max(1, candidates),
+        kind=kind,
+        render_seed=render_seed,
+    )
+    if is_out_of_time is None:
+        deadline = math.inf if seconds is None else started + seconds
+        is_out_of_time = _make_deadline_check(deadline)
     try:
         with interruptible():
-            deadline = math.inf if seconds is None else started + seconds
-            stopped = _explore(
-                log,
-                policy,
-                steps,
-                seed,
-                is_out_of_time or (lambda _: time.perf_counter() >= deadline),
-            )
+            stopped = _explore(log, policy, steps, seed, is_out_of_time)
             if domain.draws_conditions:
                 log.pool = replace_worst(log.pool, log.last, log.size)
             if candidates:
-                # Step 1 used seed indices below `steps` at most.
+                # Step 1 made at most `steps` evaluations, with seed indices from 0 on.
                 _rank(log, steps, repeats, max_extra_repeats)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
     return _make_result(log, stopped, time.perf_counter() - started)
+
+
+def _make_deadline_check(deadline: float) -> IsOutOfTime:
+    """Return a function that says whether `time.perf_counter` has passed a deadline."""
+    return lambda n_evaluations: time.perf_counter() >= deadline
 
 
 def _check_limits(
@@ -246,8 +287,9 @@ def _check_limits(
 def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     """Return the result of a search from its log.
 
-    A failure is claimed (FOUND) if the model was wrong in at least half of the best
-    candidate's renders. An interrupted search claims nothing, whatever it found.
+    The best candidate is selected by its renders in the ranking. A failure is claimed
+    (FOUND) if the model was wrong in at least half of these. An interrupted search
+    claims nothing, whatever it found.
 
     Args:
         log: log of the search.
@@ -257,6 +299,7 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     best = Candidate(log.domain.start, math.nan, False)
     if log.pool:  # else nothing could be evaluated
         best = select_best(log.pool)
+    # mean of the renders in the ranking, of which one may be -inf
     best_objective = math.nan
     if math.isfinite(best.mean_objective):
         best_objective = best.mean_objective
@@ -264,7 +307,7 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
     result = SearchResult(
         best_u=best.u,
         best_objective=best_objective,
-        claimed_objective=best.objective,
+        claimed_objective=best.objective,  # of its first render
         success_rate=best.success_rate,
         ending=Ending.FOUND if is_claimed else stopped,
         stopped=stopped,
@@ -281,9 +324,9 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
 
 
 def _add_policy_findings(result: SearchResult, log: _Log) -> SearchResult:
-    """Return the result of a search with what its policy knows at the end.
+    """Add the counts, the distribution and the failures of the policy to a result.
 
-    An interrupted batch is passed to the policy as far as it was evaluated.
+    If the last batch was interrupted, the policy is updated with its evaluations first.
     """
     policy = log.policy
     state = log.state
@@ -301,27 +344,29 @@ def _add_policy_findings(result: SearchResult, log: _Log) -> SearchResult:
 
 @dataclass(eq=False)
 class _Log:
-    """The state of a search, the only thing in it that changes.
+    """The mutable state of a search.
 
     Attributes:
-        evaluate: answers queries.
+        evaluate: evaluates queries.
         domain: domain of the search.
         on_step: called after every evaluation.
         size: maximum number of candidates.
         kind: kind of the queries.
         render_seed: root seed of their noise.
         pool: the best candidates so far, the best first.
-        last: the latest configuration with a finite objective.
-        best: largest raw objective so far; NaN before there is one.
+        last: the latest configuration with a finite objective; it need not be in
+            `pool`.
+        best: largest objective so far; NaN before there is one.
         records: records of all evaluations so far.
         gradients: number of gradients that were requested.
         non_finite: number of objectives that were not finite.
-        renders: renders that all evaluations took.
-        previous_gradient: (d,) the latest that is not zero.
+        renders: number of renders of all evaluations.
+        previous_gradient: (d,) the latest gradient that is not zero.
         agreement: cosine similarities of each gradient with the one before.
-        policy: policy that proposes, wrapped in `Choices` if need be.
+        policy: policy that proposes, wrapped in `Choices` if necessary.
         state: state of the policy, after its latest proposals.
-        evaluated_batch: evaluations of these that the policy has not got yet.
+        evaluated_batch: evaluations of these proposals that were not passed to the
+            policy yet.
     """
 
     evaluate: Evaluate
@@ -348,8 +393,9 @@ class _Log:
     ) -> Iterator[Evaluation]:
         """Evaluate proposals; yield each evaluation once it is counted and recorded.
 
-        The time of an evaluation is measured from the one before. The caller's work
-        between two of them is left out.
+        `self.evaluate` is lazy: an evaluation is computed when the loop below requests
+        the next one. Its time is measured from there. The work of the caller, between a
+        `yield` and its next request, is not included.
 
         Args:
             proposals: proposals to evaluate.
@@ -420,6 +466,7 @@ class _Log:
                 self.best = evaluation.objective
             candidate = Candidate(proposal.u, evaluation.objective, evaluation.success)
             self.pool = add_candidate(self.pool, candidate, self.size)
+            # stored even if it is not good enough for the pool
             self.last = candidate
 
     def _make_record(
@@ -510,12 +557,13 @@ def _explore(
         if not proposals:
             return Ending.STALLED
         _check_proposals(proposals, max_proposals, log.domain, name)
-        batch = _limit_batch(proposals, log.domain, steps - log.renders)
+        batch = _limit_batch(proposals, log.domain, renders_left=steps - log.renders)
         log.state = state
         log.evaluated_batch = []
+        # An evaluation may take several renders, so seeds follow from their own count.
         first_index = len(log.records)
-        indices = range(first_index, first_index + len(batch))
-        evaluations = log.evaluate_and_record(batch, indices, "search")
+        seed_indices = range(first_index, first_index + len(batch))
+        evaluations = log.evaluate_and_record(batch, seed_indices, "search")
         for proposal, evaluation in zip(batch, evaluations, strict=True):
             log.evaluated_batch.append((proposal.u, evaluation))
             n_non_finite = 0 if evaluation.is_finite else n_non_finite + 1
@@ -548,8 +596,10 @@ def _limit_batch(
             break
         # A policy may write into its tensor later.
         proposal_copy = replace(proposal, u=proposal.u.clone())
-        batch.append(proposal_copy.limit_cost(domain, renders_left))
-        renders_left -= batch[-1].max_cost(domain)
+        # It may have become cheaper, so the limited proposal is charged.
+        limited_proposal = proposal_copy.limit_cost(domain, renders_left)
+        batch.append(limited_proposal)
+        renders_left -= limited_proposal.max_cost(domain)
     return batch
 
 
@@ -585,15 +635,20 @@ def _repeat_candidates(log: _Log, indices: range) -> None:
         log: log of the search, whose pool changes.
         indices: seed indices, one render of each candidate for each.
     """
-    pool = log.pool
-    proposals = [Proposal(candidate.u) for candidate in pool for _ in indices]
-    # an iterator over the renders of the first candidate, then those of the second, ...
-    evaluations = log.evaluate_and_record(proposals, [*indices] * len(pool), "ranking")
-    for position, candidate in enumerate(pool):
+    candidates = log.pool
+    # All renders of the first candidate come first, then those of the second, and so
+    # on. Each candidate has the same seeds.
+    proposals = [Proposal(candidate.u) for candidate in candidates for _ in indices]
+    seed_indices = [*indices] * len(candidates)
+    evaluations = log.evaluate_and_record(proposals, seed_indices, "ranking")
+    for position, candidate in enumerate(candidates):
         repeated = candidate
+        # `evaluations` is one iterator, so this takes the next ones
         for evaluation in islice(evaluations, len(indices)):
             repeated = repeated.with_repeat(evaluation.objective, evaluation.success)
-            log.pool = (*log.pool[:position], repeated, *pool[position + 1 :])
+            updated = log.pool[:position]
+            not_updated = candidates[position + 1 :]
+            log.pool = (*updated, repeated, *not_updated)
 
 
 def _check_proposals(
@@ -652,8 +707,9 @@ def _check_evaluation(
 ) -> None:
     """Raise RuntimeError if an evaluation does not fit its proposal, which is a bug.
 
-    It must have the gradient that was requested, like u in shape and dtype, and have
-    taken as many renders as the domain states.
+    It must have the gradient that was requested, with the shape and dtype of u. Its
+    cost must be at least the proposal's samples, and at most those with a full
+    gradient; a part of a gradient may have cost less.
 
     Args:
         evaluation: what `evaluate` returned.
@@ -662,19 +718,17 @@ def _check_evaluation(
     """
     gradient = evaluation.gradient
     u = proposal.u
-    min_cost = proposal.samples
-    max_cost = proposal.max_cost(domain)
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")
-    is_like_u = gradient is not None and (gradient.shape, gradient.dtype) == (
-        u.shape,
-        u.dtype,
-    )
-    if proposal.gradient and gradient is not None and not is_like_u:
-        raise RuntimeError(
-            f"evaluate returned a gradient of {gradient.dtype}, shape "
-            f"{tuple(gradient.shape)}; expected {u.dtype}, shape {tuple(u.shape)}"
-        )
+    if proposal.gradient and gradient is not None:
+        is_like_u = gradient.shape == u.shape and gradient.dtype == u.dtype
+        if not is_like_u:
+            raise RuntimeError(
+                f"evaluate returned a gradient of {gradient.dtype}, shape "
+                f"{tuple(gradient.shape)}; expected {u.dtype}, shape {tuple(u.shape)}"
+            )
+    min_cost = proposal.samples
+    max_cost = proposal.max_cost(domain)
     if not min_cost <= evaluation.cost <= max_cost:
         raise RuntimeError(
             f"evaluate took {evaluation.cost} renders; expected {min_cost} to "

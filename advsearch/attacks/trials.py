@@ -1,9 +1,9 @@
-"""Counting successes, saying how sure the count is, and how many samples a pixel trials
-need (docs/design.md).
+"""Counts of successes in trials with their intervals, and the number of samples per
+pixel that trials need (docs/design.md).
 
-Monte Carlo noise takes part of the margin away, and less of it the more samples there
-are. So the margin *drifts* with the sample count, and a verification in the middle of
-that drift credits the scene with what the noise did.
+Monte Carlo noise reduces the margin, and the more so the fewer samples per pixel there
+are. So the margin *drifts* with the sample count. If trials have too few samples, a
+failure that is caused by the noise is taken for one of the scene.
 """
 
 from __future__ import annotations
@@ -28,13 +28,19 @@ from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 
 @dataclass(frozen=True)
 class Trials:
-    """How often something happened in independent trials."""
+    """The number of successes in independent trials.
 
-    successes: int  # successes from 0 to `trials`
-    trials: int  # trials at least 1
-    spp: int  # samples per pixel of every trial
-    # Confidence of the interval; larger than 95 % where trials might have ended at
-    # several looks.
+    Attributes:
+        successes: number of successes, from 0 to `trials`.
+        trials: number of trials, at least 1.
+        spp: samples per pixel of every trial.
+        confidence: confidence of the interval. It is larger than 95 % if the trials
+            might have ended at several looks.
+    """
+
+    successes: int
+    trials: int
+    spp: int
     confidence: float = CONFIDENCE
 
     @property
@@ -43,28 +49,30 @@ class Trials:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Interval that covers the rate in 95 % of all cases, by Clopper and
-        Pearson.
-        """
+        """Clopper and Pearson's interval of the success rate, with `confidence`."""
         return clopper_pearson(self.successes, self.trials, self.confidence)
 
 
 def derive_trial_seed(seed: int, number: int) -> int:
-    """Return the seed of a trial by its number. Groups of trials with the same root
-    seed have the same seeds.
+    """Return the seed of a trial, by its number.
+
+    Groups of trials with the same root seed have the same seeds.
     """
     return stream(seed, "verification", number)
 
 
-# sample counts to try; each quarters the variance of the one before
+# A sample count is chosen by trying the rungs of a ladder, from the lowest on. At each
+# rung a configuration is rendered several times. A *look* is a check of these renders:
+# whether more samples would change the sign of the margin.
+
+# samples per pixel of the rungs; each quarters the variance of the one before
 LADDER = (4, 16, 64, 256)
-# renders of a configuration at each sample count after which one looks at them
+# numbers of renders at a rung after which there is a look
 LOOK_SIZES = (4, 8)
-# renders of a sample count of which no more are made to look at, though there be more
-# trials
+# largest number of renders of a look, even if there are more trials
 MAX_LOOK_SIZE = 20
 
-# (spp, seeds) -> margins in logits, one of each render
+# (spp, seeds) -> margins in logits, one for each render
 MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
 
 
@@ -128,8 +136,8 @@ class Rung:
         name: name of the configuration.
         spp: samples per pixel.
         mean: mean of the margins.
-        half_width: half width of the one-sided 95 % interval of the mean (Student's t),
-            all looks together.
+        half_width: distance from the mean to its one-sided 95 % bound (Student's t).
+            The 5 % are those of all looks together.
         drift: difference of the mean from that of the rung below; NaN at the first.
         is_settled: whether more samples would not change the sign of the mean; see
             `choose_spp`.
@@ -177,35 +185,39 @@ def choose_spp(
     and m' the one at the rung below. The configuration has settled if all of these have
     the same sign, with 95 % confidence:
 
-    - m,
+    - m;
     - m + (m - m'), the margin if more samples changed it as much again as the step from
       the rung below did. The remaining error falls with the sample count, so it is
-      smaller than that,
-    - every single render at the rung. Unless these are as many as the trials to come,
-      m must even exceed the uncertainty of a single render.
+      smaller than that;
+    - every single render at the rung.
 
-    A margin at zero never settles: its verdict depends on the noise. About 5 % settle
-    with the wrong sign at most: 5.1 % of the hardest cases (`benchmarks/verdicts.py`).
-    A rung is checked after some renders and again after more; the 5 % are divided
-    equally among these looks (Bonferroni). A look that cannot settle anything, judging
-    by the noise so far (`_may_settle`), is skipped. If one configuration does not
-    settle, the last rung is returned, with `converged` False.
+    In general m must exceed the uncertainty of a single render, because a trial that
+    follows is a single render. If there are as many renders as trials to come, m must
+    only exceed its own standard error.
 
-    These renders must not be used as trials, because a rung is chosen where they
-    agree: trials have other seeds (`run_trials`). If they were, a claim that holds in
-    75 % of renders would be `found` in 5.9 % of all cases and not in 2.2 %.
+    A margin at zero never settles: its verdict depends on the noise. At most about 5 %
+    settle with the wrong sign: 5.1 % of the hardest cases (`benchmarks/verdicts.py`).
+    At each rung there are several looks, after more and more renders. The 5 % are
+    divided equally among them (Bonferroni). A look is skipped if it cannot show that
+    the margin has settled, according to the noise so far (`_may_settle`). If one
+    configuration does not settle, the last rung is returned, with `converged` False.
+
+    These renders must not be used as trials, because the rung is chosen by their
+    agreement. So trials have other seeds (`run_trials`). Otherwise a claim that holds
+    in 75 % of renders would be `found` in 5.9 % of all cases, instead of 2.2 %.
 
     Args:
         margins: for each configuration, e.g. "adversarial" and "clean", a function
             that renders it (`make_margin_function`). The first should be the one that
             is least likely to settle, as the others are then not rendered.
         seed: root seed.
-        ladder: sample counts, rising, at least one, or InputError. A single one is
-            returned unmeasured.
+        ladder: sample counts, rising. A single one is returned unmeasured.
         trials: number of trials that will follow under the same conditions; 0 if the
-            trials are of another kind. There is one more look after so many renders,
-            the last one, which takes the standard error of m, not the deviation of a
-            single render.
+            trials are of another kind. If it is not too large, there is one more look
+            after this many renders (`list_look_sizes`).
+
+    Raises:
+        InputError: the ladder is empty, not rising, or has a count below 1.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(
@@ -216,22 +228,28 @@ def choose_spp(
         return SampleCount(ladder[0], False, (), 0)
     table = list[Rung]()
     n_renders = 0
-    highest_rung = 1  # index; nothing settles at the first rung, which has none below
+    # Nothing settles at the rung with index 0, which has none below.
+    highest_rung = 1
     look_sizes = list_look_sizes(trials)
     for name, render in margins.items():
+        # for each rung that was rendered, which are the first ones of the ladder
         margins_of_rungs = _climb_ladder(render, seed, ladder, look_sizes, trials)
-        below: list[float] = []  # margins of the rung before
-        # only the rungs that were rendered, from the first on
+        below: list[float] = []  # margins of the rung below; the first has none
         for spp, at_rung in zip(ladder, margins_of_rungs, strict=False):
-            table.append(
-                _summarize_rung(name, spp, at_rung, below, len(look_sizes), trials)
+            row = _summarize_rung(
+                name, spp, at_rung, below, looks=len(look_sizes), trials=trials
             )
+            table.append(row)
             below = at_rung
         n_renders += sum(map(len, margins_of_rungs))
         highest_rung = max(highest_rung, len(margins_of_rungs) - 1)
         if not table[-1].is_settled:
-            return SampleCount(ladder[-1], False, tuple(table), n_renders)
-    return SampleCount(ladder[highest_rung], True, tuple(table), n_renders)
+            return SampleCount(
+                ladder[-1], converged=False, table=tuple(table), renders=n_renders
+            )
+    return SampleCount(
+        ladder[highest_rung], converged=True, table=tuple(table), renders=n_renders
+    )
 
 
 def _summarize_rung(
@@ -250,7 +268,7 @@ def _summarize_rung(
         at_rung: margins of the rung.
         below: margins of the rung below; empty at the first.
         looks: number of looks at a rung.
-        trials: trials that will follow; 0 if other trials follow.
+        trials: number of trials that will follow, as in `choose_spp`.
     """
     mean = fmean(at_rung)
     half_width = (
@@ -258,8 +276,9 @@ def _summarize_rung(
         * _compute_deviation(at_rung)
         / math.sqrt(len(at_rung))
     )
-    if not below:
-        return Rung(name, spp, mean, half_width, math.nan, False)
+    is_first_rung = not below
+    if is_first_rung:
+        return Rung(name, spp, mean, half_width, drift=math.nan, is_settled=False)
     is_settled = _is_settled(at_rung, below, looks, trials)
     return Rung(name, spp, mean, half_width, mean - fmean(below), is_settled)
 
@@ -273,41 +292,45 @@ def _climb_ladder(
 ) -> list[list[float]]:
     """Return the margins of one configuration at each rung that was rendered.
 
-    It ends at the rung at which the configuration settles, or when no later look can
-    settle it. A look renders what is still missing at its rung and at the rung below,
-    with the same seeds at both.
+    Looks are made at rising rungs, and at each rung after more and more renders. They
+    end at the look at which the configuration has settled, or when neither it nor a
+    later one can show that it has. A look needs `count` renders at its rung and at the
+    rung below, with the same seeds at both, and renders those that are missing.
 
     Args:
         margins: renders the configuration; (spp, seeds) to margins.
         seed: root seed.
         ladder: samples per pixel of the rungs, ascending.
-        look_sizes: renders of a rung after which one looks, ascending.
-        trials: trials that will follow; 0 if other trials follow.
+        look_sizes: numbers of renders at a rung after which there is a look, ascending.
+        trials: number of trials that will follow, as in `choose_spp`.
     """
     margins_of_rungs: list[list[float]] = [[] for _ in ladder]
-    n_looks = len(look_sizes)
-    # (index of the rung, renders there), in the order in which one looks
-    all_looks = list(product(range(1, len(ladder)), look_sizes))
-    for look_index, (level, count) in enumerate(all_looks):
-        # at this look, or at a later one
-        may_settle_yet = any(
-            _may_settle(margins_of_rungs, ladder, *level_and_count, n_looks)
-            for level_and_count in all_looks[look_index:]
-        )
-        if not may_settle_yet:
+    n_looks = len(look_sizes)  # at each rung
+
+    def may_settle(rung: int, count: int) -> bool:
+        return _may_settle(margins_of_rungs, ladder, rung, count, n_looks)
+
+    # (index of the rung, number of renders there), in order; the first rung has no look
+    looks = list(product(range(1, len(ladder)), look_sizes))
+    for look_index, (rung, count) in enumerate(looks):
+        remaining_looks = looks[look_index:]  # including this one
+        if not any(may_settle(*look) for look in remaining_looks):
             break
-        if not _may_settle(margins_of_rungs, ladder, level, count, n_looks):
+        if not may_settle(rung, count):
             continue
-        for rung in (level - 1, level):
-            seeds = [stream(seed, "sample count", number) for number in range(count)]
-            new_seeds = seeds[len(margins_of_rungs[rung]) :]
+        seeds = [stream(seed, "sample count", number) for number in range(count)]
+        below = rung - 1
+        for rendered_rung in (below, rung):
+            n_rendered = len(margins_of_rungs[rendered_rung])
+            new_seeds = seeds[n_rendered:]
             if new_seeds:
-                margins_of_rungs[rung] += margins(ladder[rung], new_seeds)
+                new_margins = margins(ladder[rendered_rung], new_seeds)
+                margins_of_rungs[rendered_rung] += new_margins
         if _is_settled(
-            margins_of_rungs[level], margins_of_rungs[level - 1], n_looks, trials
+            margins_of_rungs[rung], margins_of_rungs[below], n_looks, trials
         ):
             break
-    return [rendered for rendered in margins_of_rungs if rendered]
+    return [margins_of_rung for margins_of_rung in margins_of_rungs if margins_of_rung]
 
 
 def _is_settled(
@@ -322,26 +345,24 @@ def _is_settled(
         at_rung: margins of a rung.
         below: margins of the rung below.
         looks: number of looks, which share the 5 %.
-        trials: trials that will follow; 0 if other trials follow.
+        trials: number of trials that will follow, as in `choose_spp`.
     """
     mean = fmean(at_rung)
-    # An earlier look may have rendered more at the rung below.
-    count = min(len(at_rung), len(below))
     deviation = _compute_deviation(at_rung)
-    # m + (m - m'), with the mean m at the rung and m' below: the mean if the rest of the
-    # noise changed it as much as the step from below did
+    # The rung below may have more renders, from an earlier look there.
+    count = min(len(at_rung), len(below))
+    # m + (m - m') of `choose_spp`, and its standard error
     extrapolated = 2.0 * mean - fmean(below)
-    # standard error of 2 m - m'
-    extrapolated_error = math.hypot(
-        2.0 * deviation, _compute_deviation(below)
-    ) / math.sqrt(count)
-    # The trials that follow are judged by the mean of as many renders as these: its
-    # standard error counts. Otherwise each single one has to be on the same side.
-    has_renders_of_trials = count == trials
-    error = deviation / math.sqrt(count) if has_renders_of_trials else deviation
+    single_render_error = math.hypot(2.0 * deviation, _compute_deviation(below))
+    extrapolated_error = single_render_error / math.sqrt(count)
+    # With fewer renders than trials, a single render has to be sure: the trials that
+    # were not rendered are on the same side only if the mean exceeds its deviation.
+    # With as many, they are a sample of the trials, and the standard error suffices.
+    are_as_many_as_trials = count == trials
+    mean_error = deviation / math.sqrt(count) if are_as_many_as_trials else deviation
     sign = math.copysign(1.0, mean)
     quantile = _compute_quantile(count, looks)
-    is_mean_sure = sign * mean > quantile * error
+    is_mean_sure = sign * mean > quantile * mean_error
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
     is_sign_constant = all(sign * value > 0.0 for value in at_rung)
     return is_mean_sure and is_extrapolated_sure and is_sign_constant
@@ -350,44 +371,51 @@ def _is_settled(
 def _may_settle(
     values: Sequence[list[float]],
     ladder: Sequence[int],
-    level: int,
+    rung: int,
     count: int,
     looks: int,
 ) -> bool:
     """Return whether `count` renders at a rung may show that the margin has settled.
 
-    This is an optimistic forecast from the renders so far: the mean may be farther from
-    zero by its standard error, and by as much again as it changed over the last rung.
-    Standard deviations are assumed to stay as they are, and at rungs that were not
-    rendered to fall with the square root of the samples. If margins at the rung have
-    both signs, it cannot settle.
+    This is an optimistic forecast from the renders so far. The largest mean to be
+    expected at the rung is compared with the smallest one that could settle there.
+
+    - Largest: the mean at the last rendered rung, plus its standard error, plus as much
+      again as it changed from the rung below.
+    - Smallest: 2 m - m' has to exceed its error (`_is_settled`). Here only m counts.
+      Standard deviations are those of the renders so far. At a rung that was not
+      rendered they are assumed to fall with the square root of the samples.
+
+    If margins at the rung have both signs, it cannot settle.
 
     Args:
         values: margins of each rung; an empty list if it was not rendered.
         ladder: samples per pixel of the rungs.
-        level: index of the rung in `ladder`.
+        rung: index of the rung in `ladder`.
         count: number of renders at the rung that the look would use.
         looks: number of looks, which share the 5 %.
     """
-    rendered_rungs = [rung for rung in range(level + 1) if values[rung]]
+    rendered_rungs = [index for index in range(rung + 1) if values[index]]
     if not rendered_rungs:
         return True  # nothing is known yet
-    if values[level] and min(values[level]) <= 0.0 <= max(values[level]):
+    was_rendered = bool(values[rung])
+    if was_rendered and min(values[rung]) <= 0.0 <= max(values[rung]):
         return False
+    # The first look renders two rungs, so that there are always two here.
     last_rung = rendered_rungs[-1]
     last_values = values[last_rung]
+    values_below = values[rendered_rungs[-2]]
     mean = fmean(last_values)
-    # the first look renders two rungs, so that there is one before the last
-    drift = abs(mean - fmean(values[rendered_rungs[-2]]))
+    drift = abs(mean - fmean(values_below))
     standard_error = _compute_deviation(last_values) / math.sqrt(len(last_values))
     max_mean = abs(mean) + drift + standard_error
-    # 2 m - m' has to differ from zero (`_is_settled`), with the mean m at the rung and
-    # m' below. Its deviation, for a single render of each:
-    deviation = math.hypot(
-        2.0 * _estimate_deviation(values, ladder, last_rung, level),
-        _estimate_deviation(values, ladder, last_rung, level - 1),
+    # standard deviation of 2 m - m' for a single render of each
+    single_render_error = math.hypot(
+        2.0 * _estimate_deviation(values, ladder, last_rung, rung),
+        _estimate_deviation(values, ladder, last_rung, rung - 1),
     )
-    min_mean = deviation * _compute_quantile(count, looks) / math.sqrt(count)
+    quantile = _compute_quantile(count, looks)
+    min_mean = single_render_error * quantile / math.sqrt(count)
     return min_mean <= max_mean
 
 
@@ -396,11 +424,11 @@ def _estimate_deviation(
 ) -> float:
     """Return the standard deviation of the margins of a rung, rendered or not.
 
-    At a rung that was not rendered, it is that of the last rendered one, which falls
-    with the root of the samples.
+    At a rung that was not rendered, it is estimated from the last rendered one: it
+    falls with the square root of the samples.
 
     Args:
-        values: margins of each rung; empty of one that was not rendered.
+        values: margins of each rung; an empty list if it was not rendered.
         ladder: samples per pixel of the rungs.
         last_rung: index of the last rung that was rendered.
         rung: index of the rung.
@@ -413,10 +441,10 @@ def _estimate_deviation(
 
 
 def list_look_sizes(trials: int = 0) -> tuple[int, ...]:
-    """Return after how many renders at a sample count one looks whether the margin has
-    settled (`choose_spp`).
+    """Return the numbers of renders at a rung after which there is a look, ascending.
 
-    The number of trials is one more look if it is above the others, but not too large.
+    They are `LOOK_SIZES`, and the number of trials if it is above these but not above
+    `MAX_LOOK_SIZE`.
     """
     if LOOK_SIZES[-1] < trials <= MAX_LOOK_SIZE:
         return (*LOOK_SIZES, trials)
@@ -443,25 +471,30 @@ def _compute_deviation(values: Sequence[float]) -> float:
 
 
 def _compute_quantile(count: int, looks: int) -> float:
-    """Return the quantile of Student's t for one bound of the interval of a mean.
+    """Return the quantile of Student's t for the one-sided bound of a mean.
+
+    It is one-sided, since a margin can only settle on the side of zero where its mean
+    is. So the 5 % lie on one side, and are divided equally among the looks.
 
     Args:
         count: number of values.
-        looks: number of looks, which share the 5 % equally.
+        looks: number of looks.
     """
-    return float(stdtrit(count - 1, 1.0 - (1.0 - CONFIDENCE) / looks))
+    error_per_look = (1.0 - CONFIDENCE) / looks
+    return float(stdtrit(count - 1, 1.0 - error_per_look))
 
 
 # ---- sample counts of trials over many conditions
-# How many samples per pixel the rate of such trials needs (docs/design.md).
+# The number of samples per pixel that the rate of such trials needs (docs/design.md).
 
-# conditions under which each configuration is rendered at each sample count
+# number of conditions under which each configuration is rendered at each sample count
 N_CONDITIONS = 30
-# fraction of the conditions whose margin more samples may carry over zero
+# A configuration has settled if more samples would change the sign of the margin in at
+# most this fraction of the conditions.
 MAX_MOVED_FRACTION = 0.05
-OVER_LADDER = LADDER[:3]  # sample counts to try
-# limit of the samples of a check beyond the second rung, as a multiple of those of the
-# searches
+OVER_LADDER = LADDER[:3]  # samples per pixel of the rungs
+# Limit of the samples of a check, as a multiple of those of the searches. It does not
+# apply to the first two rungs.
 MAX_SAMPLE_RATIO = 2
 
 FloatArray = npt.NDArray[np.float64]
@@ -493,12 +526,13 @@ def choose_rate_spp(
     needed is returned.
 
     A configuration is rendered under the same `N_CONDITIONS` conditions at each rung.
-    Suppose that more samples changed all margins by the mean change from the rung
-    below, at either bound of its 95 % interval (Student's t). The configuration has
-    settled if this would move at most `MAX_MOVED_FRACTION` of the conditions across
-    zero (`estimate_moved_fraction`). The remaining error falls with the sample count,
-    so it is smaller than that change. `benchmarks/verdicts.py` measures the error of
-    the rate. These renders are not used as trials.
+    The mean change of the margins from the rung below has a 95 % interval (Student's
+    t). It is assumed that more samples would change all margins again by as much as one
+    of the bounds of this interval; the worse bound is taken. The configuration has
+    settled if this changes the sign in at most `MAX_MOVED_FRACTION` of the conditions
+    (`estimate_moved_fraction`). The remaining error falls with the sample count, so the
+    true change is smaller. `benchmarks/verdicts.py` measures the error of the rate.
+    These renders are not used as trials.
 
     Args:
         margins: for each configuration, by name, a function that renders it
@@ -507,21 +541,24 @@ def choose_rate_spp(
         ladder: sample counts, ascending. A single one is returned unmeasured.
     """
     if len(ladder) == 1:
-        return SampleCount(ladder[0], False, (), 0)
+        return SampleCount(ladder[0], converged=False, table=(), renders=0)
     table = list[Rung]()
-    # index; nothing settles at the first rung, which has none below
+    # Nothing settles at the rung with index 0, which has none below.
     highest_rung = 1
+    have_settled = True
     seeds = [stream(seed, "sample count", number) for number in range(N_CONDITIONS)]
     for name, render in margins.items():
         rungs = _climb_until_settled(name, render, seeds, ladder)
         table += rungs
-        if not rungs[-1].is_settled:
-            return SampleCount(
-                ladder[-1], False, tuple(table), N_CONDITIONS * len(table)
-            )
+        have_settled = rungs[-1].is_settled
+        if not have_settled:
+            break
         highest_rung = max(highest_rung, len(rungs) - 1)
     return SampleCount(
-        ladder[highest_rung], True, tuple(table), N_CONDITIONS * len(table)
+        ladder[highest_rung] if have_settled else ladder[-1],
+        converged=have_settled,
+        table=tuple(table),
+        renders=N_CONDITIONS * len(table),  # each rung has one under each condition
     )
 
 
@@ -561,7 +598,8 @@ def _summarize_conditions(
         at_rung: (n,) margins of the rung, by condition.
         below: (n,) margins of the rung below; None at the first.
     """
-    quantile = stdtrit(len(at_rung) - 1, CONFIDENCE)  # Student's t, one-sided
+    # one-sided, as `Rung.half_width` is
+    quantile = stdtrit(len(at_rung) - 1, CONFIDENCE)
     half_width = quantile * at_rung.std(ddof=1) / math.sqrt(len(at_rung))
     drift = math.nan
     is_settled = False
@@ -573,12 +611,12 @@ def _summarize_conditions(
 
 
 def estimate_moved_fraction(at_rung: FloatArray, below: FloatArray) -> float:
-    """Return the fraction of conditions whose margin more samples may carry over zero.
+    """Return the fraction of conditions whose margin may change sign with more samples.
 
-    It is supposed that more samples change all margins by the mean change from the rung
-    below, at either bound of its 95 % interval. The bound that moves more conditions
-    across zero counts. The distribution of margins is smoothed by normal kernels. NaN
-    if a margin is not finite.
+    It is assumed that more samples change all margins by the mean change from the rung
+    below. This change has a 95 % interval; of its bounds, the one that changes more
+    signs is taken. The distribution of margins is smoothed by normal kernels. NaN if a
+    margin is not finite.
 
     Args:
         at_rung: (n,) margins at one sample count, by condition.

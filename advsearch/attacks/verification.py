@@ -1,6 +1,8 @@
-"""The independent check of what a search found (docs/design.md, "Verification"): fresh
-seeds, enough samples, 8 bits, a task that judges, and a control group of the clean
-configuration. The rule of a verdict stands here only.
+"""The independent check of the result of a search (docs/design.md, "Verification").
+
+The configuration is rendered again in *trials*: with new seeds, enough samples, and 8
+bits per channel. The task evaluates the predictions. The clean configuration is
+rendered with the same seeds, as a control group. `Rule` decides on the verdict.
 """
 
 from __future__ import annotations
@@ -22,9 +24,9 @@ from advsearch.tasks import Judgement
 
 
 class Ending(Enum):
-    """Why a search or a run stopped. The value is what JSON holds; `explanation` is one
-    sentence for a person. What a search ends with is a claim; only `verify` makes it a
-    finding (docs/design.md, "Verification").
+    """Why a search or a run stopped. The value is stored in JSON; `explanation` is a
+    sentence for the user. The ending of a search is a claim, which `verify` has to
+    confirm (docs/design.md, "Verification").
     """
 
     explanation: str
@@ -71,51 +73,55 @@ PASS_PERCENT = 95
 PASS_PERCENT_OVER = 90
 
 TRIAL_LOOKS = 14, 23
-"""Trials after which a verdict may stand, if the user set no number: `found` takes 14
-of 14, or 22 of 23.
+"""Numbers of trials after which there may be a verdict (looks), if the user set no
+number. `found` needs 14 of 14, or 22 of 23 successes.
 
-What holds in 75 % or less is found in 2.4 % of all cases at most, as by 19 of 20, and
-the interval of what is found begins at 77 %, by 19 of 20 at 75 %.
-`benchmarks/verdicts.py` has both exactly.
+A claim that holds in at most 75 % of trials is found in at most 2.4 % of all cases, as
+with 19 of 20. The interval of the rate of what is found begins at 77 %, with 19 of 20
+at 75 %. `benchmarks/verdicts.py` computes both exactly.
 """
 
 OVER_EARLY = {30: 30, 60: 59, 100: 95, 150: 141}
 OVER_LOOKS = *OVER_EARLY, 200
-"""Trials over many conditions after which a verdict may stand, if the user set no
-number. All but the last are numbers of trials that count (the clean configuration is
-right), with the successes that `OVER_EARLY` has for them; the last is one of all
-trials.
+"""Numbers of trials over many conditions after which there may be a verdict (looks), if
+the user set no number. All but the last are numbers of trials that count, which are
+those in which the clean configuration is right; `OVER_EARLY` has the successes that
+each of them needs. The last look is after 200 trials, whether they count or not.
 
-What holds in 85 % or less is found in 3.3 % of all cases at most, and in 2.6 % by 180
-of 200 alone.
+A claim that holds in at most 85 % of trials is found in at most 3.3 % of all cases, and
+in 2.6 % with a single look at 180 of 200.
 """
 OVER_CONFIDENCE = 0.97
-"""Confidence of a Clopper-Pearson interval after `OVER_LOOKS`, so that it covers the
-rate in 95 % of all cases (`benchmarks/verdicts.py`): somebody who looks five times is
-lucky more often than somebody who looks once.
+"""Confidence of a Clopper-Pearson interval after `OVER_LOOKS`. It is over 95 %, because
+several looks raise the chance of a lucky one. So the interval covers the rate in 95 %
+of all cases (`benchmarks/verdicts.py`).
 """
 
 MIN_RATE = 0.5
-"""Where the 95 % interval of a claim's rate may begin: what is called found holds more
-often than not. So 6 trials are the fewest that can verify anything (54 to 100 %); 5 of
-5 begin at 48 %.
+"""Smallest lower bound of the 95 % interval of the success rate of a verified claim: it
+holds in more than half of all trials. So at least 6 trials are needed to verify
+anything: the interval of 6 of 6 is 54 to 100 %, that of 5 of 5 begins at 48 %.
 """
 
 
 @dataclass(frozen=True)
 class Rule:
-    """When a claim counts as verified."""
+    """When a claim counts as verified.
 
-    percent: int = PASS_PERCENT  # percent of the trials in which it must hold
+    Attributes:
+        percent: percentage of the trials that have to succeed.
+        has_control: whether the clean configuration is a control group. Then a trial
+            only succeeds if the clean prediction with the same seed is right, and the
+            clean configuration has to be right in `percent` of its trials as well.
+        is_conditional: whether conditions vary from trial to trial, some of which may
+            be difficult by themselves. Then only trials with a right clean prediction
+            count, and the percentage is of these. The clean configuration has to be
+            right in half of all trials.
+    """
+
+    percent: int = PASS_PERCENT
     has_control: bool = True
-    """A success counts only where the clean configuration is right, which it has to be
-    in as many per cent.
-    """
     is_conditional: bool = False
-    """The percentage is one of the trials in which the clean configuration is right,
-    and it has to be right in half of all: for conditions that vary, and may be hard
-    ones by themselves.
-    """
 
     def count_needed(self, trials: int, *, early: bool = False) -> int:
         """Return how many of `trials` must succeed.
@@ -130,16 +136,21 @@ class Rule:
         """
         n_required = self.count_percent(trials)
         if early and self.is_conditional:
+            # an early look is always after exactly this many trials that count
             n_required = OVER_EARLY[trials]
+        # with fewer trials than `min_trials`, even all successes are not enough
         return max(n_required, self.min_trials)
 
     def count_allowed_failures(self, trials: int) -> int:
+        """Return how many of `trials` may fail; below 0 for too few trials."""
         return trials - self.count_needed(trials)
 
     @property
     def min_trials(self) -> int:
-        """Smallest number of trials that can verify anything: if as many succeed as the
-        percentage needs, the interval of the rate begins at `MIN_RATE` at least.
+        """Smallest number of trials that can verify a claim.
+
+        If `percent` of these trials succeed, the lower bound of the interval of the
+        success rate is at least `MIN_RATE`.
         """
         return next(
             n
@@ -154,8 +165,10 @@ class Rule:
     def is_success(self, trial: Judgement, clean: Judgement) -> bool:
         """Return whether a trial is a success, given the clean trial of the same seed.
 
-        With a control group, the clean trial has to be right, so that failures by noise
-        alone do not count. Without one, the trial needs a larger score than the clean.
+        With a control group, the clean prediction has to be right, so that failures
+        that the noise alone causes do not count. Without one, the score of the trial
+        has to exceed that of the clean trial. Scores are those of the task: the larger,
+        the closer to what the search seeks.
         """
         if not trial.success:
             return False
@@ -179,9 +192,9 @@ class Rule:
     def decide(self, successes: int, trials: int) -> bool | None:
         """Return whether a configuration is a success by its trials.
 
-        None if that depends on the noise: it succeeds too often to be called a failure
-        and fails too often to be called a success. Trials agree if the rarer outcome,
-        whichever it is, occurs at most as often as the rule allows failures.
+        True if almost all trials succeed, and False if almost all fail: then the rarer
+        outcome occurs at most as often as the rule allows failures. Otherwise the
+        outcome depends on the noise, and the result is None.
         """
         failures = trials - successes
         n_exceptions = min(successes, failures)
@@ -194,9 +207,13 @@ class Rule:
     ) -> Ending:
         """Return the ending of a run, by its search and by the trials of both groups.
 
-        It is FOUND if both groups have as many successes as the rule needs, even if the
-        search claimed nothing. Over conditions, or without a control group, only the
-        adversarial trials need as many.
+        It is FOUND if the adversarial trials have as many successes as the rule needs,
+        even if the search claimed nothing. The clean trials need as many right
+        predictions, unless there is no control group, or conditions vary: then trials
+        with a wrong clean prediction are left out already.
+
+        A claim of the search that the trials do not confirm is NOT_VERIFIED. Any other
+        ending of the search stays.
 
         Args:
             search: how the search ended. INTERRUPTED is never changed.
@@ -216,40 +233,51 @@ class Rule:
         )
         if is_control_right and is_verified:
             return Ending.FOUND
-        return Ending.NOT_VERIFIED if search is Ending.FOUND else search
+        was_claimed = search is Ending.FOUND
+        return Ending.NOT_VERIFIED if was_claimed else search
 
 
 WORST_CASE = Rule()
 OVER_CONDITIONS = Rule(PASS_PERCENT_OVER, is_conditional=True)
 EASIER = Rule(has_control=False)
-"""For `--minimise`: the clean configuration may be wrong, so there is no control group
-to pass; but a success has to be recognised better than the clean one with the same
-seed.
+"""For `--minimise`: the clean configuration may be wrong, so there is no control group.
+But a success has to have a larger score than the clean trial with the same seed.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """What the trials say."""
+    """The result of the trials.
 
-    ending: Ending  # the run's; see `Rule.decide_ending`
-    reason: str  # one sentence with the numbers behind it
-    u: Tensor  # (d,) the configuration verified, projected into its budget again
-    clean_counts: Trials  # right predictions of the control group
-    adversarial_counts: Trials  # successes, by `Rule.is_success`
-    # every single trial, in the order of their seeds
+    Attributes:
+        ending: ending of the run, by `Rule.decide_ending`.
+        reason: one sentence with the counts behind it.
+        u: (d,) the configuration that was verified, projected into its budget again.
+        clean_counts: counts of right predictions in the control group.
+        adversarial_counts: counts of successes, by `Rule.is_success`.
+        clean_trials: all trials of the clean configuration, in the order of their
+            seeds.
+        adversarial_trials: all trials of the adversarial configuration, in the same
+            order. If trials are curtailed, there are fewer of these.
+        renders: number of renders of the trials.
+        stopped: why there are no more trials: "asked for" (the number that was
+            requested) or "decided" (further ones could not change the verdict).
+        outcomes: for each adversarial trial, whether it is a success. None if it does
+            not count, because the clean prediction is wrong under its conditions.
+        first_index: index of the first trial.
+    """
+
+    ending: Ending
+    reason: str
+    u: Tensor
+    clean_counts: Trials
+    adversarial_counts: Trials
     clean_trials: tuple[Judgement, ...]
-    # likewise; of curtailed ones this group is the shorter
     adversarial_trials: tuple[Judgement, ...]
-    renders: int  # spent here
-    # why there are no more trials: "asked for" (as many as were), "decided" (the
-    # verdict stands)
+    renders: int
     stopped: str
     outcomes: tuple[bool | None, ...]
-    """Of each trial of the second group, whether it is a success; None where it does
-    not count, as under its conditions the clean configuration is wrong.
-    """
-    first_index: int = 0  # the number of the first trial
+    first_index: int = 0
 
     @property
     def valid_trials(self) -> tuple[Judgement, ...]:
@@ -265,6 +293,7 @@ class Verification:
 
     @property
     def successful_trials(self) -> tuple[Judgement, ...]:
+        """The adversarial trials that are a success."""
         return tuple(itertools.compress(self.adversarial_trials, self.outcomes))
 
 
@@ -355,9 +384,9 @@ def verify(
 
     `trials` may be several ascending numbers, such as `TRIAL_LOOKS`. They are looks:
     after that many trials the successes are counted, and if they suffice, no more
-    trials follow. Over conditions only trials with a right clean prediction count: a
-    look is then at so many of these (`OVER_LOOKS`), but the last number is the limit of
-    all trials.
+    trials follow. If conditions vary, a look is after this many trials that count: those
+    with a right clean prediction (`OVER_LOOKS`). The last number is the
+    maximum of all trials.
 
     Curtailed trials end as soon as more have failed than the rule allows: the remaining
     trials could not change the verdict. Their Clopper-Pearson interval still covers the
@@ -365,8 +394,8 @@ def verify(
     rule (Jennison and Turnbull 1983).
 
     Trials with several looks are always curtailed, but at least `Rule.min_trials` are
-    made, as fewer say nothing of the rate. `benchmarks/verdicts.py` computes from the
-    probability of every outcome that their intervals cover the rate.
+    made, as fewer say nothing about the rate. `benchmarks/verdicts.py` checks that
+    their intervals cover the rate, from the probability of every outcome.
 
     Args:
         evaluate: renders the queries and yields their evaluations.
@@ -377,21 +406,21 @@ def verify(
         seed: root seed. Must not be one that the search rendered with through the same
             stream.
         trials: number of trials of each group; or ascending numbers, the looks.
-        clean: the first trials of the clean configuration, where `run_trials` has run
-            them with the same spp and seed (one control group serves the attack and its
-            baseline); what is missing is run here.
-        rule: what counts as a success, and which ending it is.
+        clean: trials of the clean configuration that `run_trials` has run already, with
+            the same spp and seed. So an attack and its baseline can share a control
+            group. Missing ones are run here.
+        rule: decides what counts as a success, and on the ending.
         kind: kind of the queries of the adversarial configuration.
         control_kind: kind of the queries of the clean configuration.
         n_images: number of adversarial trials, the first ones, with an image.
-        curtailed: whether trials end early once too many have failed; for a claim of
-            which only the verdict matters, not the rate.
+        curtailed: whether trials end early once too many have failed. This is for a
+            claim if only the verdict matters, not the rate.
         first_index: index of the first trial, which decides its seed. If trials chose
             the configuration, the new ones must begin after these.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
     has_several_looks = len(looks) > 1
-    # so many adversarial trials are made even if the verdict stands sooner
+    # As many adversarial trials are made at least, even if too many have failed sooner.
     min_trials = rule.min_trials if has_several_looks and not curtailed else 0
     u = domain.project(u)
     clean_trials = list(clean)
@@ -425,9 +454,10 @@ def verify(
             rule, done, clean_trials, count, spp=spp, is_early=is_early
         )
         # `run` stops before `count` trials if too many of them failed.
-        if len(done) < count or has_failed(()) or is_success or not is_early:
+        was_curtailed = len(done) < count
+        if was_curtailed or has_failed(()) or is_success or not is_early:
             break
-    # as many as were asked for, and no look before
+    # as many trials as were requested, and no look before
     is_complete = not has_several_looks and len(done) == looks[0]
     return _summarize_trials(
         rule,
@@ -437,7 +467,7 @@ def verify(
         done,
         spp=spp,
         confidence=_choose_confidence(rule, has_several_looks=has_several_looks),
-        renders=len(done) + len(clean_trials) - len(clean),  # those that were made here
+        renders=len(done) + len(clean_trials) - len(clean),  # without those of `clean`
         stopped="asked for" if is_complete else "decided",
         is_early=is_success and is_early,
         begin=first_index,
@@ -465,8 +495,8 @@ def _fails_too_often(
 def _choose_confidence(rule: Rule, *, has_several_looks: bool) -> float:
     """Return the confidence of the Clopper-Pearson interval of the success rate.
 
-    It is larger where trials over conditions may have ended at several looks, so that
-    the interval covers the rate in 95 % of all cases nevertheless.
+    If conditions vary and there are several looks, it is larger than 95 %, so that the
+    interval still covers the rate in 95 % of all cases.
     """
     return OVER_CONFIDENCE if rule.is_conditional and has_several_looks else CONFIDENCE
 
@@ -480,21 +510,23 @@ def _extend_clean_trials(
 ) -> int:
     """Run clean trials until `look` of them count, or there are `max_trials`.
 
-    Over conditions (weather, viewpoints, ...) a clean trial that is wrong does not
-    count, so another is run for it.
-
-    Returns:
-        How many trials are needed for this look, those that do not count included.
+    If conditions vary (weather, viewpoints, ...), a clean trial that is wrong does not
+    count, so another one is run in its place.
 
     Args:
         clean_trials: clean trials so far; new ones are appended.
-        run_clean: runs trials of the clean configuration (`run_trials`).
-        rule: says which trials count.
+        run_clean: runs trials of the clean configuration. Like `run_trials` it takes
+            `trials`, the total number, and `n_done`, how many of these are done.
+        rule: decides which trials count.
         look: number of trials that have to count.
         max_trials: maximum number of trials.
+
+    Returns:
+        The number of trials that this look needs, including those that do not count.
+        `clean_trials` may have more than these, from another verification.
     """
     count = look
-    # There may be more than `count` already, from an earlier call: then none is run.
+    # If there are more than `count` already, none is run.
     clean_trials += run_clean(trials=count, n_done=len(clean_trials))
     n_missing = look - rule.count_valid(clean_trials[:count])
     while n_missing > 0 and count < max_trials:
@@ -519,31 +551,36 @@ def _is_found(
     configuration already.
 
     Args:
-        rule: says how many have to succeed.
-        trials: trials of the adversarial configuration.
+        rule: decides how many have to succeed.
+        trials: trials of the adversarial configuration, at most `count`.
         clean_trials: clean trials of the same seeds, or more.
-        count: number of clean trials that count here, the first ones.
-        spp: samples per pixel.
+        count: number of trials at this look; further clean trials are ignored.
+        spp: samples per pixel of the trials.
         is_early: whether more trials could follow.
     """
-    counted_clean_trials = clean_trials[:count]
-    n_valid = rule.count_valid(counted_clean_trials)
+    clean_trials_of_look = clean_trials[:count]
+    n_valid = rule.count_valid(clean_trials_of_look)
     n_needed = rule.count_needed(n_valid, early=is_early)
-    n_successes = _list_outcomes(rule, trials, clean_trials).count(True)
-    is_clean_wrong = rule.is_already_wrong(count_right(counted_clean_trials, spp))
+    outcomes = _list_outcomes(rule, trials, clean_trials_of_look)
+    n_successes = outcomes.count(True)
+    is_clean_wrong = rule.is_already_wrong(count_right(clean_trials_of_look, spp))
     return n_successes >= n_needed and not is_clean_wrong
 
 
 def _list_outcomes(
     rule: Rule, trials: Sequence[Judgement], clean_trials: Sequence[Judgement]
 ) -> tuple[bool | None, ...]:
-    """Return whether each trial is a success; None where it does not count.
+    """Return whether each trial is a success, or None if it does not count.
 
-    Where conditions vary (`Rule.is_conditional`), a trial does not count if the model
-    is wrong about the clean configuration under the same conditions.
+    If conditions vary (`Rule.is_conditional`), a trial does not count if the clean
+    prediction under the same conditions is wrong.
+
+    Args:
+        rule: decides what a success is.
+        trials: trials of the adversarial configuration.
+        clean_trials: clean trials of the same seeds; further ones are ignored.
     """
     outcomes: list[bool | None] = []
-    # there may be more clean trials than others
     for trial, clean in zip(trials, clean_trials, strict=False):
         if rule.is_conditional and not clean.right:
             outcomes.append(None)
@@ -580,11 +617,13 @@ def _summarize_trials(
         confidence: confidence of the interval of the success rate.
         renders: number of renders that the trials took.
         stopped: why there are no more trials: "asked for" or "decided".
-        is_early: whether the needed successes are those of an early look.
+        is_early: whether the claim was found at an early look. Then the reason states
+            the larger number of successes that this look needs.
         begin: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
-    # None marks a trial that does not count; a rate of no trials would be 0 / 0.
+    # None marks a trial that does not count. `Trials` needs at least 1, as the rate of
+    # none would be 0 / 0.
     n_counted = max(1, len(outcomes) - outcomes.count(None))
     clean_counts = count_right(clean_trials, spp)
     counts = Trials(outcomes.count(True), n_counted, spp, confidence)

@@ -1,3 +1,3 @@
-"""What every question is answered with: problems, stages, replay, sweeps, plans and
-domains.
+"""The engine of all experiments: problems, predictors of images, trials, gradients and
+the journal.
 """

@@ -2,11 +2,11 @@
 
 The rule is the same for matrices and for light on surfaces.
 
-A few views are traced beside predicted ones (docs/surface-light.md, "How far off
-predictions may be"). Noise averages out over a search, and bias does not: a search
-climbs it. So a prediction may be as noisy as a rendered image, on the object alone,
-which may be small. On average over the views it may not move the margin, except for a
-small part of what the search has moved it.
+A few views are predicted and also traced (docs/surface-light.md, "How far off
+predictions may be"). Noise averages out over a search, but bias does not: a search
+would follow it. So a prediction may be as noisy as a rendered image; this is measured
+on the object only, which may be small. Its mean error of the margin has to be near
+zero: at most a small fraction of the change that the search has made.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.scene.renderer import Renderer
 
-# largest accepted mean difference of the margin over the views (of a classifier:
-# logits)
+# largest accepted mean error of the margin over the views (for a classifier: in logits)
 MAX_MARGIN_BIAS = 0.3
 MAX_BIAS_FRACTION = 0.05
-"""The same as a fraction of what the search has moved the margin, where that is larger.
-
-So much affects the length of a step that is predicted, and not its direction.
+"""The same as a fraction of the change of the margin by the search; the larger limit
+counts. Such an error affects the length of a predicted step, but not its direction.
 """
-# accepted root mean square over the object, in levels of 255, where a rendered image
-# has less noise
+# The root-mean-square error on the object may always be this large, in levels of 255,
+# even if a rendered image has less noise.
 MIN_ALLOWED_LEVELS = 2.0
 # fraction of the allowed levels that is accepted, so that a prediction beyond the limit
-# seldom passes by chance
+# rarely passes by chance
 ACCEPTED_FRACTION = 0.9
 CHECK_SPP = 16  # samples per pixel of each of the two traced images of a view
-N_FIRST_VIEWS = 2  # views that are compared at first
-N_VIEWS = 6  # views that are compared where the first do not decide
-# fractions of what is allowed up to which, and from which on, the first views decide
+N_FIRST_VIEWS = 2  # number of views that are compared at first
+N_VIEWS = 6  # number of views that are compared if the first do not decide
+# The first views decide if the error is at most the first, or at least the second
+# fraction of what is allowed.
 CLEARLY_GOOD = 0.7
 CLEARLY_BAD = 1.4
 
@@ -52,12 +51,12 @@ class ComparedView:
     """A predicted image compared with traced ones.
 
     Attributes:
-        squared_error: mean squared error over the object, in levels of 255 squared;
-            below 0 by chance where it is small.
+        squared_error: mean squared error over the object, in levels of 255 squared; a
+            small one may be below 0 by chance.
         allowed_squared_error: the same of a rendered image.
-        margin_bias: by how much its margin is larger than the traced one.
-        n_traced: images that were traced.
-        margin_change: by how much the search has moved the margin of predicted images.
+        margin_bias: margin of the predicted image minus that of the traced one.
+        n_traced: number of images that were traced.
+        margin_change: absolute change of the margin by the search, in predicted images.
     """
 
     squared_error: float
@@ -69,14 +68,14 @@ class ComparedView:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far predictions are off, over several views.
+    """The error of predictions, over several views.
 
     Attributes:
-        levels: root mean square over the object, in levels of 255.
-        margin_bias: mean difference of the margin.
-        allowed_levels: levels that are allowed.
-        n_traced: images that were traced to measure it.
-        allowed_margin_bias: difference of the margin that is allowed.
+        levels: root-mean-square error over the object, in levels of 255.
+        margin_bias: mean error of the margin, with its sign.
+        allowed_levels: limit of `levels`.
+        n_traced: number of images that were traced to measure it.
+        allowed_margin_bias: limit of the absolute value of `margin_bias`.
     """
 
     levels: float
@@ -87,11 +86,10 @@ class Deviation:
 
     @classmethod
     def from_views(cls, views: Sequence[ComparedView]) -> Deviation:
-        """Return the deviation of predictions over several views, by means over the
-        views.
+        """Return the deviation of predictions, from means over several views.
 
-        The margin may be off by `MAX_MARGIN_BIAS`, or by a fraction of what the search
-        has moved it, whichever is larger.
+        The error of the margin may be `MAX_MARGIN_BIAS`, or a fraction of the change of
+        the margin by the search, whichever is larger.
         """
         square = statistics.fmean(view.squared_error for view in views)
         allowed_square = statistics.fmean(view.allowed_squared_error for view in views)
@@ -125,7 +123,10 @@ class Deviation:
 
     @property
     def reason(self) -> str:
-        """Why predictions may not replace rendered images, for a sentence."""
+        """Why predictions may not replace rendered images, as a part of a sentence.
+
+        If the levels are small enough, it is the margin.
+        """
         if not self.has_accepted_levels:
             max_levels = ACCEPTED_FRACTION * self.allowed_levels
             return (
@@ -154,9 +155,11 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     is_clearly_good = (
         first.levels_fraction <= CLEARLY_GOOD and abs(first.margin_bias) <= margin_limit
     )
-    may_be_good = first.levels_fraction < CLEARLY_BAD
-    if not is_clearly_good and may_be_good:
-        views += [compare_view(index) for index in range(N_FIRST_VIEWS, N_VIEWS)]
+    # A margin alone is never clearly bad. The `not` makes NaN clearly bad.
+    is_clearly_bad = not first.levels_fraction < CLEARLY_BAD
+    if is_clearly_good or is_clearly_bad:
+        return first
+    views += [compare_view(index) for index in range(N_FIRST_VIEWS, N_VIEWS)]
     return Deviation.from_views(views)
 
 

@@ -32,15 +32,16 @@ from advsearch.scene.transport.matrix import (
 )
 from advsearch.trust.stored_files import scale_limit
 
-# conditions in the bank at first, as a multiple of those of an evaluation
+# initial number of conditions in the bank, as a multiple of those of an evaluation
 INITIAL_CONDITIONS = 8
-# conditions that evaluations draw for each that is added, while the bank grows
+# While the bank grows, one condition is added for each `DRAWS_PER_CONDITION` that are
+# drawn.
 DRAWS_PER_CONDITION = 4
-COMPARISON_INTERVAL = 100  # evaluations from one comparison to the next
-# conditions that a comparison traces, and as many of the bank that it predicts
+COMPARISON_INTERVAL = 100  # number of evaluations from one comparison to the next
+# A comparison traces this many new conditions, and predicts as many of the bank.
 N_COMPARED = 16
-# standard errors by which unseen conditions must be better for the model, for the bank
-# to grow
+# The bank grows if the objective under unseen conditions is smaller by this number of
+# standard errors.
 MIN_STANDARD_ERRORS = 1.0
 SPP = 4  # samples per pixel of a condition's light (see `problem.LIGHT_DEPTH`)
 BATCH_SIZE = 16  # images in a batch of the model
@@ -98,11 +99,11 @@ class Condition:
     """A condition of the bank, and its matrix.
 
     Attributes:
-        index: its index in the bank's sequence.
+        index: index in the sequence of all conditions of the bank.
         u: (d,) coordinates of the condition.
-        renderer: predicts images under it.
-        depends_on_searched_only: whether base colors under it depend only on what is
-            searched.
+        renderer: predicts images under the condition.
+        depends_on_searched_only: whether the inputs of the matrix, such as base colors,
+            depend only on the searched controls, and not on the condition.
     """
 
     index: int
@@ -115,11 +116,15 @@ class Condition:
 class Bank(PredictedSearch):
     """The matrices of a run whose searches have random conditions.
 
+    The bank begins with some conditions, and grows during the search. At regular
+    intervals it is compared with unseen conditions. It grows on only if the search has
+    adapted to the conditions of the bank, or if predictions are inaccurate.
+
     Attributes:
-        trace: collects the light of conditions, on workers where there are some.
-        growth_steps: evaluations whose comparison let the bank go on growing.
-        gaps: gaps of each comparison, by how much the objective was larger under
-            conditions of the bank than under unseen ones.
+        trace: collects the light of conditions, on workers if there are any.
+        growth_steps: indices of the evaluations whose comparison let the bank grow on.
+        gaps: for each comparison, the mean objective under conditions of the bank minus
+            that under unseen conditions.
     """
 
     trace: Evaluate
@@ -129,7 +134,7 @@ class Bank(PredictedSearch):
     gaps: list[float] = field(default_factory=list)
     # conditions in memory, the newest last
     _conditions: list[Condition] = field(default_factory=list)
-    # u of each comparison that let the bank grow, by evaluation
+    # u at each comparison that let the bank grow, by the index of the evaluation
     _grown_at: dict[int, Tensor] = field(default_factory=dict)
     # inputs of the newest matrix, to share tensors that are equal
     _latest_inputs: dict[str, Tensor] = field(default_factory=dict)
@@ -150,7 +155,7 @@ class Bank(PredictedSearch):
         return entries, self._bytes
 
     def summarize_conditions(self) -> BankOfConditions:
-        """Return how the bank has grown, and what its latest comparison found."""
+        """Return how the bank has grown, and the gap of its latest comparison."""
         return BankOfConditions(
             created=self._count_conditions(self._latest_step),
             dropped=self._n_dropped,
@@ -175,16 +180,16 @@ class Bank(PredictedSearch):
                 self._compare(query.u, query.index)
         self._fill(self._latest_step)
         if query.with_image:
-            # only so that the renderer for images is made, and counted, as it was when
-            # the query was evaluated
+            # The image is not needed. But its first one makes a renderer, which is
+            # counted in `n_traced` as when the query was evaluated.
             self._render_image(query.u)
 
     def evaluate(self, query: Query) -> Evaluation:
         """Evaluate a query by its mean over conditions of the bank.
 
-        The image of the evaluation, if it is requested, is one without conditions.
+        If the image is requested, it shows the scene without random conditions.
         """
-        self.replay(query)
+        self.replay(query)  # the comparison and the growth that are due
         conditions = self._choose_conditions(query.kind, query.index)
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
         if not query.with_image:
@@ -202,12 +207,12 @@ class Bank(PredictedSearch):
             gradient: whether a derivative is computed.
         """
         full_configurations = [torch.cat([u, condition.u]) for condition in conditions]
+
+        def predict(batch: slice, variable_u: Tensor) -> Tensor:
+            return self._predict_images(conditions[batch], variable_u)
+
         evaluation = self.problem.evaluate_conditions(
-            lambda batch, batch_u: self._predict_images(conditions[batch], batch_u),
-            full_configurations,
-            u,
-            gradient,
-            BATCH_SIZE,
+            predict, full_configurations, u, gradient, BATCH_SIZE
         )
         # samples per pixel of the prediction: a matrix counts as one
         return replace(evaluation, predicted=1)
@@ -216,25 +221,28 @@ class Bank(PredictedSearch):
         """Return the conditions under which a query is evaluated.
 
         The conditions that the bank has gained since the previous query come first, so
-        that each of them counts soon. The rest is random. While configurations are
-        ranked, after the search, none is new.
+        that each of them is used soon. The others are random. In the ranking after the
+        search no condition is new.
 
         Args:
             kind: kind of the search.
             index: index of the query.
         """
         count = min(self.problem.n_draws, len(self._conditions))
-        # any other kind of search runs after "search", so that no condition is new to it
-        previous_index = index - 1 if kind == "search" else self._latest_step
+        previous_index = index - 1
+        if kind != "search":
+            # Any other search runs after "search", when the bank no longer grows. With
+            # the size at its latest step, no condition is new.
+            previous_index = self._latest_step
         size_before = self._count_conditions(previous_index)
-        new = [
-            condition
-            for condition in self._conditions
-            if condition.index >= size_before
-        ][:count]
-        old = [
-            condition for condition in self._conditions if condition.index < size_before
-        ]
+        new = []
+        old = []
+        for condition in self._conditions:
+            if condition.index >= size_before:
+                new.append(condition)
+            else:
+                old.append(condition)
+        new = new[:count]
         return new + self._sample(old, count - len(new), f"bank {kind}", index)
 
     def _sample(
@@ -264,22 +272,24 @@ class Bank(PredictedSearch):
             conditions: n conditions of the bank.
             u: (d,) the searched coordinates.
         """
-        inputs = self.problem.searched_space.inputs(u)
+        searched_inputs = self.problem.searched_space.inputs(u)
         images = []
         for condition in conditions:
             full_u = torch.cat([u, condition.u])
             renderer = condition.renderer
             if condition.depends_on_searched_only:
-                color_inputs = {name: inputs[name] for name in renderer.linearized_at}
-                images.append(renderer.predict_image(color_inputs, full_u))
+                # `linearized_at` has an entry for each input of the matrix
+                matrix_inputs = {
+                    name: searched_inputs[name] for name in renderer.linearized_at
+                }
+                images.append(renderer.predict_image(matrix_inputs, full_u))
             else:
+                # computes the inputs from the full configuration first
                 images.append(renderer(full_u))
         return torch.stack(images)
 
     def _render_image(self, u: Tensor) -> Tensor:
-        """Return the image (H, W, 3) of u (d,) as the scene comes, without random
-        conditions.
-        """
+        """Return the image (H, W, 3) of u (d,) without random conditions."""
         if self._image_renderer is None:
             seed = seeds.stream(self.problem.seed, "bank still")
             # without a seed, the conditions are those that leave the scene unchanged
@@ -290,21 +300,24 @@ class Bank(PredictedSearch):
             return self._image_renderer(self.problem.add_conditions(u))
 
     def _count_conditions(self, index: int) -> int:
-        """Return how many conditions the bank has had by an evaluation.
+        """Return the number of conditions that the bank has at an evaluation.
 
-        Conditions that were dropped since then count. The bank begins with
-        `INITIAL_CONDITIONS` for each draw. It grows during the first interval between
-        comparisons, and during each interval after a comparison in `growth_steps`. It
-        gains one condition for every `DRAWS_PER_CONDITION` draws. In the second half of
-        a search it does not grow, so that the search can converge.
+        This includes conditions that were dropped. It follows from these rules:
+
+        - The bank begins with `INITIAL_CONDITIONS` for each draw of an evaluation.
+        - It grows from the start to the first comparison, and from each comparison in
+          `growth_steps` to the next one. While it grows, it gains one condition for
+          every `DRAWS_PER_CONDITION` draws.
+        - In the second half of a search it does not grow, so that the search can
+          converge.
 
         Args:
             index: index of the evaluation.
         """
         last_index_of_first_half = self.steps // 2 - 1
+        # later evaluations have the same number
         index = min(index, last_index_of_first_half)
-        # evaluations so far at which the bank grew
-        n_growing_steps = 0
+        n_growing_steps = 0  # number of evaluations so far at which the bank grew
         for begin in (0, *self.growth_steps):
             n_since_begin = max(index - begin + 1, 0)
             # the next comparison, which ends the growth, is `COMPARISON_INTERVAL` later
@@ -316,23 +329,20 @@ class Bank(PredictedSearch):
     def _make_query(self, number: int) -> Query:
         """Return the query that collects the light of the condition with an index.
 
-        Light is collected at one configuration of the searched controls, near which a
-        matrix is exact. It is the configuration of the latest comparison that let the
-        bank grow before this condition, or the start.
+        A matrix is exact near the configuration at which its light is collected. The
+        search moves, so this is the configuration at the latest comparison before the
+        condition was added, or the start.
 
         Args:
             number: index of the condition in the bank's sequence.
         """
         assert self.problem.conditions is not None
-        # comparisons that let the bank grow and before which it lacked this condition
-        earlier_growth_steps = [
-            step
-            for step in self.growth_steps
-            if self._count_conditions(step - 1) <= number
-        ]
         u = self.problem.domain.start
-        if earlier_growth_steps:
-            u = self._grown_at[earlier_growth_steps[-1]]
+        for growth_step in self.growth_steps:  # ascending
+            size_before = self._count_conditions(growth_step - 1)
+            was_added_later = number >= size_before
+            if was_added_later:
+                u = self._grown_at[growth_step]
         bank_seed = seeds.stream(self.problem.seed, "bank")
         condition = sample_condition(self.problem.conditions, number, bank_seed)
         seed = seeds.stream(self.problem.seed, "bank matrix", number)
@@ -346,7 +356,7 @@ class Bank(PredictedSearch):
             tick: called with the samples of each condition that is made.
         """
         size = self._count_conditions(index)
-        # index of the first condition that has no matrix yet
+        # index of the first condition without a matrix
         first_missing = 0
         if self._conditions:
             # The newest condition is the last. Older ones may have been dropped, so
@@ -355,10 +365,12 @@ class Bank(PredictedSearch):
         if first_missing >= size:
             return
         with self.count_time():
+            # An earlier call may have requested light for these conditions, too.
             is_requested = first_missing < self._collected_until
             if not is_requested:
                 self._request_light(first_missing, index)
             for number in range(first_missing, size):
+                # `_incoming` yields light in the order of the conditions
                 condition = self._make_condition(number, next(self._incoming).light)
                 self._conditions.append(condition)
                 self._bytes += condition.renderer.n_bytes
@@ -373,10 +385,11 @@ class Bank(PredictedSearch):
 
         Args:
             first_missing: index of the first condition without a matrix.
-            index: index of the evaluation; the comparison after it counts.
+            index: index of the current evaluation.
         """
         next_comparison = (index // COMPARISON_INTERVAL + 1) * COMPARISON_INTERVAL
-        self._collected_until = self._count_conditions(next_comparison - 1)
+        last_before_comparison = next_comparison - 1
+        self._collected_until = self._count_conditions(last_before_comparison)
         queries = [
             self._make_query(number)
             for number in range(first_missing, self._collected_until)
@@ -384,7 +397,7 @@ class Bank(PredictedSearch):
         self._incoming = iter(self.trace(queries))
 
     def _drop_oldest(self) -> None:
-        """Drop the oldest matrices, but the last, while all take too much memory."""
+        """Drop the oldest matrices while all take too much memory; one always stays."""
         while len(self._conditions) > 1 and self._bytes > scale_limit(MAX_BYTES):
             self._bytes -= self._conditions.pop(0).renderer.n_bytes
             self._n_dropped += 1
@@ -400,24 +413,34 @@ class Bank(PredictedSearch):
         dim = self.problem.domain.dim
         renderer = self.problem.make_linear_renderer(query.u, query.seed, SPP, light)
         self.n_traced += 1
-        # by name, the inputs of the scene at which the matrix was computed
+        # By name, the inputs of the scene at which the matrix was computed. They were
+        # set by the searched controls and those of the condition together.
         inputs = renderer.linearized_at
         with torch.no_grad():
             searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
-        # They depend on the searched controls only if these alone set all of them, to
-        # the same values as together with the condition's controls.
+        # The condition has no influence on the inputs if the searched controls by
+        # themselves set all of them, and to the same values.
         depends_on_searched_only = all(
             name in searched_inputs and torch.equal(searched_inputs[name], value)
             for name, value in inputs.items()
         )
-        # To save memory, an input that equals that of the previous matrix shares its
-        # tensor.
-        for name, value in inputs.items():
-            latest = self._latest_inputs.get(name)
-            if latest is not None and torch.equal(latest, value):
-                inputs[name] = latest
-        self._latest_inputs = dict(inputs)
+        self._share_equal_inputs(inputs)
         return Condition(number, query.u[dim:], renderer, depends_on_searched_only)
+
+    def _share_equal_inputs(self, inputs: dict[str, Tensor]) -> None:
+        """Replace inputs that equal those of the previous matrix by the same tensors.
+
+        This saves memory.
+
+        Args:
+            inputs: inputs of the newest matrix by name; the dict of its renderer, which
+                is changed.
+        """
+        for name, value in inputs.items():
+            previous = self._latest_inputs.get(name)
+            if previous is not None and torch.equal(previous, value):
+                inputs[name] = previous
+        self._latest_inputs = dict(inputs)
 
     def _compare(self, u: Tensor, index: int) -> None:
         """Compare the bank with unseen conditions, and let it grow if it must.
@@ -426,7 +449,7 @@ class Bank(PredictedSearch):
         those of the bank, or if predictions are too far from traced images.
 
         Args:
-            u: (d,) where the search is.
+            u: (d,) current configuration of the search.
             index: index of the evaluation.
         """
         problem = self.problem
@@ -435,6 +458,7 @@ class Bank(PredictedSearch):
             unseen_objectives = self._trace_unseen(u, seed)
             conditions = self._sample(self._conditions, N_COMPARED, "bank check", index)
             bank_objectives = self._predict_objectives(u, conditions)
+            # mean of the bank minus mean of the unseen conditions
             gap, standard_error = _compare_means(bank_objectives, unseen_objectives)
             self.gaps.append(gap)
             self.n_traced += N_COMPARED
@@ -470,20 +494,20 @@ class Bank(PredictedSearch):
         return [evaluation.objective for evaluation, _ in evaluated]
 
     def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:
-        """Return the objectives of traced images under conditions not in the bank.
+        """Return the objectives of traced images under `N_COMPARED` new conditions.
+
+        They are random, as those of a search without a bank.
 
         Args:
             u: (d,) the searched coordinates.
-            seed: seed of the `N_COMPARED` new conditions and of the noise.
+            seed: seed of the conditions and of the noise.
         """
         objectives = []
         for index in range(N_COMPARED):
             # one seed for both the condition and the noise
             draw_seed = seeds.stream(seed, "draw", index)
-            evaluation, _ = self.problem.evaluate_full(
-                Query(u, draw_seed),
-                self.problem.add_conditions(u, draw_seed),
-                draw_seed,
-            )
+            full_u = self.problem.add_conditions(u, draw_seed)
+            query = Query(u, draw_seed)  # without a gradient
+            evaluation, _ = self.problem.evaluate_full(query, full_u, draw_seed)
             objectives.append(evaluation.objective)
         return objectives

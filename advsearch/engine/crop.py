@@ -1,9 +1,10 @@
 """Searches that render only the window of the image in which something can change.
 
-The rest of each image is that of a whole one. It is rendered again every
-`COMPARISON_INTERVAL` evaluations, which also measures what was missed. Where this is
-too much twice in a row, the rest of the search renders whole images. All trials do so
-anyway. How the window is chosen: `advsearch.engine.windows`.
+The surroundings of the window are taken from a full image. Every `COMPARISON_INTERVAL`
+evaluations a new full image is rendered, which shows how much the surroundings have
+changed. If they have changed too much twice in a row, the search renders full images
+from there on. All trials render full images. `advsearch.engine.windows` chooses the
+window.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from advsearch.scene.transport.matrix import ProgressCallback
 
 @dataclass
 class CroppedSearch(PredictedSearch):
-    """The window of a run's searches, and what is around it.
+    """The window of a run's searches, and its surroundings.
 
     Attributes:
         windowing: the window; None before it is chosen, or if there is none.
-        refusal: why there is none.
+        refusal: why there is no window; None if there is one.
     """
 
     method: ClassVar[str] = "crop"
@@ -42,7 +43,8 @@ class CroppedSearch(PredictedSearch):
 
     windowing: Windowing | None = None
     refusal: Refusal | None = None
-    # the latest whole image of each kind of search, and the renderer with that around
+    # For each kind of search the latest full image, and the renderer that pastes the
+    # window into it. Key "start": those at the start, with which all searches begin.
     _current: dict[str, tuple[FullImage, Renderer]] = field(default_factory=dict)
 
     @property
@@ -63,7 +65,8 @@ class CroppedSearch(PredictedSearch):
         return 0, bytes_per_pixel * height * width * n_images
 
     def count_predicted(self, kind: str, evaluations: int) -> int:
-        return 0  # they are rendered
+        """Return 0, since all images are rendered, if only in the window."""
+        return 0
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
         """Choose the window, and render the surroundings at the start."""
@@ -75,22 +78,29 @@ class CroppedSearch(PredictedSearch):
             self.windowing = windowing
             self.window = windowing.window
             self.deviations.append(windowing.deviation)
+            # `find_window` has rendered these
             tick(self.n_samples)
             self.n_traced += N_WINDOW_IMAGES
-            # all searches begin with these; they belong to no query: number 0
-            self._renew_surroundings(windowing, "start", 0, windowing.start)
+            self._renew_surroundings(
+                windowing,
+                "start",
+                number=0,  # it belongs to no query
+                image=windowing.start,  # full image of the start
+            )
 
     def _renew_surroundings(
         self, windowing: Windowing, kind: str, number: int, image: FullImage
     ) -> Renderer:
-        """Render new surroundings of the window, for a kind of search from now on.
+        """Render new surroundings of the window at the configuration of a full image.
+
+        A kind of search uses them from now on. They are rendered with the samples and
+        the light paths of the search; the full image has fewer samples.
 
         Args:
             windowing: the window.
             kind: kind of the search.
             number: index of the query, for the seed.
-            image: full image of the configuration whose surroundings are rendered; it
-                is stored, to be compared with later ones.
+            image: full image; it is stored, to be compared with later ones.
 
         Returns:
             The renderer that traces the window and pastes it into these surroundings.
@@ -116,33 +126,35 @@ class CroppedSearch(PredictedSearch):
         return renderer
 
     def replay(self, query: Query) -> None:
-        self._update(query)
+        self._update_renderer(query)
 
     def evaluate(self, query: Query) -> Evaluation:
         """Evaluate a query, by rendering only the window if that is enough."""
-        renderer = self._update(query)
+        renderer = self._update_renderer(query)
         if renderer is None:
             return self.problem.evaluate(query)
         evaluation, _ = self.problem.evaluate_full(query, query.u, query.seed, renderer)
         return evaluation
 
-    def _update(self, query: Query) -> Renderer | None:
+    def _update_renderer(self, query: Query) -> Renderer | None:
         """Return the renderer of the window for a query; None to render a full image.
 
-        Every `COMPARISON_INTERVAL` queries of a search a full image is rendered, and
-        the surroundings of the window in it are compared with those in use, which it
-        then replaces. After two comparisons in a row that differ too much, the rest of
-        the search renders full images.
+        Every `COMPARISON_INTERVAL` queries of a search a full image is rendered. It is
+        compared outside of the window with the surroundings in use, and then replaces
+        them. After two comparisons in a row that differ too much, the search renders
+        full images from there on.
         """
         kind = query.kind
         number = query.index
+        # index of the first query that renders a full image
         first_full = self.first_traced.get(kind, self.steps)
         if query.phase != "search" or number >= first_full:
             return None
         if self.windowing is None:
             self.prepare()
         assert self.windowing is not None
-        image, renderer = self._current.setdefault(kind, self._current["start"])
+        # a search begins with the surroundings of the start
+        image_in_use, renderer = self._current.setdefault(kind, self._current["start"])
         is_due = number > 0 and number % COMPARISON_INTERVAL == 0
         # A random search ("baseline") does not move away from the start, so that its
         # surroundings do not get old.
@@ -150,15 +162,14 @@ class CroppedSearch(PredictedSearch):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
         with self.count_time():
-            current, deviation = self.measure_surroundings(
-                self.windowing.window, image, query.u
+            new_image, deviation = self.measure_surroundings(
+                self.windowing.window, image_in_use, query.u
             )
             self.deviations.append(deviation)
-            # After a single bad comparison the surroundings are only renewed, since
-            # this may have been enough.
+            # After a single bad comparison new surroundings may be enough.
             if deviation.is_accepted or was_accepted:
                 assert self.n_renewals is not None  # None only for a `Bank`
                 self.n_renewals += 1
-                return self._renew_surroundings(self.windowing, kind, number, current)
+                return self._renew_surroundings(self.windowing, kind, number, new_image)
         self.trace_from(kind, number, f" of the {kind}")
         return None

@@ -76,7 +76,8 @@ def meets_claim(claim: str, before: Prediction, after: Prediction) -> bool:
         after: prediction on the changed image.
     """
     has_other_label = before.label != after.label
-    if claim != "must_change":
+    if claim != "must_change":  # "must_not_change"
         return not has_other_label
+    # a prediction without a probability counts as one of 0
     difference = abs((before.probability or 0.0) - (after.probability or 0.0))
     return has_other_label or difference > MAX_UNCHANGED_DIFFERENCE

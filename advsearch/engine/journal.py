@@ -1,8 +1,8 @@
 """The journal of a run: its queries and their evaluations, as rows of its store.
 
-What is in it is not evaluated again. So a run is resumed by sending all queries once
-more, with the functions and networks that it began with; those that are not stored are
-evaluated in order, by workers where there are some.
+A stored evaluation is not computed again. So a run is resumed by sending all queries
+once more, with the same functions and networks. Queries that are not stored are
+evaluated in order, by workers if there are any.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ ProblemKey = str | float
 light.
 """
 WorkItem: TypeAlias = tuple[ProblemKey, Preparation | None, Query]
-"""What a worker gets: the key of a problem, its preparation, and a query."""
+"""A query for a worker: (key of the problem, preparation of the problem, query)."""
 
 
 class Evaluator(Protocol):
@@ -64,11 +64,11 @@ class Evaluator(Protocol):
 
 @dataclass
 class ParallelEvaluator:
-    """Evaluates the queries of a problem, several at once where there are workers.
+    """Evaluates the queries of a problem, in parallel if there are workers.
 
     Attributes:
-        optional_problem: the problem; None of a sweep, which has one for each scene and
-            model.
+        optional_problem: the problem; None for a sweep, which has one for each scene
+            and model.
         executor: workers that run `make_worker_call`; None to evaluate in this process.
         key: identifies the problem among those of workers.
     """
@@ -140,8 +140,13 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
     def call(items: Sequence[WorkItem]) -> list[Evaluation]:
         """Evaluate work items, and return the evaluations in their order."""
         evaluations = list[Evaluation]()
-        # queries of one problem follow one another
-        for key, group in groupby(items, lambda item: item[0]):
+
+        def get_key(item: WorkItem) -> ProblemKey:
+            key, _, _ = item
+            return key
+
+        # `groupby` groups neighbors, and queries of one problem follow one another
+        for key, group in groupby(items, get_key):
             items_of_problem = list(group)
             # All were sent in one call, so that they have the same preparation.
             _, preparation, _ = items_of_problem[0]
@@ -202,8 +207,9 @@ def check_digests(
 ) -> None:
     """Store the digests of networks and functions, or check those of a resumed run.
 
-    A run may only be resumed with what it began with. A model behind an address has no
-    digest, as its weights are elsewhere: its answers are stored in the run instead.
+    The digests of a new run are stored. A resumed run has to have the same digests. A
+    model behind an address has none, as its weights are elsewhere. Its outputs are
+    stored in the run instead.
 
     Args:
         run: run that is new or resumed.
@@ -221,7 +227,7 @@ def check_digests(
         for network in networks:
             if isinstance(network.module, RemoteNetwork):
                 network.module.store_answers_in(run.store)
-            # None for a model behind an address
+            # None if the weights can't be read, as behind an address
             digests[f"model {network.name}"] = compute_weights_digest(network)
     for name, function in (functions or {}).items():
         if function is not None:
@@ -229,6 +235,7 @@ def check_digests(
     known_digests = {
         name: digest for name, digest in digests.items() if digest is not None
     }
+    # stores them if the run is new
     run.check_unchanged(DIGESTS_NOTE, known_digests)
 
 
@@ -294,11 +301,11 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
 def _list_array_digests(holder: Any) -> list[tuple[str, Any]]:
     """Return name and digest of each array that is an attribute of an object.
 
-    An attribute of type bytes is listed, too: it stands for itself.
+    An attribute of type bytes is listed, too, with its value.
     """
     attributes = sorted(getattr(holder, "__dict__", {}).items())
     simplified = [(name, _simplify(value)) for name, value in attributes]
-    # `_simplify` turns arrays, and nothing else but bytes, into bytes: their digests.
+    # `_simplify` returns bytes for arrays (their digests) and for bytes.
     return [(name, digest) for name, digest in simplified if isinstance(digest, bytes)]
 
 
@@ -310,9 +317,9 @@ def _simplify_code(code: CodeType, docstring: str | None = None) -> tuple[Any, .
 
     Args:
         code: compiled code of the function.
-        docstring: docstring of the function, which is among its constants; None for
-            code without one. Then constants that are None are left out, which does no
-            harm.
+        docstring: docstring of the function, which Python stores among the constants
+            and which is left out; None for code without one. Then constants of None are
+            left out, which changes all digests of such code alike.
     """
     constants = [
         _simplify_code(constant)
@@ -337,7 +344,8 @@ def _simplify(value: Any) -> Any:
             return None
     if isinstance(value, (tuple, list)):
         return [_simplify(item) for item in value]
-    # the order of a set differs from process to process
+    # A set among the constants of code is a frozenset. Its order differs from process
+    # to process.
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     if isinstance(value, (np.ndarray, Tensor)):
@@ -351,8 +359,10 @@ def _simplify(value: Any) -> Any:
     return type(value).__name__
 
 
-MACHINES_NOTE = "machines"  # the note that describes machines unlike this one
-PLAN_NOTE = "gradient plan"  # the note of how derivatives are computed
+# Keys of notes in the store: descriptions of machines that differ from this one, and
+# the plan by which derivatives are computed.
+MACHINES_NOTE = "machines"
+PLAN_NOTE = "gradient plan"
 
 
 @dataclass
@@ -360,12 +370,12 @@ class Journal:
     """The stored evaluations of a run.
 
     Attributes:
-        run: directory whose store has the rows; None to hold them in `rows`.
-        evaluator: evaluates queries that nothing predicts.
+        run: directory whose store has the rows; None to store them in `rows`.
+        evaluator: evaluates queries whose images are not predicted.
         rows: rows of a journal without a run directory.
-        n_lost: queries whose workers all died.
-        machines: description of the machines that are not like this one, by the names
-            in rows.
+        n_lost: number of queries whose workers all died.
+        machines: descriptions of machines that differ from this one, by the name in the
+            rows that they evaluated.
     """
 
     run: RunDirectory | None
@@ -385,7 +395,8 @@ class Journal:
     def __post_init__(self) -> None:
         """Read from the store which machines and how many rows the run has.
 
-        A copy for another problem of the same run has these already.
+        A copy made by `dataclasses.replace`, for another problem of the same run, has
+        the same dicts and `_opened`, so that nothing is read again.
         """
         if self.run is not None and not self._opened:
             self.machines |= self.get_note(MACHINES_NOTE) or {}
@@ -409,6 +420,7 @@ class Journal:
             evaluate: evaluates those that are not stored; None for the journal's own
                 evaluator.
             on_replay: called with every query of a search that is read from the store.
+                A trial depends on no state, and is not reported.
         """
         stored = [self._read(query) for query in queries]
         # those without a stored evaluation, to evaluate in one call
@@ -418,15 +430,16 @@ class Journal:
             if evaluation is None
         ]
         evaluate = self.evaluator if evaluate is None else evaluate
-        # a generator: each evaluation is computed by its `next` below
+        # lazy: an evaluation is computed when it is requested by `next` below
         new_evaluations = iter(evaluate(new_queries))
         for query, evaluation in zip(queries, stored, strict=True):
-            started = time.perf_counter()
             # a query without a phase is a trial of the verification
             belongs_to_search = query.phase is not None
             if evaluation is None:
+                started = time.perf_counter()
                 evaluation = next(new_evaluations)
-                # only searches have a limit of time, which `make_time_check` checks
+                # Only searches have a time limit, for which `make_time_check` reads the
+                # seconds of their rows.
                 seconds = None
                 if belongs_to_search:
                     seconds = time.perf_counter() - started
@@ -436,11 +449,10 @@ class Journal:
             yield evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
-        """Return the evaluated trials of a kind by their numbers.
+        """Return the evaluated trials of a kind by their index.
 
-        It is the journal's own dictionary, to which `store` adds new trials. The first
-        call for a kind reads its rows from the store, and counts those that were lost
-        with their workers.
+        `store` adds new trials to this dict. The first call for a kind reads its rows
+        from the store, and counts those that were lost with their workers.
         """
         if kind in self._trials:
             return self._trials[kind]
@@ -451,10 +463,11 @@ class Journal:
         for row in rows:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
-                # A row without a seed is that of a predicted image, and its spp are the
-                # samples per pixel of the prediction. For a rendered image this is 0.
+                # See `_row_of_trial`: a predicted image has no seed, and the samples
+                # per pixel of the prediction. `predicted` is 0 for a rendered image.
                 predicted = 0
-                if row.seed is None:
+                is_predicted = row.seed is None
+                if is_predicted:
                     predicted = row.spp or 1
                 trials[row.step] = Evaluation.from_judgement(
                     read_judgement(row), predicted=predicted
@@ -482,9 +495,11 @@ class Journal:
         if self.run is None or query.index >= n_stored:
             return None
         stored = self.run.store.read_cached(query.kind, query.index)
+        # A complete run deletes what the rows do not have, such as gradients.
         if stored is None:
             return None
         row, cached = stored
+        # `cached.u` is the digest of the configuration
         is_same_query = cached.u == compute_digest(query.u) and row.seed == query.seed
         if not is_same_query:
             raise InputError(
@@ -505,13 +520,15 @@ class Journal:
     ) -> list[Row]:
         """Store evaluations in one transaction, a row each.
 
-        For an evaluation of a search, gradient and image are stored with the row; it
-        has to come alone.
+        For an evaluation of a search, gradient and image are stored with the row. They
+        are stored for one row only, so such an evaluation is stored by itself.
 
         Args:
-            evaluated: queries and their evaluations.
-            id_is_number: whether the id of a row follows from the number of its query
-                (number + 1). So rows that come in any order have the same ids.
+            evaluated: queries and their evaluations; trials, or a single evaluation of
+                a search.
+            id_is_number: whether the id of a row is the index of its query plus 1. So
+                rows that come in any order have the same ids. Such rows, of a sweep,
+                are not cached in memory.
 
         Returns:
             The rows.
@@ -556,14 +573,15 @@ class Journal:
         """Store the description of a machine that differs from this one.
 
         Args:
-            name: name of the machine in its rows; None for one that is like this one.
-                Nothing is done for a name that is stored already.
+            name: name of the machine in the rows that it evaluated; None for a machine
+                like this one. Nothing is done for a name that is stored already.
         """
         if name is None or name in self.machines:
             return
         stats = self.evaluator.worker_stats
         description: dict[str, str] = {}
         if stats is not None:
+            # `stats.machines` has the description of each machine by its name
             description = dict(stats.machines.get(name, {}))
         self.machines[name] = description
         self.set_note(MACHINES_NOTE, self.machines)
@@ -598,10 +616,10 @@ class Journal:
     def _row_of_search(
         self, query: Query, evaluation: Evaluation
     ) -> tuple[Row, CachedEvaluation]:
-        """Return the row of a search's evaluation, and what resuming it needs.
+        """Return the row of a search's evaluation, and the values to resume it.
 
-        That is what the row does not have: digest of the configuration, cost, gradient
-        and image. It is deleted when the run is done.
+        These are values that the row does not have: digest of the configuration, cost,
+        gradient and image. The store deletes them when the run is complete.
 
         Args:
             query: the query.
@@ -614,14 +632,14 @@ class Journal:
             query.kind,
             query.index,
             query.seed,
-            # A predicted image was not rendered: it has neither samples nor renders.
-            # The cost of a rendered one counts images under each condition.
+            # A predicted image was not rendered, so it has neither samples nor renders.
             spp=None if is_predicted else problem.spp * query.samples,
             objective=evaluation.objective if is_finite else math.nan,
             success=evaluation.success and is_finite,
             values=problem.describe(query.u),
             seconds=evaluation.seconds,
             phase=query.phase,
+            # A cost of 1 is an image under each of the `n_draws` conditions.
             renders=0 if is_predicted else evaluation.cost * problem.n_draws,
             machine=evaluation.machine,
         )
@@ -648,10 +666,11 @@ class Journal:
     ) -> Callable[[int], bool] | None:
         """Return a function that tells whether the time of a search is over.
 
-        The function takes the number of evaluations so far. Time that was spent before
-        the run was resumed counts. Evaluations that are read from the store take no
-        time, and the search never ends before the last of them. If the store has rows
-        of the ranking, the search had ended before these, and ends there again.
+        The function takes the number of evaluations so far. In a resumed run, the time
+        of the earlier process counts. Evaluations that are read from the store take no
+        time, and the search does not end before the last of them. If the store has rows
+        of the ranking, which follows the search, the search had ended already. Then it
+        ends again after its last stored evaluation.
 
         Args:
             kind: kind of the search, such as "search".
@@ -720,7 +739,10 @@ def compute_digest(u: Tensor) -> bytes:
 
 
 def _restore_evaluation(row: Row, cached: CachedEvaluation) -> Evaluation:
-    """Return a search's evaluation as it was when it was stored.
+    """Return a search's evaluation from the store.
+
+    A row of an old run may have no judgement. Arrays of the store are read-only, so
+    they are copied.
 
     Args:
         row: row of the evaluation.

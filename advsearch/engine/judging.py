@@ -1,6 +1,6 @@
-"""How images are judged: tasks, user metrics, print terms, and objectives.
+"""Judgements of images: tasks, user metrics, print terms, and objectives.
 
-A task compares the output of a model with what is true of the scene. A metric is a
+A task compares the output of a model with the ground truth of the scene. A metric is a
 user function whose values are stored with every image.
 """
 
@@ -73,8 +73,8 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
             "package.module:function".
 
     Raises:
-        InputError: no mapping of functions, a function with other parameters, or a name
-            that a column of rows has already.
+        InputError: the argument is no mapping of functions, a function has other
+            parameters, or a name is that of a column of rows.
     """
     if not isinstance(metrics, Mapping) or not all(
         isinstance(name, str) for name in metrics
@@ -149,15 +149,19 @@ def load_metrics(
     """Return the functions of metrics by name.
 
     Args:
-        settings: import name of each, see `metrics_to_settings`.
-        python_functions: functions that the caller passed; they are not imported.
+        settings: for each metric a text "package.module:function", as
+            `metrics_to_settings` returns it.
+        python_functions: the metrics as the caller passed them, by name. Functions
+            among these are not imported.
 
     Raises:
-        InputError: a function cannot be imported, or is none.
+        InputError: a function cannot be imported, or the imported object is no
+            function.
     """
     loaded: dict[str, Any] = {}
     for name, import_name in settings.items():
         function: Any = (python_functions or {}).get(name)
+        # the caller may have passed a text instead
         if not callable(function):
             function = _import_metric(name, import_name)
         loaded[name] = function
@@ -319,20 +323,22 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
     """Return output and truth of the only image of a batch, without the batch axis.
 
     Metrics are called with these. For an ensemble both are tuples with one item for
-    each model.
+    each model. The output for an image is then a sequence, with the output of each
+    model as a batch of one.
     """
-    first_output = output[0]
-    is_of_several_models = isinstance(first_output, (tuple, list))
-    if is_of_several_models:
+    image_output = output[0]
+    is_ensemble = isinstance(image_output, (tuple, list))
+    if is_ensemble:
         pairs = [
             _unbatch(model_output, model_truth)
-            for model_output, model_truth in zip(first_output, truth, strict=True)
+            for model_output, model_truth in zip(image_output, truth, strict=True)
         ]
         outputs, truths = zip(*pairs, strict=True) if pairs else ((), ())
         return outputs, truths
-    labels = truth_to_labels(truth, output, 1)  # for a batch of one
-    first_label = labels[0] if isinstance(labels, Tensor) else labels
-    return first_output, first_label
+    labels = truth_to_labels(truth, output, count=1)
+    # a single label is a tensor (1,); any other truth stays as it is
+    image_truth = labels[0] if isinstance(labels, Tensor) else labels
+    return image_output, image_truth
 
 
 def mean_metrics(judgements: Sequence[Judgement]) -> dict[str, float | None] | None:
@@ -428,7 +434,7 @@ def check_truth(
     facts: Facts,
     image_settings: Mapping[str, Any],
 ) -> None:
-    """Check that the task can tell what is right in a scene, before a run is prepared.
+    """Check that the task can derive the truth of a scene, before a run is prepared.
 
     Args:
         task: task of the model.
@@ -439,14 +445,16 @@ def check_truth(
 
     Raises:
         InputError: it cannot. If the user stated no label, the message has the model's
-            first predictions of a clean image, and suggests one of them.
+            predictions for a clean image, and suggests one of them.
     """
     try:
-        # `each` has the facts of every thing if all are judged, else it is empty
-        for facts_of_thing in facts.facts_of_thing.values() or (facts,):
+        # If all things are judged, `facts_of_thing` has the facts of each of them.
+        # Otherwise it is empty, and `facts` are those of the judged thing.
+        judged_facts = list(facts.facts_of_thing.values()) or [facts]
+        for facts_of_thing in judged_facts:
             task.check(facts_of_thing)
     except InputError as error:
-        # a stated label is wrong, and the task's own message says how
+        # If the user stated a label, that is the error, which the task explains.
         if facts.label is not None:
             raise
         rendering = render(
@@ -502,11 +510,13 @@ def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> b
 
     Args:
         models: models with names of classes.
-        first: an object's own label. A model that lacks it is passed over.
-        second: the label that the user stated.
+        first: an object's own label. A model need not have a class for it; such a model
+            is skipped.
+        second: the label that the user stated, for which every model has to have a
+            class.
 
     Raises:
-        InputError: a model lacks `second`.
+        InputError: a model has no class for `second`.
     """
     for model in models:
         try:
@@ -520,11 +530,12 @@ def _has_disjoint_classes(models: Sequence[Model], first: str, second: str) -> b
 
 
 # ---- domain and objective
-# What a search maximises, over which domain, and the terms that `printable` subtracts:
-# the variation of colors, and their distance from printable ones (Sharif et al. 2016,
-# *Accessorize to a Crime*, sections 5.2.2 and 5.2.3). Theirs are sums over pixels, and
-# a product of distances to all printable colors; these are means, and the distance to
-# the nearest, which is zero at the same colors.
+# The domain and the objective of a search, and the terms that `printable` subtracts
+# from the objective: the variation of colors, and their distance from printable ones.
+# Both are after Sharif et al. 2016, *Accessorize to a Crime*, sections 5.2.2 and 5.2.3.
+# There they are sums over pixels, and the distance is a product over all printable
+# colors. Here they are means, and the distance is that to the nearest printable color,
+# which is zero at the same colors.
 
 
 def make_domain(
@@ -557,14 +568,20 @@ def make_domain(
 
 
 class StackedTensors(Mapping[str, Tensor]):
-    """Tensors of N configurations by name, stacked to (N, ...) when one is read.
+    """Tensors of N configurations by name, stacked to (N, ...) when one is read."""
 
-    `what` is what a name stands for, in the message about an unknown one.
-    """
+    def __init__(
+        self, kind: str, tensors_of_configuration: Sequence[Mapping[str, Tensor]]
+    ) -> None:
+        """Store the tensors of each configuration.
 
-    def __init__(self, what: str, each: Sequence[Mapping[str, Tensor]]) -> None:
-        self._kind = what
-        self._tensors_of_configuration = each
+        Args:
+            kind: kind of the names, such as "input of the scene", for the message about
+                an unknown one.
+            tensors_of_configuration: for each of the N configurations, tensors by name.
+        """
+        self._kind = kind
+        self._tensors_of_configuration = tensors_of_configuration
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the tensors with a name, stacked to (N, ...)."""
@@ -587,16 +604,20 @@ class StackedTensors(Mapping[str, Tensor]):
 
 
 class ConfigurationInputs:
-    """What an objective may read beside images, at N configurations.
+    """The further inputs that an objective may read, at N configurations.
+
+    An objective that reads some depends on the configuration not only through the
+    image. Then its gradient has a second part, which the caller computes if `used` is
+    set.
 
     Attributes:
-        used: whether the objective has read anything.
+        used: whether the objective has read an input.
 
     Args:
         space: all controls; those that are searched come first.
         searched: the controls that are searched.
-        full_configurations: N configurations (d,) of `space`, equal in what is
-            searched.
+        full_configurations: N configurations (d,) of `space`, with the same searched
+            coordinates.
     """
 
     def __init__(
@@ -621,7 +642,6 @@ class ConfigurationInputs:
         Raises:
             InputError: "texture", and not exactly one control has searched colors.
         """
-        # the caller then needs the derivative by u that does not go through the image
         self.used = True
         if name == "inputs":
             inputs = [self._space.inputs(u) for u in self._configurations]
@@ -630,7 +650,8 @@ class ConfigurationInputs:
             values = [self._space.get_numeric_values(u) for u in self._configurations]
             return StackedTensors("number of the configuration", values)
         n_configurations = len(self._configurations)
-        # The searched coordinates come first, and are the same in all configurations.
+        # The searched coordinates come first, and are the same in all configurations,
+        # so that those of the first one are taken.
         searched_u = self._configurations[0][: len(self._searched.start)]
         if name == "u":
             return searched_u.expand(n_configurations, *searched_u.shape)
@@ -687,8 +708,8 @@ def mean_variation(colors: Tensor) -> Tensor:
         # the step's first pixel is masked at the end, its second one here
         right = right * mask[:, 1:]
         down = down * mask[1:]
-    # Zeros are added for the last column and the last row, which have no neighbor. `pad`
-    # takes the zeros before and after, from the last axis (color) to the first.
+    # Zeros are added for the last column and the last row, which have no neighbor.
+    # `pad` takes the zeros before and after, from the last axis (color) to the first.
     squared_right = F.pad(right.square(), (0, 0, 0, 1))
     squared_down = F.pad(down.square(), (0, 0, 0, 0, 0, 1))
     squared = squared_right + squared_down
@@ -811,12 +832,12 @@ def make_objective(
     seed: int,
     ensemble: EnsembleReduction | None = None,
 ) -> tuple[Objective, str]:
-    """Return the function that a search maximises, and a remark about it or "".
+    """Return the function that a search maximizes, and a remark about it or "".
 
     Args:
         requested: name of an objective, or a function.
         task: task of the model.
-        model: whose output is maximised.
+        model: model whose output is evaluated.
         renderer: renders the clean image for an objective that compares features.
         seed: seed of the noise of that image.
         ensemble: how the objectives of several models become one, "mean" or "worst".
@@ -856,7 +877,8 @@ def _make_feature_objective(
         The objective, and a remark. The remark states which features are compared if
         they are not those before the last layer; else it is "".
     """
-    # if the task reads no logits, the output of the model itself is compared
+    # Features are those before the last layer. If the task reads no logits, the output
+    # of the model itself, a function of the image, are the features.
     features = features_of(model) if task.reads_logits else None
     with torch.no_grad():
         clean_image = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
@@ -879,16 +901,18 @@ def _make_ensemble_objective(
         task: joint task of the models.
         ensemble: "mean" or "worst" of the models' objectives; None for the default.
     """
-    # Unless the user chose an objective for all models, each model has the objective of
-    # its own task.
+    # `EnsembleTask.objective`, "each", is the default of such a task, and means that
+    # each model has the objective of its own task.
     uses_task_objectives = requested == EnsembleTask.objective
     objectives = [
         get_objective(part.objective if uses_task_objectives else requested, part)
         for part in task.tasks
     ]
-    # A mean needs equal units, which the tasks' own objectives do not have.
-    default: EnsembleReduction = "worst" if uses_task_objectives else "mean"
-    return reduce_objectives(objectives, ensemble or default)
+    reduction = ensemble
+    if reduction is None:
+        # A mean needs equal units, which the objectives of different tasks lack.
+        reduction = "worst" if uses_task_objectives else "mean"
+    return reduce_objectives(objectives, reduction)
 
 
 def reduce_objectives(

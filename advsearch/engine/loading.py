@@ -1,4 +1,4 @@
-"""Load a scene from Python, and make a renderer `render(u, seed, spp)` of it."""
+"""Load a scene from Python, and make a renderer `render(u, seed, spp)` for it."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ from advsearch.trust.foreign_code import use_plain_switches
 from advsearch.trust.stored_files import track_opened_files
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
-"""One control or several, by name or instance; a mapping gives each name its settings
-or its instance, and ``mitsuba:KEY`` a range.
+"""One control or several, by name or instance, or a mapping from names to settings or
+instances. A name ``mitsuba:KEY`` has a range instead of settings.
 """
 
 Texture = str | Path | npt.ArrayLike | Tensor
@@ -85,7 +85,7 @@ PHOTOGRAPH_SETTINGS = (
     *("ground.level", "ground.gloss", "ground.roughness"),
     *("backdrop.noise", "backdrop.blur"),
 )
-"""Settings that only a scene has which is rendered into a photograph."""
+"""Settings that only apply to a scene that is rendered into a photograph."""
 
 SINGLE_VALUE_KEYS = {"distribution", "choices", "range"}
 """A mapping with one of these keys describes one value, and not the settings of a
@@ -98,12 +98,12 @@ DEFAULT_RESOLUTION = 128
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """An object under an environment, with some parameters fixed. Made by `load_scene`.
+    """An object under an environment, with some parameters fixed. See `load_scene`.
 
     Attributes:
         description: the scene as data.
-        is_session_only: whether it holds Python objects that no file and no command can
-            name.
+        is_session_only: whether it contains Python objects that can't be named in a
+            file or a command.
     """
 
     description: SceneDescription
@@ -123,14 +123,15 @@ class Scene:
         """Return `render(u, seed, spp)` for the space of these controls.
 
         Args:
-            controls: what u varies.
+            controls: controls that u varies.
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
-            seed: root of the noise; the `seed` of each call counts on from it.
+            seed: root of the noise; the `seed` of each call is added to it.
             estimators: how derivatives are computed, by "control.parameter", "control"
-                or "*". `advsearch check` shows which estimators there are.
-            sampler: "multijitter", or "independent", which has more noise; the first
-                rounds sample counts up to products of two near numbers.
+                or "*". `advsearch check` lists the estimators.
+            sampler: "multijitter", or "independent", which has more noise.
+                "multijitter" rounds sample counts up to products of two similar
+                numbers.
 
         Raises:
             InputError: a control is unknown or impossible in this scene, or an argument
@@ -138,6 +139,7 @@ class Scene:
         """
         resolution = to_python(resolution)
         description = fit_camera(self.description, resolution)
+        # global switches of torch that the caller has set do not change the result
         with use_plain_switches():
             space = make_space(make_controls(controls), description)
             return make_renderer(
@@ -181,10 +183,13 @@ class Scene:
             }
             folder = replace(description.photographs, scenes=relit_scenes)
             relit = replace(relit, photographs=folder)
-        return Scene(add_lamps(with_requested_ground(relit)), self.is_session_only)
+        # The lamps of a place are on if the environment is dark, so that ground and lamps
+        # are added again.
+        grounded = with_requested_ground(relit)
+        return Scene(add_lamps(grounded), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
-        """Explain what takes the place of `render`; called for missing attributes only."""
+        """Explain what to use instead of `render`; called for missing attributes only."""
         if name == "render":
             raise AttributeError(
                 "a scene has no `render`: advsearch.render(scene) makes a picture and "
@@ -230,24 +235,26 @@ class Scene:
         Raises:
             InputError: a name is unknown or a value out of range.
         """
+        # `resolved` has a value for every parameter, of which those of `overrides` count
         resolved = settings.resolve_settings(overrides)
         description = self.description
         check_mesh_names(description, overrides)
         if description.camera_model is not None:
+            # it has its own focal lengths
             description.camera_model.check_no_fov(overrides)
         values = {**description.values, **{name: resolved[name] for name in overrides}}
         # A camera that has a height gets its elevation from that. So a stated elevation
         # removes the height.
         if "camera.elevation" in overrides:
             values["camera.height"] = None
-        changed = with_requested_ground(
-            replace(
-                description,
-                values=values,
-                requested=description.requested | set(overrides),
-            )
+        changed = replace(
+            description,
+            values=values,
+            requested=description.requested | set(overrides),
         )
-        return Scene(add_lamps(changed), self.is_session_only)
+        # The settings may request another ground, or switch lamps on or off.
+        grounded = with_requested_ground(changed)
+        return Scene(add_lamps(grounded), self.is_session_only)
 
 
 @with_checked_arguments
@@ -277,45 +284,47 @@ def load_scene(
         object: a bundled name ("mug"), a path to a mesh (`advsearch.files.MESHES`), or
             an asset.
         environment: a bundled name, a path to an .hdr or .exr file or to the .yaml file
-            of a place, an asset; default "studio".
-        scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which
-            `object` is a node or the id of a shape; a file may as well be written
-            before it: "scene.glb#chair", "box.xml#large-box".
-        up: the up axis of a mesh file, "y" or "z"; by default what its format or else
-            its shape states.
+            of a place, or an asset; default "studio".
+        scene: a scene file, or a scene dictionary of Mitsuba (`mi.cornell_box()`).
+            `object` is then a node or the id of a shape in it. The file may also be
+            written before the object: "scene.glb#chair", "box.xml#large-box".
+        up: the up axis of a mesh file, "y" or "z"; by default that of its format, or
+            else one that is guessed from its shape.
         facing: the axis of a mesh file that its front faces, "+x", "-x", "+y", "-y",
-            "+z" or "-z"; by default what its format states: +z of glTF and VRM 1, -z of
-            VRM 0, and +x of others. It is rotated towards +x.
+            "+z" or "-z". By default that of its format: +z for glTF and VRM 1, -z for
+            VRM 0, and +x for others. The front is rotated towards +x.
         size: size of the object, its longest side in metres, 1e-4 to 1e4. Distances of
-            the camera, paths of files and the height of a photograph are in metres
-            where the size of the object is known, and in object sizes elsewhere.
-        unit: unit of the coordinates of the object's file, "mm", "cm", "m" or "in",
-            which gives it its size; by default bundled objects and glTF have one, and
-            of other files it is not known.
-        settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a
-            picture belongs to none of them but to what makes it: `resolution` of
-            `attack`, `sweep`, `render` and `Scene.renderer`.
-        camera: a camera file (docs/cameras.md), "fisheye" or "equirectangular", whose
-            lens the camera around the object then has; for a `backdrop`, COLMAP's
-            images.txt or a transforms.json, which names it; "dashcam" or "robot", mounted at
-            its height above the ground; the name of a camera of a scene file; "orbit"
-            or None for a pinhole.
-        texture: texture of the object in place of its own: a picture file, or (h, w, 3)
-            sRGB in [0, 1] or of 8 bits, row 0 on top; `result.artifacts["texture"]`,
-            say.
-        things: what stands beside the object, in metres from it, x forwards and y to
-            its left: a text such as "car@12,3.5,heading=180; person@6,-2", or a list of
-            such texts or of mappings, {"object": "car", "x": 12, "y": 3.5, "heading":
-            180}; `size` (metres), `name` and `label` are optional.
-        backdrop: a photograph that the scene is rendered into (docs/cameras.md): a
-            picture file, taken by `camera`; of a part of it,
+            the camera, paths of files and the height of a photograph are in metres if
+            the size of the object is known, and otherwise in object sizes.
+        unit: unit of the coordinates of the object's file, "mm", "cm", "m" or "in", by
+            which its size is known. By default bundled objects and glTF files have a
+            unit, and other files have none.
+        settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of an
+            image is not among them: it is `resolution` of `attack`, `sweep`, `render`
+            and `Scene.renderer`.
+        camera: a camera file (docs/cameras.md); "fisheye" or "equirectangular", the
+            lens of the camera that orbits the object; "dashcam" or "robot", a camera at
+            its height above the ground; the name of a camera of a scene file; for a
+            `backdrop`, the images.txt of COLMAP or a transforms.json that contains the
+            photograph; "orbit" or None for a pinhole that orbits the object.
+        texture: texture that replaces that of the object: an image file, or (h, w, 3)
+            sRGB in [0, 1] or of 8 bits, row 0 on top, for example
+            `result.artifacts["texture"]`.
+        things: other objects of the scene. Positions are in metres from the object, x
+            forwards and y to its left: a text such as "car@12,3.5,heading=180;
+            person@6,-2", or a list of such texts or of mappings, {"object": "car", "x":
+            12, "y": 3.5, "heading": 180}; `size` (metres), `name` and `label` are
+            optional.
+        backdrop: a photograph that the scene is rendered into (docs/cameras.md): an
+            image file, taken by `camera`; a part of it,
             ``photo.jpg#X,Y,WIDTH,HEIGHT`` in pixels; or a folder of photographs, of
-            which the control `backdrop` chooses one. By default it is lit by the .hdr
-            or .exr file of its name beside it, and seen by the camera of the .yaml or
-            .json file of its name, if there is one.
-        occluder: a mask of the photograph's size, white where it shows what is before
-            the object; or its depth, an .exr or .npy file in metres, or a picture with
-            the metres of a level behind its name, ``depth.png#0.001``.
+            which the control `backdrop` selects one. If there is an .hdr or .exr file
+            of the same name next to it, that is its default light; a .yaml or .json
+            file of the same name is its default camera.
+        occluder: a mask of the size of the photograph, white where the photograph shows
+            something in front of the object; or the depth of the photograph: an .exr or
+            .npy file in metres, or an image with the metres of a level after its name,
+            ``depth.png#0.001``.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of
@@ -332,7 +341,7 @@ def load_scene(
         object_spec = f"{scene}#{object}"
     fixed_values = None if settings is None else to_python(settings)
     has_environment = environment is not None
-    # In a folder, each photograph has its own light, which is read with it below.
+    # In a folder, each photograph has its own light, which is read below.
     if environment is None and not is_photograph_folder(backdrop):
         environment = find_photographed_light(backdrop)
     description = load_description(
@@ -387,7 +396,7 @@ def _put_into_photographs(
     """
     is_folder = is_photograph_folder(spec)
     if not is_folder:
-        # The scene has its light already: `load_scene` found it.
+        # `load_scene` has given the scene the light next to a single photograph.
         view = read_photograph_view(spec)
         return put_into_photograph(description, view, camera, occluder)
     if occluder is not None:
@@ -396,9 +405,13 @@ def _put_into_photographs(
             "one photograph; state it as `occluder` in the camera file beside that"
         )
     scenes: dict[str, SceneDescription] = {}
+    # Files that are opened here belong to the folder.
     with track_opened_files(spec):
-        # a file with the cameras of all photographs is parsed only once
-        cameras = read_photograph_cameras(camera) if camera is not None else None
+        # A file with the cameras of all photographs is parsed only once. `camera` may
+        # also be the name of a camera, and stays.
+        photograph_camera: Any = camera
+        if camera is not None:
+            photograph_camera = read_photograph_cameras(camera) or camera
         views = read_photograph_folder(spec, has_camera=camera is not None)
         for name, view in views.items():
             light = None if has_environment else find_photographed_light(view.spec)
@@ -406,7 +419,7 @@ def _put_into_photographs(
             if light is not None:
                 environment = import_environment(light)
                 lit_scene = Scene(description).with_environment(environment).description
-            scenes[name] = put_into_photograph(lit_scene, view, cameras or camera)
+            scenes[name] = put_into_photograph(lit_scene, view, photograph_camera)
     folder = PhotographFolder(str(spec), camera, scenes)
     # The scene shows the first photograph, until a control chooses another one.
     return replace(next(iter(scenes.values())), photographs=folder)
@@ -426,8 +439,8 @@ def _check_no_photograph(
         stated.append("occluder")
     if stated:
         raise InputError(
-            f"{stated[0]}: is about a photograph that the scene is rendered into, and "
-            "there is none; give a `backdrop`, or leave it out"
+            f"{stated[0]}: only applies to a scene that is rendered into a photograph; "
+            "set `backdrop`, or leave it out"
         )
 
 
@@ -462,13 +475,19 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
 def scene_to_settings(scene: Scene) -> dict[str, Any]:
     """Return the settings by which a configuration names a loaded scene.
 
-    The keys are those of `SceneConfig`. Of a scene with `is_session_only` these
+    The keys are those of `SceneConfig`. For a scene with `is_session_only` these
     settings are incomplete, since no file can name its Python objects.
     """
     description = scene.description
     photograph = description.backdrop_photograph
-    backdrop = photograph.spec if photograph is not None else None
+    backdrop = None
+    occluder = None
+    if photograph is not None:
+        backdrop = photograph.spec
+        # file of the mask of what is in front of the object; "" without one
+        occluder = photograph.front_spec or None
     camera = _camera_setting(description)
+    # In a folder, the scene shows one of its photographs. The settings name the folder.
     if description.photographs is not None:
         backdrop = description.photographs.path
         camera = description.photographs.camera
@@ -482,7 +501,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "camera": camera,
         "things": description.things_spec or None,
         "backdrop": backdrop,
-        "occluder": (photograph.front_spec or None) if photograph is not None else None,
+        "occluder": occluder,
         "set": description.requested_values,
     }
 
@@ -490,8 +509,8 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
 def _camera_setting(description: SceneDescription) -> str | None:
     """Return the value of the `camera` setting that names a scene's camera.
 
-    The first that the scene has decides: a rig of several cameras, a preset such as
-    "dashcam", a lens such as "fisheye", or a camera of the scene file. None stands for
+    It is the first of these that the scene has: a rig of several cameras, a preset such
+    as "dashcam", a lens such as "fisheye", or a camera of the scene file. None means
     the default, a pinhole that orbits the object.
     """
     if description.rig:
@@ -558,14 +577,15 @@ def fit_camera(
             raise InputError(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
-        # Drops bend the ray of each pixel. So they need a camera model, which has the
-        # rays as a table. A model without a name was made here by an earlier call,
-        # perhaps for another aspect, and is replaced.
+        # Drops bend the ray of each pixel, so they need a camera model, which has a
+        # table of rays. A camera model without a name was made by an earlier call of
+        # this function, perhaps for another aspect, and is replaced.
         if camera_model is None or not camera_model.name:
             camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
     if camera_model is not None:
-        # bundled lenses depend on the aspect; any other model stays
-        camera_model = make_bundled_models(aspect).get(camera_model.name, camera_model)
+        # A bundled lens depends on the aspect, and is made again; others stay.
+        bundled_models = make_bundled_models(aspect)
+        camera_model = bundled_models.get(camera_model.name, camera_model)
         scaling_remarks = camera_model.describe_scaling((height, width))
         remarks = tuple(dict.fromkeys((*remarks, *scaling_remarks)))
     return replace(
@@ -604,8 +624,9 @@ def make_renderer(
     """Load a described scene, with what the space's controls need, into Mitsuba.
 
     Args:
-        description: the scene; that of the space, if it has one, takes its place.
-        space: what varies.
+        description: the scene. If a control of the space has changed the scene, the
+            changed one is loaded instead.
+        space: controls that vary.
         resolution: side, or (height, width), in pixels.
         denoise: "oidn" or "none".
         seed: root of the noise.
@@ -639,30 +660,31 @@ def make_renderer(
     )
     has_exposure_time = any(space.exposure)
     _check_rig_times(description, space)
-    # `Motion` tells how points move in the image. Derivatives at outlines need it, and
-    # the number of moments for motion blur.
+    # `Motion` computes how points move in the image. It is needed for derivatives at
+    # outlines, and for the moments of an exposure.
     motion = None
-    if differentiated or has_exposure_time:
+    if differentiated:
         motion = Motion(description, size, scene.assembly)
-    # moments of the exposure; their images together are one with motion blur
+    # images at these moments are averaged to an image with motion blur
     moments: tuple[Moment, ...] = ()
-    if has_exposure_time and motion is not None:
-        moments = choose_moments(space, motion, scene.assembly, size[0])
+    if has_exposure_time:
+        exposure_motion = motion or Motion(description, size, scene.assembly)
+        moments = choose_moments(space, exposure_motion, scene.assembly, height=size[0])
     return Renderer(
         scene,
         space,
         formation,
         seed,
-        motion=motion if differentiated else None,
+        motion=motion,
         estimators=estimators,
         moments=moments,
     )
 
 
 def _check_rig_times(description: SceneDescription, space: Space) -> None:
-    """Check a rig of which some cameras take their image later than others.
+    """Check a rig in which some cameras take their image later than others.
 
-    Such a rig is pointless unless something in the scene changes with time. It cannot
+    Such a rig only makes sense if something in the scene changes with time. It can't
     have motion blur or a rolling shutter.
 
     Args:
@@ -672,8 +694,8 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     Raises:
         InputError: nothing changes with time, or an image has motion blur.
     """
-    takes_turns = any(mount.delay for mount in description.rig)
-    if not takes_turns:
+    has_delays = any(mount.delay for mount in description.rig)
+    if not has_delays:
         return
     prefix = (
         f"camera: the pictures of {description.rig_spec} are taken one after the other"
@@ -691,7 +713,7 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
     )
     if not changes_with_time:
         raise InputError(
-            f"{prefix}, and show the same: nothing knows a time; add a `path`"
+            f"{prefix}, but nothing in the scene changes with time; add a `path`"
         )
 
 
@@ -721,10 +743,13 @@ def choose_moments(
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)
     max_pixels_moved = _measure_max_motion(space, motion, assembly, duration)
+    # `flashes` is a number per second
     n_flashes = max(control.flashes for control in space.controls) * duration
     n_for_motion = math.ceil(MOMENTS_PER_PIXEL * max_pixels_moved)
     n_for_flashes = math.ceil(MOMENTS_PER_FLASH * n_flashes)
     n_moments = min(max(MIN_MOMENTS, n_for_motion, n_for_flashes), MAX_MOMENTS)
+    # time of each moment, the rows that are exposed at it, and the fraction of samples,
+    # which is equal for all moments
     offsets, rows, samples = divide_exposure(shutter, rolling, height, n_moments)
     return tuple(
         Moment(space.advance_time(float(offset)), rows_of_moment, samples)
@@ -747,6 +772,7 @@ def _measure_max_motion(
         assembly: turns the inputs of the space into those of the scene.
         duration: length of the exposure in seconds.
     """
+    # only a control that moves has an exposure: (shutter, rolling) in seconds
     moving_controls = tuple(
         control for control in space.controls if any(control.exposure)
     )
@@ -756,7 +782,8 @@ def _measure_max_motion(
     configurations = torch.rand(
         N_MOTION_SAMPLES,
         len(moving_space.start),
-        # a fixed seed: the number of moments must not differ between two runs
+        # A fixed seed, as the number of moments, which follows from the result, must
+        # not differ between two runs.
         generator=torch.Generator().manual_seed(0),
     )
     max_moved = 0.0
@@ -775,20 +802,24 @@ def _measure_max_motion(
 
 
 def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
-    """Return the settings of controls by name, as a file holds them.
+    """Return the settings of controls by name, as a file stores them.
 
     Controls may be given as names, instances or a mapping. An instance is written with
     all of its settings, a name only with those that the caller stated.
     """
+    # an instance or the stated settings, which are empty for a bare name
     control_by_name = normalize_controls(controls)
     if not isinstance(controls, Mapping):
-        # The result is dropped: this only raises errors, as for an unknown name.
-        # Settings of a mapping are checked later, when its controls are made.
+        # This only checks the controls, e.g. for an unknown name. Settings of a mapping
+        # are checked later, when its controls are made.
         make_controls(control_by_name)
-    return {
-        name: control.to_settings() if isinstance(control, Control) else dict(control)
-        for name, control in control_by_name.items()
-    }
+    settings_of_control = {}
+    for name, control in control_by_name.items():
+        if isinstance(control, Control):
+            settings_of_control[name] = control.to_settings()
+        else:
+            settings_of_control[name] = dict(control)
+    return settings_of_control
 
 
 def make_controls(controls: Controls) -> tuple[Control, ...]:
@@ -813,7 +844,8 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
     # several names may state parameters of one control
     settings_by_control = merge_control_settings(named_settings)
     for name in instances:
-        # an instance has brought an empty mapping; anything in it came by a name
+        # An instance was entered with empty settings. If there are some now, a name has
+        # stated them.
         if settings_by_control[name]:
             raise InputError(
                 f"controls: {name} is given twice, by an instance and by "
@@ -844,10 +876,10 @@ def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, o
         for name, control in control_by_name.items()
         if isinstance(control, Control)
     }
-    all_settings = check_control_settings(
-        # an instance counts as no settings here, and is put back below
-        {**control_by_name, **dict.fromkeys(instances)}
-    )
+    # Settings are checked. An instance is replaced by None, which means no settings,
+    # and put back afterwards. So the order of the controls stays.
+    without_instances = {**control_by_name, **dict.fromkeys(instances)}
+    all_settings = check_control_settings(without_instances)
     return {
         name: instances.get(name, control_settings)
         for name, control_settings in all_settings.items()
@@ -875,14 +907,22 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             )
         if isinstance(control, Control):
             control_by_name[name] = control
-        # a mapping with one of these keys is the value of a single parameter
-        elif isinstance(control, Mapping) and not control.keys() & SINGLE_VALUE_KEYS:
+        elif _is_settings_of_control(control):
             control_by_name[name] = {
                 key: distribution_to_setting(value) for key, value in control.items()
             }
         else:
+            # the value of a single parameter, as for the name "camera.azimuth"
             control_by_name[name] = distribution_to_setting(control)
     return control_by_name
+
+
+def _is_settings_of_control(value: Any) -> bool:
+    """Return whether a value is a mapping of settings, and not that of one parameter.
+
+    The value of a parameter may be a mapping as well, such as {"range": [0, 30]}.
+    """
+    return isinstance(value, Mapping) and not value.keys() & SINGLE_VALUE_KEYS
 
 
 def _read_control_list(
@@ -941,7 +981,7 @@ def list_session_only_controls(controls: Controls) -> list[str]:
     for name, control_settings in controls_to_settings(controls).items():
         for parameter, value in control_settings.items():
             if isinstance(value, PythonQuantiles):
-                # a distribution may be given as "control.parameter" at once
+                # the name of a control, or already "control.parameter"
                 full_name = name if "." in name else f"{name}.{parameter}"
                 session_only.append(f"{full_name} (drawn by {value['name']})")
     return session_only

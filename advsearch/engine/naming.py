@@ -46,7 +46,7 @@ from advsearch.trust.foreign_code import use_plain_switches
 CONTROL = "control"
 MODEL = "model"
 SCENE = "scene"
-"""Roles of objects that a Python caller may pass in place of a name."""
+"""Roles of objects that a Python caller may pass instead of a name."""
 
 
 def load_configured_scene(
@@ -88,6 +88,7 @@ def collect_scene_parameters(config: SceneConfig) -> SettingValues:
         InputError: both state an exposure.
     """
     parameters: dict[str, Any] = dict(config.set_)
+    # 0 stops of exposure is the default, and changes nothing
     if config.exposure:
         if "camera.exposure" in parameters:
             raise InputError(
@@ -143,7 +144,7 @@ def load_models(
                 model,
                 task_of_model,
                 config,
-                # False for the tasks of an `EnsembleTask`
+                # an `EnsembleTask` has other tasks as its parts
                 is_only_task=task_of_model is task,
             )
             for model, task_of_model in zip(models, tasks, strict=True)
@@ -171,18 +172,19 @@ def _load_for_task(
         task: task of the model.
         config: states labels, prompt and range of values.
         is_only_task: whether all models have this task. If each model has its own task,
-            the labels and the prompt of the configuration are only for tasks that take
-            labels and have no names of classes by themselves.
+            the labels and the prompt of the configuration are only for those tasks that
+            need names of classes from the user.
     """
     single_image_task = task.single_image_task
     labels = None
     prompt = None
-    # whether the task reads classes whose names the user has to give
+    # A task may have classes, whose names may have another source.
     needs_names = single_image_task.labelled and not single_image_task.names_source
     if is_only_task or needs_names:
         labels = config.labels
         prompt = config.prompt
     if isinstance(model, str):
+        # The name may be that of an object that a Python caller passed.
         model = config.python_object(MODEL, model) or model
     return load_model(
         model,
@@ -266,9 +268,10 @@ def get_model_name(model: AnyModel) -> str:
 def is_session_only(model: AnyModel) -> bool:
     """Return whether a model exists in this session only.
 
-    Then no file and no command can name it.
+    Then it can't be named in a file or a command.
     """
     if isinstance(model, Model):
+        # `spec` is the name or path from which it was loaded
         return model.spec is None
     return not isinstance(model, (str, Path))
 
@@ -328,20 +331,20 @@ def check_no_worker_settings(settings: Mapping[str, object]) -> None:
             raise InputError(
                 f"{name}: other processes load objects, models, controls and the "
                 "objective by name, and some were "
-                "given as loaded objects; give their names or files"
+                "passed as loaded objects; pass their names or files"
             )
 
 
 RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path", "shutter", "rolling")
 """Settings that a configuration states for all of its controls.
 
-Each control declares which of them it takes (`Choice.run_setting`). A configuration
-without such a setting counts as one that does not state it.
+Each control declares which of them it takes (`Choice.run_setting`). Not every
+configuration has all of these settings.
 """
 
 
 SETTINGS_OF_SEARCHES = frozenset({"epsilon"})
-"""Those that only searched controls take; one that varies by chance has none."""
+"""Settings of these that only searched controls take, not those that vary by chance."""
 
 
 def collect_run_settings(
@@ -385,7 +388,8 @@ def make_configured_controls(
         if not isinstance(control, Control):
             control = config.python_object(CONTROL, name) or control
         control_by_name[name] = control
-    # Unknown controls are rejected here, before settings are read.
+    # This only checks the controls: an unknown one is rejected before settings are
+    # read.
     make_controls(control_by_name)
     completed: dict[str, Control | Mapping[str, object]] = {}
     for name, control in control_by_name.items():
@@ -393,8 +397,9 @@ def make_configured_controls(
             _check_takes_no_run_setting(run_settings, control)
             completed[name] = control
         else:
-            settings_of_control = _select_settings(run_settings, name, control)
-            completed[name] = {**settings_of_control, **control}
+            defaults_from_run = _select_settings(run_settings, name, control)
+            # what the user stated for the control itself wins
+            completed[name] = {**defaults_from_run, **control}
     return make_controls(completed)
 
 
@@ -432,7 +437,7 @@ def _select_settings(
     """
     selected: dict[str, object] = {}
     choices = _list_choices(qualified_name, control_settings)
-    for choice in choices or ():  # None of a control that is not known
+    for choice in choices or ():  # None for an unknown control
         value = run_settings.get(choice.run_setting)
         if isinstance(value, Mapping):
             _, instance_name = parse_control_name(qualified_name, control_settings)
@@ -487,20 +492,22 @@ def check_run_settings(config: SceneConfig) -> None:
             # only some commands have controls that vary by chance
             random_controls = getattr(config, "over", {})
         controls = merge_control_settings({**config.controls, **random_controls})
-        # kind of each control that does not take the setting
-        rejecting_kinds = {
-            name: parse_control_name(name, control_settings)[0]
-            for name, control_settings in controls.items()
-            if not takes_setting(name, control_settings, setting)
-        }
+        # kind of each control that does not take the setting, by its name
+        rejecting_kinds = {}
+        for name, control_settings in controls.items():
+            if not takes_setting(name, control_settings, setting):
+                kind, _ = parse_control_name(name, control_settings)
+                rejecting_kinds[name] = kind
+        # a mapping from names of controls to values, such as {"key": 0.1}
         if isinstance(value, Mapping):
             _check_named_controls(setting, value, controls, rejecting_kinds)
             continue
-        # A curve (several values, one for each run) has to be taken by all controls; a
-        # single value by any of them.
+        # A tuple of values is a curve, with a run for each value: all controls have to
+        # take the setting. For a single value it is enough if one of them does.
         is_curve = isinstance(value, tuple)
         is_rejected_by_all = len(rejecting_kinds) == len(controls)
-        if rejecting_kinds and (is_curve or is_rejected_by_all):
+        is_unsupported = is_rejected_by_all or is_curve
+        if rejecting_kinds and is_unsupported:
             name, kind = next(iter(rejecting_kinds.items()))
             raise _make_unsupported_error(setting, name, kind)
 
@@ -579,21 +586,24 @@ def _list_active_choices(
 ) -> list[Choice]:
     """List the choices of a control that have an effect with these settings.
 
-    A choice is an option of a control besides its parameters, such as `epsilon`, which
-    bounds a parameter. It has no effect if that parameter is not searched. A parameter
-    is not searched if it is set to a number, if another choice fixes it, or if it has
-    no default range and none is set.
+    A choice is an option of a control besides its parameters. `Choice.bounds` names the
+    parameter that a choice bounds, as `epsilon` does; the choice has no effect if that
+    parameter is not searched. A parameter is not searched if it is set to a number, if
+    another choice fixes it (`Choice.fixes`), or if it has no default range and none is
+    set.
 
     Args:
         kind: class of the control.
-        settings: settings that the user stated for it.
+        settings: settings that the user stated for it: values of parameters and of
+            choices, by name.
     """
-    # names of parameters that do not vary: a choice fixes them, or a number is set
+    # names of parameters that a choice fixes, or that are set to a number
     fixed = {
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
-    # names of parameters that are searched: with a default range, or with a range set
+    # names of parameters with a default range, or with a range that is set; names of
+    # choices are among these as well, but no choice bounds a choice
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
@@ -612,11 +622,12 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
     Args:
         setting: name of the setting, such as "epsilon".
         name: name of the control.
-        kind: kind of the control, which decides what is advised.
+        kind: kind of the control, on which the advice depends.
     """
     if setting == "epsilon":
         choices = CONTROLS[kind].choices if kind in CONTROLS else ()
-        # parameters that an epsilon would bound if they were searched
+        # Some controls take an epsilon for a parameter (`Choice.bounds`), but only if
+        # it is searched. The first such parameter is suggested.
         bounded_parameters = [
             choice.bounds
             for choice in choices
@@ -641,18 +652,17 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
 
 
 _PROCESS_LOCK = threading.RLock()
-"""Held by the experiment that runs.
-
-The threads of torch and Dr.Jit, and warnings that are caught, belong to the process.
+"""Lock that is held by the running experiment. The number of threads of torch and Dr.Jit
+and the recording of warnings are shared by the process.
 """
 
 
 @contextmanager
 def hold_process_lock() -> Iterator[None]:
-    """Run the block while no other thread of the process runs an experiment.
+    """Run a block while no other thread of the process runs an experiment.
 
-    Derivatives are on in it, whatever the caller has switched off (`torch.no_grad`,
-    `torch.inference_mode`). torch and Dr.Jit have their threads again after it.
+    Gradients are enabled in it, even if the caller has disabled them (`torch.no_grad`,
+    `torch.inference_mode`). Afterwards torch and Dr.Jit have as many threads as before.
     """
     with _PROCESS_LOCK, threads.restore_threads(), use_plain_switches():
         yield

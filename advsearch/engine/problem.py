@@ -1,8 +1,9 @@
 """The problem of a search: scene, space, model, task and objective in one.
 
 A `Problem` evaluates the queries of `attacks`. u (d,) are the coordinates of the
-controls that are searched. A *full configuration* has those of the conditions behind
-them: of the controls that vary by chance.
+controls that are searched. Other controls may vary by chance, such as the weather:
+these are the *conditions*. A *full configuration* consists of u, followed by the
+coordinates of the conditions.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ from advsearch.tasks.base import Output, Truth, mean, most_frequent_judgement
 
 
 class Preparation(NamedTuple):
-    """What is measured before a search, and sent to workers with its queries.
+    """Values that are measured before a search, and sent to workers with its queries.
 
     Attributes:
         spp: samples per pixel.
@@ -69,18 +70,17 @@ class Preparation(NamedTuple):
 
 LIGHT_DEPTH = 4
 """Segments of the longest light path that is collected under each of many conditions.
-
-Many conditions with some noise and without the last light teach more than few that are
-exact.
+A search learns more from many conditions with some noise and without longer paths than
+from few that are exact.
 """
 
 MAX_CACHED_COORDINATES = 64
-"""Coordinates, beside base colors, of a configuration whose truth is cached, at
-most.
+"""The truth of a configuration is cached if it has at most this many coordinates besides
+base colors.
 """
 
 MAX_CACHED_TRUTHS = 512
-"""Truths that are cached, at most."""
+"""Largest number of truths that are cached."""
 
 
 def _add_to_cache(cached: dict[bytes, Any], key: bytes, value: Any) -> None:
@@ -111,24 +111,25 @@ class Problem:
         renderer: `render(u, seed, spp)` of full configurations.
         space: all controls: those that are searched, then those that vary by chance.
         model: predicts what an image shows.
-        task: judges the model's output, and defines success.
-        make_facts: returns what the task judges by, from functions that describe and
-            render a configuration.
-        objective: the function that a search maximises; None of a sweep.
+        task: evaluates the model's output, and defines success.
+        make_facts: returns the facts from which the task derives the ground truth. Its
+            arguments are functions that describe and render a configuration.
+        objective: the function that a search maximizes; None for a sweep, which only
+            evaluates images.
         spp: samples per pixel of a search.
         seed: root seed.
-        n_searched: how many of the controls are searched, None for all. The others are
+        n_searched: number of controls that are searched; None for all. The others are
             the conditions: every image has new ones from their full range.
-        steps: renders of a search.
-        n_draws: conditions of one evaluation, if there are any; the objective is their
-            mean.
+        steps: number of renders of a search.
+        n_draws: number of conditions of an evaluation, whose objective is the mean over
+            them; 1 without conditions.
         search_depth: segments of the longest light path in a search; None for that of
             the scene.
-        aovs: ground truth that is stored of the clean and the adversarial scene
-            (`formation.AOVS`).
+        aovs: names of the layers of ground truth that are stored for the clean and the
+            adversarial scene (`formation.AOVS`).
         metrics: user functions whose values are stored with every image.
-        shared_paths: traces what trials of one seed have in common once; None where
-            each is traced in full.
+        shared_paths: traces the light paths that trials of one seed share only once;
+            None if each trial is traced in full.
         domain: the domain of the searched controls.
         conditions: the domain of the conditions; None if there are none.
     """
@@ -165,11 +166,12 @@ class Problem:
     def plan(self, plan: GradientPlan) -> None:
         """Set the plan of the gradient.
 
-        Groups of conditions are forced to the estimator "none", as nothing asks for
-        their derivatives. `domain` and `conditions` are made anew, since the cost of a
-        gradient depends on the plan.
+        Groups of conditions are forced to the estimator "none", as their derivatives
+        are never requested. `domain` and `conditions` are created again, since the
+        domain states the cost of a gradient, which depends on the plan.
         """
         controls = self.space.controls
+        # None means that all are searched
         n_searched = len(controls) if self.n_searched is None else self.n_searched
         searched = controls[:n_searched]
         conditions = controls[n_searched:]
@@ -232,8 +234,8 @@ class Problem:
             return u
         if draw_seed is None:
             return torch.cat([u, self.conditions.start])
-        # A stream of its own, so that the conditions do not depend on the noise, which
-        # has the same seed.
+        # The noise has the same seed. Another stream makes the conditions independent
+        # of it.
         generator = torch.Generator().manual_seed(seeds.stream(draw_seed, "conditions"))
         # `sample` returns a batch (1, d) of one configuration
         return torch.cat([u, self.conditions.sample(generator)[0]])
@@ -287,10 +289,10 @@ class Problem:
         full_configurations: Sequence[Tensor],
         stated_values: Sequence[Mapping[str, Value]],
     ) -> list[Judgement]:
-        """Judge images that the model gets in one batch, without an objective.
+        """Judge images that the model gets in one batch.
 
-        If a margin is infinite or NaN, the image counts as one for which the model
-        returned NaN.
+        The judgements have no objective. If a margin is infinite or NaN, the judgement
+        is that of a model that returned NaN.
 
         Args:
             images: (N, H, W, 3) sRGB in [0, 1].
@@ -312,8 +314,8 @@ class Problem:
             judged = self._judge_outputs(output, images, truths, full_configurations)
         judgements_without_objective = []
         for judgement in judged:
-            # `of` checks that the margin is finite; it takes no metrics, which are
-            # added below
+            # `from_margin` checks that the margin is finite, and sets no objective. It
+            # takes no metrics, so these are added below.
             without_objective = Judgement.from_margin(
                 judgement.score,
                 judgement.margin,
@@ -377,8 +379,8 @@ class Problem:
             full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise of the traced images.
             spp: samples per pixel of a rendered image.
-            is_random: (d,) bool, the searched coordinates that are random here, and not
-                where the search has moved them.
+            is_random: (d,) bool, which searched coordinates of `full_u` were set to
+                random values for this comparison. They are no change by the search.
             renderer: traces the images; None for that of the problem.
         """
         dim = self.domain.dim
@@ -386,11 +388,12 @@ class Problem:
             predicted = predict(full_u)
             # the start of the search, under the same conditions
             start = torch.cat([self.domain.start, full_u[dim:]])
-            # What the search has not moved is equal in both, so that only the search
-            # makes a difference.
+            # Random coordinates have the same values in both, so that only the change
+            # by the search is a difference.
             if is_random is not None:
                 start[:dim][is_random] = full_u[:dim][is_random]
-            predicted_start = None if torch.equal(start, full_u) else predict(start)
+            is_start = torch.equal(start, full_u)
+            predicted_start = None if is_start else predict(start)
 
         def measure_margin(image: Tensor, u: Tensor) -> float:
             """Return the model's margin on an image of a configuration."""
@@ -445,19 +448,37 @@ class Problem:
         if full_u is None or not self.task.varies:
             return self._start_truth
         # A truth may depend on what the camera sees, which base colors do not change.
-        # So it is cached by the other coordinates, if these are few. It is not cached
-        # if the task has read the configuration's numbers, which may include colors, or
-        # if values are stated that the coordinates do not tell.
+        # So it is cached by the other coordinates, if these are few. A truth is not
+        # cached if exact values were stated, or if the task has read values of the
+        # configuration (`Facts.numbers`), which may include colors.
         geometric_u = full_u.detach()[self._is_geometric]
         key = geometric_u.numpy().tobytes()
         if not stated_values and key in self._truths:
             return self._truths[key]
+        facts = self._make_facts_of_cameras(full_u, stated_values or {})
+        truth = self.task.truth(facts)
+        is_cacheable = not stated_values and len(geometric_u) <= MAX_CACHED_COORDINATES
+        # `numbers` is a cached property, which `vars` contains once it was read
+        has_read_numbers = "numbers" in vars(facts)
+        if is_cacheable and not has_read_numbers:
+            _add_to_cache(self._truths, key, truth)
+        return truth
+
+    def _make_facts_of_cameras(
+        self, full_u: Tensor, stated_values: Mapping[str, Value]
+    ) -> Facts:
+        """Return the facts of the main camera, with those of a rig's cameras.
+
+        Args:
+            full_u: the full configuration.
+            stated_values: exact values, which replace those of the configuration.
+        """
 
         def describe() -> dict[str, Value]:
-            """Describe the configuration, by stated values where there are any."""
             values = self.space.describe(full_u)
-            stated = stated_values or {}
-            return {name: stated.get(name, value) for name, value in values.items()}
+            return {
+                name: stated_values.get(name, value) for name, value in values.items()
+            }
 
         n_rig_cameras = 0 if self.space.scene is None else len(self.space.scene.rig)
         # one function for the main camera, then one for each camera of a rig
@@ -465,39 +486,37 @@ class Problem:
         facts, *camera_facts = [
             self.make_facts(describe, render_surfaces) for render_surfaces in renders
         ]
-        facts = replace(facts, views=tuple(camera_facts))
-        truth = self.task.truth(facts)
-        is_cacheable = not stated_values and len(geometric_u) <= MAX_CACHED_COORDINATES
-        # a cached property is among the attributes once it was read
-        has_read_numbers = "numbers" in vars(facts)
-        if is_cacheable and not has_read_numbers:
-            _add_to_cache(self._truths, key, truth)
-        return truth
+        return replace(facts, views=tuple(camera_facts))
 
     @cached_property
     def _start_truth(self) -> Truth:
         """What is true at the start, and always if the task's truth does not vary."""
         start = self.add_conditions(self.domain.start)
         if self.task.varies:
+            # with a configuration, `find_truth` does not come back here
             return self.find_truth(start)
-        return self.task.truth(
-            self.make_facts(
-                lambda: self.space.describe(start),
-                lambda: self.renderer.surfaces(start),
-            )
+        # functions, since a task may need neither
+        facts = self.make_facts(
+            lambda: self.space.describe(start), lambda: self.renderer.surfaces(start)
         )
+        return self.task.truth(facts)
 
     @cached_property
     def _is_geometric(self) -> Tensor:
-        """Whether each coordinate does more than color surfaces, (d,) bool."""
+        """Whether each coordinate changes more than the colors of surfaces, (d,) bool.
+
+        Coordinates that change the finished image, such as a blur, count as well.
+        """
+        # names of the inputs in which an image is linear, which are base colors
         color_inputs = find_linear_inputs(self.renderer)
         is_geometric = torch.ones(len(self.space.start), dtype=torch.bool)
         for group in self.space.groups:
-            # The inputs of the scene that the group changes. It is None for a group
-            # that changes no input but the finished image, as a blur does.
-            route = self.renderer.routes.get(group.name)
-            only_colors = bool(route and route <= color_inputs)
-            is_geometric[group.coordinates] = not only_colors
+            # Names of the scene inputs that the group changes; None for a group that
+            # only changes the finished image.
+            changed_inputs = self.renderer.routes.get(group.name)
+            if changed_inputs:
+                only_colors = changed_inputs <= color_inputs  # a subset
+                is_geometric[group.coordinates] = not only_colors
         return is_geometric
 
     def make_objective_inputs(
@@ -521,9 +540,11 @@ class Problem:
     def summarize_plan(self, plan: GradientPlan) -> PlannedGradient:
         """Return what a result stores of a plan, each step in its parameter's unit."""
         groups = []
-        for group, row in zip(plan.groups, plan.to_dict()["groups"], strict=True):
+        # the other fields of `GroupDerivative`, for each group
+        group_fields = plan.to_dict()["groups"]
+        for group, fields in zip(plan.groups, group_fields, strict=True):
             step, unit = self._compute_step_in_unit(group)
-            groups.append(GroupDerivative(**row, step_in_unit=step, unit=unit))
+            groups.append(GroupDerivative(**fields, step_in_unit=step, unit=unit))
         return PlannedGradient(
             renders_per_gradient=plan.renders, spp=plan.spp, groups=groups
         )
@@ -533,17 +554,18 @@ class Problem:
         degrees, and the unit.
 
         It is half the difference between the values one step above and one step below
-        the middle of the range. The result is (None, "") if the group has several
+        the center of the range. The result is (None, "") if the group has several
         coordinates, has no step, or has a value that is no number.
         """
-        # without a reason for its step, the group has no finite differences
-        if not group.step_reason or group.size != 1:
+        # a group without finite differences has no reason for a step
+        has_step = bool(group.step_reason)
+        if not has_step or group.size != 1:
             return None, ""
         u = self.add_conditions(self.domain.start).clone()
-        half_step = min(group.step, 0.5)  # within the range, from its middle
-        u[group.coordinates] = 0.5 - half_step
-        lower = self.space.describe(u).get(group.name)
-        u[group.coordinates] = 0.5 + half_step
+        step = min(group.step, 0.5)  # from the center, it stays within the range
+        u[group.coordinates] = 0.5 - step
+        lower = self.space.describe(u).get(group.name)  # {"value": 30.0, "unit": ...}
+        u[group.coordinates] = 0.5 + step
         upper = self.space.describe(u).get(group.name)
         if lower is None or upper is None:
             return None, ""
@@ -553,8 +575,9 @@ class Problem:
         return abs(difference) / 2.0, lower["unit"]
 
     def describe_conditions(self, u: Tensor, draw_seed: int) -> dict[str, Value]:
-        """Describe the conditions of a draw in values with units; {} without
-        conditions.
+        """Describe the conditions of a draw in values with units.
+
+        The result is empty if there are no conditions.
         """
         if self.conditions is None:
             return {}
@@ -586,9 +609,9 @@ class Problem:
     def evaluate(self, query: Query) -> Evaluation:
         """Evaluate one query: collect light, render an image, or judge one.
 
-        This is the only place where a run renders, predicts and judges. A query asks
-        for one of four things: light for a predictor, an image for a file, a trial of
-        the verification (it has no phase), or an evaluation of the search.
+        This is the only place where a run renders, predicts and judges. There are four
+        kinds of queries: for light for a predictor, for an image, for a trial of the
+        verification (it has no phase), and for an evaluation of the search.
         """
         non_finite_before = self.renderer.non_finite
         if query.product == "light":
@@ -608,6 +631,8 @@ class Problem:
             evaluation, _ = self.evaluate_full(query, query.u, query.seed)
         else:
             evaluation = self._evaluate_over_conditions(query)
+        # The renderer counts over all renders of the query, also those of light and
+        # images, for which the evaluation has no count yet.
         n_non_finite = self.renderer.non_finite - non_finite_before
         if n_non_finite:
             return replace(evaluation, non_finite=n_non_finite)
@@ -616,8 +641,8 @@ class Problem:
     def _evaluate_trial(self, query: Query) -> Evaluation:
         """Evaluate a trial of the verification: render an image anew and judge it.
 
-        The image has 8 bits, as a file would hold it. Its conditions are sampled only
-        if the query wants that.
+        The image has 8 bits, as a file would store it. Its conditions are sampled if
+        the query requests that.
         """
         image = self.picture(
             query.u, query.seed, query.spp, with_conditions=query.draws_conditions
@@ -634,9 +659,9 @@ class Problem:
         """Evaluate a query of a search by its mean over sampled conditions.
 
         Each of the `n_draws` conditions is rendered once. The noise of its image has
-        the same seed as the condition. If the query wants an image, it is rendered
-        under conditions that leave the scene unchanged, as no sampled one stands for
-        all.
+        the same seed as the condition. If the query requests an image, it is rendered
+        under conditions that leave the scene unchanged, as no sampled one represents
+        all of them.
         """
         condition_seeds = [
             seeds.stream(query.seed, "draw", index) for index in range(self.n_draws)
@@ -669,7 +694,7 @@ class Problem:
             truth: what is true of all images.
             inputs: what the objective may read of the configurations, such as "u".
         """
-        if self.objective is None:
+        if self.objective is None:  # only a sweep has none
             raise RuntimeError("a sweep has no objective")
         return self.objective(outputs, pictures, truth, inputs)
 
@@ -693,24 +718,24 @@ class Problem:
                 collect it now.
         """
         searched_names = {control.name for control in self.searched_space.controls}
-        searched_groups = [
-            group.name for group in self.plan.groups if group.control in searched_names
-        ]
-        # the inputs of the scene that each group changes, such as
-        # "object.base_color"
-        routes = [
-            self.renderer.routes.get(name, frozenset()) for name in searched_groups
-        ]
-        input_names = frozenset().union(*routes) & find_linear_inputs(self.renderer)
-        # light paths may be shorter than those of a search, and are never longer
-        depth = min(LIGHT_DEPTH, self.search_depth or LIGHT_DEPTH)
+        # scene inputs that the search changes, such as "object.base_color"
+        searched_inputs: frozenset[str] = frozenset()
+        for group in self.plan.groups:
+            if group.control in searched_names:
+                searched_inputs |= self.renderer.routes.get(group.name, frozenset())
+        # images are only linear in some of them
+        input_names = searched_inputs & find_linear_inputs(self.renderer)
+        # Light paths are no longer than those of a search.
+        depth = LIGHT_DEPTH
+        if self.search_depth is not None:
+            depth = min(LIGHT_DEPTH, self.search_depth)
         with self.renderer.scene.limit_depth(depth):
             return LinearRenderer(
                 self.renderer,
                 full_u,
                 seed,
                 spp=spp,
-                quick=True,  # there will be many of them
+                quick=True,  # one is made for each of many conditions
                 names=input_names,
                 collected=collected_light,
             )
@@ -720,14 +745,16 @@ class Problem:
     ) -> tuple[Evaluation, Output]:
         """Evaluate a query of a search by one image of a full configuration.
 
-        The gradient has two parts: one goes through the image and is estimated by the
-        renderer, the other exists if the objective reads the configuration itself.
+        The gradient has two parts. One goes through the image and is estimated by the
+        renderer. The other exists only if the objective reads the configuration itself,
+        for example a texture that should be smooth.
 
         Args:
-            query: the query, which states whether a gradient is wanted.
+            query: the query, which states whether a gradient is requested.
             full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise.
-            renderer: another one than that of the problem, such as a predictor.
+            renderer: renderer of the image, such as a predictor; None for that of the
+                problem.
 
         Returns:
             The evaluation and the model's output.
@@ -751,6 +778,7 @@ class Problem:
             calls.append((image.detach(), output))
             values = self._compute_objective(output, image[None], truth, inputs)
             objective = values[0]
+            # `inputs.used` is set once the objective has read an input
             is_at_u = len(calls) == 1
             if inputs.used and is_at_u:
                 input_gradient = _differentiate_by_inputs(objective, variable_u)
@@ -770,16 +798,18 @@ class Problem:
                     value = loss(renderer(full_u, seed=seed, spp=spp))
         image, output = calls[0]
         (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
-        return Evaluation(
-            float(value),
-            gradient,
-            judgement.success,
-            renderer.non_finite - non_finite_before,
-            # 1 at least, since a renderer that predicts counts no renders
-            cost=max(1, renderer.renders - renders_before) * query.samples,
+        # at least 1, since a renderer that predicts counts no renders
+        n_renders = max(1, renderer.renders - renders_before)
+        evaluation = Evaluation(
+            objective=float(value),
+            gradient=gradient,
+            success=judgement.success,
+            non_finite=renderer.non_finite - non_finite_before,
+            cost=n_renders * query.samples,  # each counts `samples` times
             judgement=judgement,
             picture=round_to_8_bit(image) if query.with_image else None,
-        ), output
+        )
+        return evaluation, output
 
     def _limit_search_depth(self, renderer: Renderer) -> AbstractContextManager[None]:
         """Return a context in which light paths are as short as those of a search.
@@ -808,17 +838,19 @@ class Problem:
         Returns:
             First, for each image, an evaluation without derivative and the model's
             output. Second, the derivative (d,) by u of the sum of the objectives, each
-            weighted by `compute_condition_weights`; None if no gradient is wanted.
+            weighted by `compute_condition_weights`; None if no gradient is requested.
         """
-        variable_u = u.detach().clone().requires_grad_(bool(gradient))
-        with torch.set_grad_enabled(bool(gradient)):
+        # "free" counts as a request: predicted images are differentiated at no cost
+        needs_gradient = bool(gradient)
+        variable_u = u.detach().clone().requires_grad_(needs_gradient)
+        with torch.set_grad_enabled(needs_gradient):
             images = render(variable_u)
             outputs = self.model(images)
             outputs_of_images = _split_batch(outputs, len(full_configurations))
             truths = [self.find_truth(full_u) for full_u in full_configurations]
+            # An objective may read the configuration itself. So its searched
+            # coordinates are replaced by those with a graph.
             variable_configurations = [
-                # An objective may read the configuration itself. So the searched
-                # coordinates in it are those with a graph.
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
@@ -827,22 +859,24 @@ class Problem:
                     outputs_of_images, images, truths, variable_configurations
                 )
             else:  # one truth holds for all images
-                values = self._compute_objective(
-                    outputs,
-                    images,
-                    truths[0],
-                    self.make_objective_inputs(*variable_configurations),
-                )
-            derivative = torch.zeros_like(u) if gradient else None
-            # without a graph the objective depends on nothing that is searched
+                inputs = self.make_objective_inputs(*variable_configurations)
+                values = self._compute_objective(outputs, images, truths[0], inputs)
+            derivative = torch.zeros_like(u) if needs_gradient else None
+            # Without a graph, the objectives do not depend on u.
             if values.requires_grad:
-                weighted_sum = (values * compute_condition_weights(values)).sum()
+                weights = compute_condition_weights(values)
+                weighted_sum = (values * weights).sum()
                 (derivative,) = torch.autograd.grad(weighted_sum, variable_u)
         judgements = self._judge_outputs(outputs, images, truths, full_configurations)
-        evaluations = [
-            Evaluation(float(value), None, judgement.success, judgement=judgement)
-            for value, judgement in zip(values.detach(), judgements, strict=True)
-        ]
+        evaluations = []
+        for value, judgement in zip(values.detach(), judgements, strict=True):
+            evaluation = Evaluation(
+                objective=float(value),
+                gradient=None,
+                success=judgement.success,
+                judgement=judgement,
+            )
+            evaluations.append(evaluation)
         return list(zip(evaluations, outputs_of_images, strict=True)), derivative
 
     def _compute_objective_of_each(
@@ -915,14 +949,14 @@ class Problem:
         """Return the evaluation of u (d,) that is the mean over conditions.
 
         It is a success if enough of the evaluations are successes: the percentage is
-        that of the rule `OVER_CONDITIONS`. A cost of 1 means one image under each of
-        the conditions, so that the cost is the maximum and not the sum.
+        that of the rule `OVER_CONDITIONS`. The cost is the largest of the evaluations,
+        and not their sum, because a cost of 1 means one image under every condition.
 
         Args:
             evaluated: an evaluation and the model's output for each condition.
             u: (d,) the searched coordinates.
-            gradient: (d,) gradient of the mean; it is used if the evaluations have no
-                gradients of their own.
+            gradient: (d,) gradient of the mean. If the evaluations have gradients, it
+                is ignored, and the mean of these is taken.
         """
         evaluations, outputs = zip(*evaluated, strict=True)
         # without the derivatives by the conditions, which come last
@@ -943,9 +977,9 @@ class Problem:
         n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
         total_objective = sum(evaluation.objective for evaluation in evaluations)
         return Evaluation(
-            total_objective / len(evaluations),
-            gradient,
-            n_successes >= n_needed,
+            objective=total_objective / len(evaluations),
+            gradient=gradient,
+            success=n_successes >= n_needed,
             non_finite=sum(evaluation.non_finite for evaluation in evaluations),
             cost=max(evaluation.cost for evaluation in evaluations),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
@@ -1010,12 +1044,13 @@ def _differentiate_by_inputs(objective: Tensor, variable_u: Tensor) -> Tensor:
 def compute_condition_weights(values: Tensor) -> Tensor:
     """Return the weights (n,) of conditions in a derivative, for their objectives (n,).
 
-    They are proportional to exp(-z), where z is the objective in standard deviations,
-    with a mean of 1: the smaller the objective, the larger the weight. With equal
-    weights the mean objective would be raised where that is easiest, where the
-    prediction is wrong already (Li et al. 2021, *Tilted Empirical Risk Minimization*,
-    section 2, with a tilt of the opposite sign). All are 1 if the objectives are equal,
-    or not finite.
+    They are proportional to exp(-z), where z is the objective divided by the standard
+    deviation of all objectives. Their mean is 1. So the smaller the objective, the
+    larger the weight. With equal weights a search would mostly raise the objective
+    under conditions where that is easy, and the prediction is often wrong there
+    already (Li et al. 2021, *Tilted Empirical Risk Minimization*, section 2, with a
+    tilt of the opposite sign). All weights are 1 if the objectives are equal, or not
+    finite.
     """
     objectives = values.detach()
     spread = objectives.new_zeros(())

@@ -1,4 +1,4 @@
-"""The state of a run, and how it is stored: findings, judgements as rows, rates."""
+"""The state of a run, and its conversion to stored rows and results."""
 
 from __future__ import annotations
 
@@ -27,48 +27,69 @@ from advsearch.scene.predictor import Refusal
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
 
-MAX_STORED_IMAGES = 4  # images of each group of trials that are stored
+MAX_STORED_IMAGES = 4  # number of images of each group of trials that are stored
 
 
 @dataclass
 class RunState:
-    """The results of a run so far; what is None or empty was not reached."""
+    """The results of a run so far. A result that was not reached is None or empty.
 
-    # renders of the clean configuration at the search's sample count
+    Attributes:
+        first_look: renders of the clean configuration at the search's sample count.
+        search: result of the search by the policy; a claim.
+        baseline: result of the random search.
+        sample_count: how the sample count of the verification was chosen.
+        clean_trials: trials of the control group.
+        verification: verification of the adversarial configuration of the run.
+        baseline_verification: verification of the result of the random search.
+        unprinted: result of a search by the policy without print terms, if the search
+            of the run has them.
+        unprinted_verification: verification of that result.
+        outdone_verification: verification of the policy's result, if the random search
+            found a scene that is worse for the model. Then that scene is the
+            adversarial one of the run.
+        failure_verifications: verifications of the first different failures that the
+            policy found.
+        ambient_verifications: verifications of a projector's image in brighter or
+            darker rooms, by lux.
+        random_trials: trials of random configurations of the full space.
+        bracket: the smallest change that makes the model fail.
+        trial_images: images of the first trials, (H, W, 3) with 8-bit values in [0, 1],
+            by kind and number. A resumed run only has those that it rendered itself.
+        frames: images of the search in its order, numpy (H, W, 3) with 8-bit values in
+            [0, 1].
+        interrupted: whether the run was interrupted.
+        predictor: predictor of the images of the searches; None if they were rendered.
+        predictor_refusal: why images were not predicted, or only cropped.
+        surface_light_refusal: why images were predicted by matrices and not by light on
+            surfaces, if that was tried.
+        crop_refusal: why full images were rendered.
+        verification_renders: number of renders for trials, and for choosing their
+            sample count.
+        n_predicted_trials: number of trials whose image was predicted.
+    """
+
     first_look: tuple[Judgement, ...] = ()
-    # what the policy claims; `verification` is what trials say of it
     search: SearchResult | None = None
-    baseline: SearchResult | None = None  # the same of the random search
-    sample_count: SampleCount | None = None  # how that of the verification was chosen
-    clean_trials: tuple[Judgement, ...] = ()  # the control group's trials
+    baseline: SearchResult | None = None
+    sample_count: SampleCount | None = None
+    clean_trials: tuple[Judgement, ...] = ()
     verification: Verification | None = None
     baseline_verification: Verification | None = None
-    # search by the policy without print terms, where that of the run has them
     unprinted: SearchResult | None = None
     unprinted_verification: Verification | None = None
-    # verification of what the policy found, where the random search found a scene that
-    # is worse for the model, which then is the adversarial scene of the run
     outdone_verification: Verification | None = None
-    # verifications of the first different failures that the policy found
     failure_verifications: tuple[Verification, ...] = ()
-    # verifications of a projector's image in brighter or darker rooms, by lux
     ambient_verifications: dict[float, Verification] = field(default_factory=dict)
-    # trials of configurations drawn from the whole space
     random_trials: tuple[Judgement, ...] = ()
     bracket: Bracket | None = None
-    # images of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and
-    # number; of a resumed run only those that it rendered itself
     trial_images: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    # images of the search in its order, numpy (H, W, 3) with 8-bit values in [0, 1]
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
-    # what predicted the pictures of the searches, if anything did
     predictor: PredictedSearch | None = None
-    predictor_refusal: Refusal | None = None  # why nothing did, or only a crop
-    # why matrices did and not light on surfaces, where that was tried
+    predictor_refusal: Refusal | None = None
     surface_light_refusal: Refusal | None = None
-    crop_refusal: Refusal | None = None  # why whole images were rendered
-    # renders spent on choosing the sample count and on trials
+    crop_refusal: Refusal | None = None
     verification_renders: int = 0
     n_predicted_trials: int = 0
 
@@ -89,15 +110,18 @@ class RunState:
             crop = str(self.crop_refusal) if self.crop_refusal else None
             return LinearTransport(used=False, reason=reason, crop=crop)
         summary = self.predictor.summarize()
-        # why a better predictor was not used: this one has a reason of its own only if
-        # it was given up
-        refusal = self.predictor_refusal or self.surface_light_refusal
-        if summary.reason or not refusal:
+        # why a better method was not used: matrices for a crop, or light on surfaces
+        # for matrices
+        better_method_refusal = self.predictor_refusal or self.surface_light_refusal
+        # If the predictor was given up, its summary has that as the reason, which
+        # stays.
+        was_given_up = bool(summary.reason)
+        if was_given_up or not better_method_refusal:
             return summary
-        return summary.model_copy(update={"reason": str(refusal)})
+        return summary.model_copy(update={"reason": str(better_method_refusal)})
 
 
-# the label of an image whose workers all died; the payload of its row has the reason
+# label of a row if all workers that tried its image died; its payload has the reason
 LOST_LABEL = "(no answer)"
 
 
@@ -131,10 +155,10 @@ def make_trial_row(
         spp: samples per pixel.
         judgement: judgement of its image.
         values: values of the configuration.
-        has_success: whether some prediction is sought. If not, as in a sweep, the row
-            has None for its success.
+        has_success: whether some prediction is sought. If not, as in a sweep, the
+            success of the row is None.
     """
-    # a trial costs one render, unless the caller replaces that
+    # A trial counts as one render. A caller may replace this.
     row = Row(
         kind,
         number,
@@ -156,7 +180,8 @@ def add_judgement(row: Row, judgement: Judgement) -> Row:
         score=_none_if_nan(judgement.score),
         correct=judgement.right,
         margin=_none_if_nan(judgement.margin),
-        # None where the output was NaN: its index and probability are None by themselves
+        # None where the output was NaN: its index and probability are None by
+        # themselves
         label=None if judgement.is_non_finite else prediction.label,
         label_index=prediction.index,
         probability=prediction.probability,
@@ -166,15 +191,15 @@ def add_judgement(row: Row, judgement: Judgement) -> Row:
 
 
 def _none_if_nan(value: float | None) -> float | None:
-    """Return a number; None, which JSON has, for NaN."""
+    """Return a number, or None for NaN, which JSON does not have."""
     return None if value is None or math.isnan(value) else value
 
 
 def read_judgement(row: Row) -> Judgement:
-    """Return the judgement that a row has, the inverse of `add_judgement`.
+    """Return the judgement of a row, the inverse of `add_judgement`.
 
-    A None in the row stands for a NaN in the judgement. A row without a label is that
-    of an output that was NaN.
+    A None in the row means NaN in the judgement. In a row without a label, the output
+    of the model was NaN.
     """
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(
@@ -189,11 +214,11 @@ def read_judgement(row: Row) -> Judgement:
 
 
 def make_verified_rate(verification: Verification) -> VerifiedRate:
-    """Return the rate of success of a verification, with labels and mean score."""
+    """Return the rate of success of a verification as a result stores it."""
     rate = make_rate(
-        verification.adversarial_counts,
-        verification.valid_trials,
-        verification.successful_trials,
+        counts=verification.adversarial_counts,
+        trials=verification.valid_trials,
+        successes=verification.successful_trials,
     )
     return rate.model_copy(update={"stopped": verification.stopped})
 
@@ -210,15 +235,16 @@ def make_rate(
         successes: judgements of the successes, whose labels and outcomes are counted.
     """
     labels = Counter(trial.prediction.label for trial in successes)
-    # A margin is the score with the opposite sign. It is 0.0 - x and not -x, so that the
-    # mean of zeros is shown as 0 and not as -0.
-    margin = 0.0 - mean_number(trial.score for trial in trials)
+    # The score is the margin with the opposite sign. In floating point -x is -0 for a
+    # mean score of 0, but 0.0 - x is 0.
+    mean_margin = 0.0 - mean_number(trial.score for trial in trials)
     return VerifiedRate(
         successes=counts.successes,
         spp=counts.spp,
         labels=dict(labels.most_common()),
+        # outcomes such as "missed", which tasks put into the payload
         outcomes=count_outcomes(trial.payload for trial in successes),
-        margin=margin,
+        margin=mean_margin,
         **_rate_fields(counts, trials),
     )
 
@@ -237,13 +263,13 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
     )
 
 
-def _rate_fields(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
+def _rate_fields(counts: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
     """Return the fields that all rates of a result have, from counts and trials."""
     n_not_a_number = sum(trial.is_non_finite for trial in trials)
     return {
-        "trials": rate.trials,
-        "rate": rate.rate,
-        "interval": rate.interval,
+        "trials": counts.trials,
+        "rate": counts.rate,
+        "interval": counts.interval,
         "not_a_number": n_not_a_number,
     }
 

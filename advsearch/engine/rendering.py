@@ -57,18 +57,18 @@ class View:
 
     Attributes:
         azimuth: azimuth of the camera, degrees.
-        picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: what the
-            model sees.
+        picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: the input
+            of the model.
         linear: (H, W, 3) linear radiance times the gain, before controls change the
             finished image.
         predictions: predictions of the model, the most probable first.
-        marks: boxes and masks of the prediction and of the truth; empty where the task
+        marks: boxes and masks of the prediction and of the truth; empty if the task
             draws nothing.
         surfaces: what each pixel shows; None if it was not requested.
         output: output of the model, for its task.
-        truth: truth of the scene; None where the task does not depend on what is
-            visible, or where it is unknown.
-        things: visible parts of the object and each thing beside it, see
+        truth: truth of the scene; None if it does not depend on what is visible, or if
+            it is unknown.
+        things: visible parts of the object and of each other thing, see
             `find_visible_things`.
     """
 
@@ -92,12 +92,12 @@ class Rendering:
     """Images of a scene. Made by `render`.
 
     Attributes:
-        scene: what was rendered.
+        scene: the scene that was rendered.
         model: name of the model.
         task: name of its task.
         formation: how the images were formed, with size and gain.
         spp: samples per pixel.
-        views: a single one, or one for each azimuth.
+        views: a single view, or one for each azimuth.
         warnings: sentences for the user.
     """
 
@@ -112,17 +112,19 @@ class Rendering:
     def save(self, path: str | Path) -> tuple[int, int]:
         """Write the image atomically, and return its height and width in pixels.
 
-        Several views become one sheet with the predictions under each. A .png holds
-        what the model sees, an .exr linear radiance times the gain. An existing file is
-        replaced.
+        Several views become one sheet with the predictions under each. A .png file
+        stores the input of the model; an .exr file stores linear radiance times the
+        gain. An existing file is replaced.
 
         Raises:
             InputError: another suffix, or an .exr of several views.
             StorageError: it could not be written.
         """
         file = check_image_path(path, len(self.views))
+        # errors name the setting "out", which states the path
         with name_setting_in_errors("out"):
             if file.suffix.lower() == ".exr":
+                # a single view, as was checked
                 write_exr(file, self.views[0].linear)
                 return self.formation.resolution
             write_png(file, self._png_pixels)
@@ -234,7 +236,7 @@ class Rendering:
 
         Args:
             out: file that was written.
-            size: its height and width in pixels.
+            size: height and width of the file in pixels; a sheet is larger than a view.
             warnings: all sentences for the user.
             prediction_path: file with the predictions drawn in, if there is one.
         """
@@ -242,6 +244,7 @@ class Rendering:
         up = scene.object.up
         return RenderResult(
             out=str(out),
+            # the image with the predictions
             answered=None if prediction_path is None else str(prediction_path),
             size=size,
             object=scene.object_name,
@@ -273,14 +276,14 @@ class _ViewSettings:
 
 
 class _RenderedView(NamedTuple):
-    """A view, with what `render` needs of it for the next views and its result.
+    """A view, with values that `render` needs for the next views and its result.
 
     Attributes:
         view: the view.
-        task: after it was calibrated by the view.
+        task: task after it was calibrated by the view.
         space: space of the controls in the scene of the view.
         formation: formation of the image.
-        truth_error: why the truth of the view is unknown; "" where it is known or not
+        truth_error: why the truth of the view is unknown; "" if it is known or not
             needed.
     """
 
@@ -314,29 +317,30 @@ def render(
     """Render a scene and predict with a model what it shows.
 
     Args:
-        scene: scene from `load_scene`, or what that takes.
-        model: model from `load_model`, or what that takes.
-        task: reads the model's predictions: a name, a mapping with a `name` and
-            options, an instance, or a function.
-        label: the right labels, for a task that draws what is true; None for the
-            object's own.
+        scene: scene from `load_scene`, or the first argument of that.
+        model: model from `load_model`, or the first argument of that.
+        task: task that reads the model's predictions: a name, a mapping with a `name`
+            and options, an instance, or a function.
+        label: the right labels, for a task that draws the truth; None for those of the
+            object.
         judge: the thing whose truth is drawn: "object", the name of another thing of
             the scene, or "all".
-        controls: what differs from the scene: names, instances, or a mapping from names
-            to settings. A parameter with a range stays where a search would start.
-        around: number of views, from azimuths all around the object; None for one, from
-            the scene's own camera.
-        texture: texture of the object in place of its own, as `load_scene` takes it.
-        resolution: side, or (height, width), in pixels; None for what the model takes.
+        controls: changes of the scene: names, instances, or a mapping from names to
+            settings. A parameter with a range has the value where a search would start.
+        around: number of views, from azimuths all around the object; None for one view,
+            from the camera of the scene.
+        texture: texture that replaces that of the object, as in `load_scene`.
+        resolution: side, or (height, width), in pixels; None for the input size of the
+            model.
         spp: samples per pixel.
         denoise: "oidn" or "none".
         sampler: "multijitter" or "independent".
         seed: root of the noise.
-        aov: store what each pixel shows, for `Rendering.save_aov`.
-        at: (d,) in [0, 1], the configuration of `controls` in place of their start:
-            `result.u`, say.
-        progress: True shows a bar, False none, None one on a terminal; or an object
-            that is told how far it is.
+        aov: whether to store what each pixel shows, for `Rendering.save_aov`.
+        at: (d,) in [0, 1], configuration of `controls`, for example `result.u`; None
+            for their start.
+        progress: True shows a progress bar, False shows none, None shows one on a
+            terminal; or an object that receives the progress.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, a value is out of range,
@@ -468,9 +472,9 @@ def _render_view(
         truth = None
         truth_error = ""
         if task.varies:
-            truth, truth_error = _find_truth(
-                task, _make_view_facts(description, space, renderer, u, settings)
-            )
+            facts = _make_view_facts(description, space, renderer, u, settings)
+            truth, truth_error = _find_truth(task, facts)
+        # From here on the predictions are read as the calibrated task does.
         task = task.after_calibration(output, truth)
         predictions = task.predictions(output, MAX_PREDICTIONS)[0]
         marks = () if truth is None else tuple(task.marks(output, truth)[0])
@@ -489,7 +493,7 @@ def _render_view(
 
 
 def _find_truth(task: Task, facts: Facts) -> tuple[Any, str]:
-    """Return what is true by the facts, or None and why the task cannot tell."""
+    """Return the truth by the facts, or None and why the task can't derive it."""
     try:
         return task.truth(facts), ""
     except InputError as error:
@@ -523,9 +527,13 @@ def _make_view_facts(
         space: space of the controls.
         renderer: renders what each camera sees.
         u: (d,) the configuration.
-        settings: label and judged thing are taken from these arguments of `render`.
+        settings: arguments of `render`, of which the label and the name of the judged
+            thing are used.
     """
-    # the first is the main camera, the others are those of a rig
+    # functions that render what each camera sees: the main camera, then those of a rig
+    render_functions = list_camera_renders(
+        renderer, u, n_rig_cameras=len(description.rig)
+    )
     facts, *camera_facts = [
         make_facts(
             description,
@@ -535,7 +543,7 @@ def _make_view_facts(
             render_surfaces=render_surfaces,
             judge=settings.judge,
         )
-        for render_surfaces in list_camera_renders(renderer, u, len(description.rig))
+        for render_surfaces in render_functions
     ]
     return replace(facts, views=tuple(camera_facts))
 
@@ -619,27 +627,28 @@ def make_facts(
         UnknownNameError: no thing has the name `judge`.
     """
     check_judged_thing(description, judge)
-    # rendered once, however many things ask for it
+    # rendered at most once, even if the facts of several things need it
     cached_render = None if render_surfaces is None else cache(render_surfaces)
     collect_numbers = partial(_collect_numbers, description, describe)
+    # The stated label belongs to one thing. All others have their own labels.
+    labelled_mesh = OBJECT if judge == ALL_THINGS else judge
 
     def make_thing_facts(mesh: str) -> Facts:
         """Return the facts of a single thing, the object or another one."""
-        # the one thing to which the stated label belongs; None as the right label of a
-        # thing means that its own label is right
-        labelled_mesh = OBJECT if judge == ALL_THINGS else judge
-        right_label = label if mesh == labelled_mesh else None
-        sight = None
+        # without a stated label (None), the own label of the thing is right
+        stated_label = label if mesh == labelled_mesh else None
+        # a function, so that a task that does not need it does not render
+        look = None
         if cached_render is not None:
             metres = description.object.size_in_metres
-            sight = partial(_look_at, cached_render, mesh, metres=metres)
+            look = partial(_look_at, cached_render, mesh, metres=metres)
         # The object has the name that the caller states. Another thing has the name of
         # its mesh.
         if mesh == OBJECT:
             own_label = description.object.label
-            return Facts(name, right_label, own_label, collect_numbers, sight)
+            return Facts(name, stated_label, own_label, collect_numbers, look)
         own_label = description.things[mesh].label
-        return Facts(mesh, right_label, own_label, collect_numbers, sight)
+        return Facts(mesh, stated_label, own_label, collect_numbers, look)
 
     facts_by_mesh = _add_others(
         {mesh: make_thing_facts(mesh) for mesh in (OBJECT, *description.things)}
@@ -688,7 +697,7 @@ def _look_at(
 def make_sight(
     surfaces: Surfaces, mesh: str = OBJECT, metres: float | None = None
 ) -> Sight:
-    """Return what a task may know of how the camera sees one mesh: its mask and depths.
+    """Return how the camera sees one mesh, as a task may use it: its mask and depths.
 
     Args:
         surfaces: what each pixel shows.

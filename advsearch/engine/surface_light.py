@@ -1,8 +1,9 @@
 """Searches in which cameras move, predicted by stored light on surfaces.
 
-Predicted images are compared with traced ones. Where they are too far off, the light is
-computed again for the present base colors, if these are searched; the second time in a
-row images are traced from there on, or predicted by matrices (docs/surface-light.md).
+At intervals predicted images are compared with traced ones. If they are not accurate
+enough, the light is computed again for the current base colors, if these are searched.
+After a second failure in a row, further images are traced, or predicted by matrices
+(docs/surface-light.md).
 """
 
 from __future__ import annotations
@@ -40,20 +41,21 @@ from advsearch.scene.surface.renderer import (
 from advsearch.scene.transport.matrix import ProgressCallback
 
 MIN_IMAGES = 32
-"""Images of a search from which on the light pays.
-
-Light and a comparison take as long as some 25 rendered images, or 45 where the first
-views do not decide.
+"""Smallest number of images of a search for which the light pays. The light and a
+comparison take as long as about 25 rendered images, or 45 if the first views do not
+decide.
 """
-# where light on surfaces has no advantage
+# If no camera moves, light on surfaces has no advantage.
 NO_CAMERA = Refusal("no camera moves", RefusalCause.NO_CAMERA)
-N_LIGHTS = 64  # environments in the bank, where they vary
-COMPARISON_INTERVAL = 100  # evaluations from one comparison to the next, at first
+# number of environments whose light is stored, if conditions change the environment
+N_LIGHTS = 64
+# first interval between two comparisons, as a number of evaluations
+COMPARISON_INTERVAL = 100
 BATCH_SIZE = 8  # images in a batch of the model
 N_CONDITION_SETS = 4
-"""Sets of conditions of a random search, which are used in turn.
-
-Nothing learns from its evaluations, and what each camera sees is stored.
+"""Number of sets of conditions of a random search, which are used in turn. Such a search
+can't adapt to them, since it does not learn from evaluations. So the views of the
+cameras can be stored, and are traced only once for each set.
 """
 
 
@@ -72,7 +74,8 @@ def find_surface_light_refusal(
             setting of this name).
     """
     if not specialise:
-        return Refusal("nothing is left out")
+        return Refusal("nothing is left out")  # as the setting requests it
+    # why the image is composed of several; "" if it is not
     if problem.renderer.composition_reason:
         return Refusal(problem.renderer.composition_reason)
     names = [control.name for control in problem.space.controls]
@@ -89,8 +92,8 @@ def find_surface_light_refusal(
     if policy.takes_differences(problem.domain, steps):
         return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
     for group in problem.plan.groups:
-        # a prediction has derivatives of its own, and not by an estimator that the user
-        # has forced
+        # The user may force an estimator of derivatives of rendered images. Derivatives
+        # of predicted images are computed in another way.
         needs_estimator = group.estimator not in ("none", "image")
         if group.is_forced and needs_estimator:
             return Refusal(f"the estimator of {group.name} is forced")
@@ -101,28 +104,36 @@ def find_surface_light_refusal(
 class SurfaceLight(PredictedSearch):
     """The light on surfaces of a run whose searches have many cameras.
 
+    The light of an environment on all surfaces is computed once and stored. Then images
+    of other cameras, and with other base colors, can be predicted. If conditions change
+    the environment, the bank has the light of `N_LIGHTS` of them.
+
     Attributes:
         light_u: (d,) configuration whose light is computed; None for the start.
         moving_coordinates: indices of the coordinates of u that move; None for those of
             cameras and environments.
+        _moving: (d,) bool, which searched coordinates move a camera or change the
+            environment.
+        _has_moving: whether there is such a coordinate.
+        _searches_colors: whether a searched coordinate changes base colors.
+        _needs_new_light: (k,) bool, which coordinates of the conditions change the
+            environment, so that other light has to be computed.
+        _input_space: controls whose scene inputs are computed for an image.
     """
 
-    # Private attributes that `__post_init__` sets: `_moving` (d,) and `_needs_new_light`
-    # (k,) tell which searched coordinates move a camera or environment, and which
-    # coordinates of conditions need another light; `_has_moving` and
-    # `_searches_colors`, whether a searched coordinate moves something, or colors it.
     method: ClassVar[str] = "surface light"
     title: ClassVar[str] = "finding the light on surfaces"
     light_u: Tensor | None = None
     moving_coordinates: Tensor | None = None
     _renderer: SurfaceRenderer | None = None
-    # coordinates of the conditions of the bank
+    # (k,) coordinates of each condition of the bank
     _bank_conditions: list[Tensor] = field(default_factory=list)
     _n_lights: int = 0
     # index of the evaluation before which predictions are compared again; 0 at first,
-    # which stands for `COMPARISON_INTERVAL`
+    # which means `COMPARISON_INTERVAL`
     _next_comparison: int = 0
-    # what cameras see, by index of the conditions and begin of the batch
+    # views of the cameras, by the index of the set of conditions and the first index of
+    # the batch in it
     _stored_views: dict[tuple[int, int], list[LitCameraView]] = field(
         default_factory=dict
     )
@@ -130,9 +141,7 @@ class SurfaceLight(PredictedSearch):
     def __post_init__(self) -> None:
         """Find which coordinates move cameras, change environments and color surfaces.
 
-        Sets `_moving` (d,), whether a searched coordinate moves a camera or changes the
-        environment, unless the caller stated which do. Sets `_needs_new_light` (k,),
-        whether a coordinate of the conditions needs the light to be computed anew.
+        Sets the private attributes that the class docstring lists.
         """
         problem = self.problem
         space = problem.space
@@ -154,13 +163,14 @@ class SurfaceLight(PredictedSearch):
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
         self.draws_conditions = problem.conditions is not None and self._searches_colors
-        # If the searched controls set nothing but base colors, only the inputs of the
-        # conditions are computed for each image. Base colors are applied separately.
+        # Base colors are applied separately. So if nothing that is searched moves, only
+        # the inputs of the conditions, whose controls come last, have to be computed.
         self._input_space = space
         if not self._has_moving:
-            # `n_searched` is None if there are no conditions. Then all controls count.
-            conditions = space.controls[problem.n_searched or 0 :]
-            self._input_space = replace(space, controls=conditions)
+            # `problem.n_searched` is None without conditions: then all controls count
+            n_searched_controls = problem.n_searched or 0
+            condition_controls = space.controls[n_searched_controls:]
+            self._input_space = replace(space, controls=condition_controls)
         self._needs_new_light = self._find_light_conditions()[n_searched:]
 
     def _find_coordinates(self, inputs: frozenset[str]) -> Tensor:
@@ -238,14 +248,13 @@ class SurfaceLight(PredictedSearch):
     def count_predicted(self, kind: str, evaluations: int) -> int:
         """Return how many of the first evaluations of a search were predicted.
 
-        None were if an earlier search has given predictions up.
-
         Args:
             kind: kind of the search.
             evaluations: how many evaluations it has had.
         """
+        # The search "search" is the first. If it has given predictions up, all later
+        # ones are traced from their first evaluation on.
         if "search" in self.first_traced and kind != "search":
-            # another search is later, and is traced from its first evaluation on
             return 0
         return super().count_predicted(kind, evaluations)
 
@@ -261,7 +270,7 @@ class SurfaceLight(PredictedSearch):
         problem = self.problem
         u = problem.domain.start if self.light_u is None else self.light_u
         with self.count_time(), torch.no_grad():
-            # without a seed, with conditions that leave the scene unchanged
+            # Without a seed, the conditions leave the scene unchanged.
             full_u = problem.add_conditions(u)
             self._renderer = SurfaceRenderer(
                 problem.renderer, full_u, seeds.stream(problem.seed, "surface light")
@@ -270,8 +279,10 @@ class SurfaceLight(PredictedSearch):
             for condition in self._bank_conditions:
                 inputs = self._compute_inputs(torch.cat([u, condition]))
                 self._renderer.get_light(inputs)  # computes it, and stores it
+                # `N_LIGHTS` is the length of the progress bar (`n_samples`), also if
+                # there is a single condition
                 tick(N_LIGHTS // len(self._bank_conditions))
-            # lights that did not fit into memory were dropped
+            # The renderer drops stored lights if they do not fit into memory.
             n_stored = len(self._renderer.stored_lights)
             self._n_lights = n_stored + self._renderer.n_dropped
         self._compare(u, index=0)
@@ -306,41 +317,52 @@ class SurfaceLight(PredictedSearch):
     ) -> Iterator[Evaluation]:
         """Evaluate queries of a search, or trials, in their order.
 
-        Images are predicted in batches if neither conditions nor colors vary, since
-        they then do not depend on earlier evaluations.
+        If neither conditions nor colors vary, images do not depend on earlier
+        evaluations, and are predicted in batches. Otherwise `evaluate` predicts them
+        one by one.
 
         Args:
             queries: the queries.
             trace: renders. From the first query that cannot be predicted on, it
                 evaluates all.
         """
-        # images of the queries of the latest batch, by position
+        # images of the latest batch, by the position of the query in `queries`
         predicted_images: dict[int, Tensor] = {}
         can_batch = self.problem.conditions is None and not self._searches_colors
         for position, query in enumerate(queries):
-            self.replay(query)
+            self.replay(query)  # compares predictions first, if that is due
             if self._must_trace(query):
                 yield from trace(queries[position:])
                 return
             if can_batch and position not in predicted_images:
                 batch = queries[position : position + self.renderer.batch_size]
                 images = self.renderer.predict_images([batched.u for batched in batch])
-                predicted_images = dict(enumerate(images, position))
-            yield self.evaluate(query, predicted_images.get(position))
+                predicted_images = dict(enumerate(images, start=position))
+            # None without batches: then `evaluate` predicts the image
+            image = predicted_images.get(position)
+            yield self.evaluate(query, image)
 
     def _must_trace(self, query: Query) -> bool:
         """Return whether a query has to be rendered.
 
-        It has to if predictions were given up before it, if the search itself is over,
-        or if its gradient takes differences of rendered images.
+        It has to if predictions were given up before it, or if its gradient takes
+        differences of rendered images. A "free" gradient takes none.
         """
         takes_differences = self.problem.domain.gradient_cost > 0
         if query.gradient is True and takes_differences:
             return True
-        return self.count_predicted(query.kind, query.index + 1) <= query.index
+        # number of predicted evaluations among the first ones, up to this query
+        n_predicted = self.count_predicted(query.kind, query.index + 1)
+        is_predicted = query.index < n_predicted
+        return not is_predicted
 
     def evaluate(self, query: Query, image: Tensor | None = None) -> Evaluation:
-        """Evaluate a query, with its image (H, W, 3) if that is predicted already."""
+        """Evaluate a query, with its image (H, W, 3) if that is predicted already.
+
+        Without an image, a query of a search is evaluated by its mean over conditions.
+        If there are no conditions, that is a mean over a single image.
+        """
+        # a query of a search has a phase, "search" or "ranking"
         is_trial = query.phase is None
         if is_trial:
             return self._evaluate_trial(query, image)
@@ -369,10 +391,14 @@ class SurfaceLight(PredictedSearch):
 
     def _evaluate_image(self, query: Query, image: Tensor) -> Evaluation:
         """Evaluate a query of a search by its predicted image, without derivative."""
+        # There are no conditions here, so that the full configuration is u itself.
         evaluated, _ = self.problem.evaluate_batch(
-            lambda u: image[None], [query.u], query.u, gradient=False
+            lambda u: image[None],  # a batch of one image
+            full_configurations=[query.u],
+            u=query.u,
+            gradient=False,
         )
-        evaluation, _ = evaluated[0]  # of a batch of one image
+        ((evaluation, _),) = evaluated
         return replace(
             evaluation,
             cost=query.samples,
@@ -383,28 +409,22 @@ class SurfaceLight(PredictedSearch):
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search by its mean over conditions.
 
-        An image is predicted under each of the problem's `n_draws` conditions.
+        An image is predicted under each of the problem's `n_draws` conditions. An
+        image that the query requests shows the scene without random conditions.
         """
         problem = self.problem
-        # A random search ("baseline") uses `N_CONDITION_SETS` sets of conditions in
-        # turn. If nothing that is searched moves, the cameras see the same surfaces
-        # each time a set is used, and that view is stored.
-        reuses_conditions = (
-            query.kind == "baseline"
-            and problem.conditions is not None
-            and not self._has_moving
-        )
-        index = query.index  # of the set of conditions
+        set_index = query.index
+        reuses_conditions = self._reuses_conditions(query.kind)
         if reuses_conditions:
-            index = query.index % N_CONDITION_SETS
-        conditions = self._choose_conditions(query.kind, index, problem.n_draws)
+            set_index = query.index % N_CONDITION_SETS
+        conditions = self._choose_conditions(query.kind, set_index, problem.n_draws)
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
         ]
 
         def predict(batch: slice, u: Tensor) -> Tensor:
-            # the key under which the views of these conditions are stored
-            key = (index, batch.start) if reuses_conditions else None
+            # the key under which the views of this batch of conditions are stored
+            key = (set_index, batch.start) if reuses_conditions else None
             return self._predict_images(full_configurations[batch], u, key)
 
         evaluation = problem.evaluate_conditions(
@@ -414,10 +434,19 @@ class SurfaceLight(PredictedSearch):
         if not query.with_image:
             return evaluation
         with torch.no_grad():
-            # without a seed, with conditions that leave the scene unchanged
-            clean_conditions = problem.add_conditions(query.u)
-            images = self._predict_images([clean_conditions], query.u)
+            # Without a seed, the conditions leave the scene unchanged.
+            clean_full_u = problem.add_conditions(query.u)
+            images = self._predict_images([clean_full_u], query.u)
             return replace(evaluation, picture=round_to_8_bit(images[0]))
+
+    def _reuses_conditions(self, kind: str) -> bool:
+        """Return whether a search uses a few sets of conditions in turn.
+
+        A random search ("baseline") does. But if something that is searched moves, the
+        views of the cameras differ each time, and nothing is gained.
+        """
+        has_conditions = self.problem.conditions is not None
+        return kind == "baseline" and has_conditions and not self._has_moving
 
     def _choose_conditions(self, kind: str, number: int, count: int) -> list[Tensor]:
         """Return the conditions (k,) of an evaluation: new cameras under stored lights.
@@ -432,7 +461,7 @@ class SurfaceLight(PredictedSearch):
         """
         problem = self.problem
         if problem.conditions is None:
-            # the bank has a single condition without coordinates
+            # the bank has a single condition without coordinates, which is repeated
             return self._bank_conditions * count
         generator = torch.Generator().manual_seed(
             seeds.stream(problem.seed, f"surface {kind}", number)
@@ -440,21 +469,26 @@ class SurfaceLight(PredictedSearch):
         n_lights = len(self._bank_conditions)
         positions = torch.randint(n_lights, (count,), generator=generator).tolist()
         new_conditions = problem.conditions.sample(generator, count)
-        return [
-            torch.where(self._needs_new_light, self._bank_conditions[position], new)
-            for position, new in zip(positions, new_conditions, strict=True)
-        ]
+        conditions = []
+        for position, new_condition in zip(positions, new_conditions, strict=True):
+            stored_condition = self._bank_conditions[position]
+            condition = torch.where(
+                self._needs_new_light, stored_condition, new_condition
+            )
+            conditions.append(condition)
+        return conditions
 
     def _compute_inputs(self, full_u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a full configuration.
 
-        If no searched control moves anything, only the inputs that conditions set are
-        computed: those of base colors are then missing.
+        If no searched control moves anything, `_input_space` has only the controls of
+        the conditions. Then only their inputs are computed, without base colors.
         """
         with torch.no_grad():
-            # all coordinates, or those of the conditions, which are the last ones
+            # the last coordinates of `full_u`, which may be all of them
             first = len(full_u) - len(self._input_space.start)
             inputs = self._input_space.inputs(full_u[first:])
+            # completed by the inputs that nothing changes
             return self.problem.renderer.scene.assembly(inputs)
 
     def _predict_images(
@@ -469,18 +503,21 @@ class SurfaceLight(PredictedSearch):
             full_configurations: n full configurations, whose searched coordinates are
                 u.
             u: (d,) the searched coordinates, perhaps with a gradient.
-            key: index of a set of conditions, and begin of the batch in it. What the
-                cameras see is stored under this key for later calls. None to store
-                nothing.
+            key: (index of a set of conditions, first index of the batch in it). The
+                views of the cameras are stored under this key for later calls. None to
+                store nothing.
         """
+        # base colors, with a graph from u
         color = self.renderer.get_color(self.problem.searched_space.inputs(u))
+        # the same configurations, with a graph from u
         variable_configurations = [
             torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
         ]
         inputs = [self._compute_inputs(full_u) for full_u in full_configurations]
         views: Iterable[LitCameraView]
         if key is None:
-            views = self.renderer.trace_views(inputs)  # lazily, one at a time
+            # an iterator, so that only one view at a time is in memory
+            views = self.renderer.trace_views(inputs)
         else:
             if key not in self._stored_views:
                 self._stored_views[key] = list(self.renderer.trace_views(inputs))
@@ -490,23 +527,28 @@ class SurfaceLight(PredictedSearch):
         )
 
     def replay(self, query: Query) -> None:
-        """Compare predictions with traced images if a comparison is due.
+        """Bring the predictor to its state at a query: compare it if that is due.
 
-        It is due every `COMPARISON_INTERVAL` evaluations if base colors are searched,
-        since the stored light reflects earlier colors. Otherwise the interval doubles
-        as long as predictions are accurate. After one inaccurate comparison the light
-        is computed again for the present colors, if colors are searched. After two in a
-        row, all further images are traced.
+        Before a query is evaluated, and also if its evaluation is read from the store,
+        the comparison that belongs to it is made.
+
+        It is due every `COMPARISON_INTERVAL` evaluations of the search if base colors
+        are searched, since the stored light was reflected by earlier colors. Otherwise
+        the interval doubles as long as predictions are accurate. After one inaccurate
+        comparison the light is computed again for the current colors, if colors are
+        searched. After two in a row, all further images are traced.
 
         Args:
             query: the query that is evaluated next.
         """
+        # Other kinds, such as "baseline", and the ranking use what this search left.
         is_of_search = query.kind == "search" and query.phase == "search"
         predictions_failed = self.tracing_reason is not None
         next_comparison = self._next_comparison or COMPARISON_INTERVAL
         is_due = query.index >= next_comparison
         if not is_of_search or predictions_failed or not is_due:
             return
+        # the comparison before, whose deviation is the latest so far
         was_accurate = self.deviations[-1].is_accepted
         is_accurate = self._compare(query.u, query.index).is_accepted
         interval = COMPARISON_INTERVAL
@@ -541,19 +583,20 @@ class SurfaceLight(PredictedSearch):
         with self.count_time():
             generator = torch.Generator().manual_seed(seed)
             random_configurations = problem.domain.sample(generator, N_VIEWS)
-            # (N_VIEWS, d): random where something moves, else as searched
+            # (N_VIEWS, d): random in the moving coordinates, else u
             configurations = torch.where(self._moving, random_configurations, u)
-            configurations[0] = u
+            configurations[0] = u  # the first view is that of u itself
             conditions = self._choose_conditions(kind, index, N_VIEWS)
             full_configurations = [
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
             ]
             # The margin may be off by a fraction of the change that the search has
-            # made. Coordinates that are random here do not count as such a change.
+            # made. Random coordinates are no such change. If colors are not searched,
+            # only cameras and environments are, so that all coordinates count as
+            # random.
             is_random = self._moving
             if not self._searches_colors:
-                # only cameras and environments are searched: no change counts
                 is_random = torch.ones_like(self._moving)
 
         def compare_view(number: int) -> ComparedView:

@@ -1,9 +1,9 @@
 """Searches whose images are predicted, and their simplest predictor: a matrix.
 
-The matrix of light transport predicts images where nothing varies by chance. Every
-`COMPARISON_INTERVAL` evaluations predictions are compared with traced images: where
-they are too far off (`engine.acceptance`), the matrix is computed again. The ranking
-and all trials trace paths; the ranking does so in the window.
+A matrix of light transport predicts the images of a search without random conditions.
+Every `COMPARISON_INTERVAL` evaluations predictions are compared with traced images. If
+they are not accurate enough (`engine.acceptance`), the matrix is computed again. The
+ranking and all trials trace paths; the ranking does so only in the window.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ from advsearch.scene.transport.matrix import ProgressCallback
 from advsearch.scene.window import Window
 
 MIN_STEPS = 16
-"""Evaluations of a search from which on the matrix pays.
-
-It costs as much as some 6 rendered evaluations with gradients
-(`benchmarks/transport.py`).
+"""Smallest number of evaluations of a search for which the matrix pays. It costs as much
+as about 6 rendered evaluations with gradients (`benchmarks/transport.py`).
 """
-# evaluations for each light from which on basis images pay
+# Smallest number of evaluations for each light for which basis images pay. A basis
+# image shows the scene under a single light; images under all lights are weighted sums.
 MIN_STEPS_PER_LIGHT = 8
-COMPARISON_INTERVAL = 20  # evaluations from one comparison to the next
-SURROUNDINGS_SPP = 16  # samples per pixel of what is outside of a matrix's window
-MIN_SCORES = 4  # trials from which a standard deviation is estimated
-# standard deviations below the mean above which 19 of 20 scores lie
+COMPARISON_INTERVAL = 20  # number of evaluations from one comparison to the next
+SURROUNDINGS_SPP = 16  # samples per pixel of the surroundings of a matrix's window
+MIN_SCORES = 4  # smallest number of trials to estimate a standard deviation
+# 19 of 20 normally distributed scores lie above the mean minus this many standard
+# deviations.
 LOWER_END_DEVIATIONS = 1.64
 ADVICE = {
     RefusalCause.HAZE: "leave the haze out",
@@ -65,7 +65,7 @@ ADVICE = {
     RefusalCause.TOO_LARGE: "take a lower `resolution` or texture resolution, or set "
     "ADVSEARCH_LIMITS=2 where memory allows it",
 }
-"""What a user can do where rendering costs much, by the cause of a refusal."""
+"""What a user can do so that images are predicted, by the cause of a refusal."""
 
 
 def find_matrix_refusal(
@@ -96,11 +96,11 @@ def find_matrix_refusal(
     refusal = find_refusal(problem.renderer, condition_names)
     if refusal is not None:
         return refusal
-    # The rest is about basis images of lights, which are not used under conditions.
-    # Without a number of steps they pay in any case.
+    # What remains is whether basis images of lights pay. They are not used under
+    # conditions, and they pay if any number of steps may follow.
     if problem.conditions is not None or steps is None:
         return None
-    # before the first prediction an image is rendered for each light
+    # an image is rendered for each light before the first prediction
     min_steps = MIN_STEPS_PER_LIGHT * count_lights(problem.renderer)
     if steps < min_steps:
         return Refusal(
@@ -111,7 +111,7 @@ def find_matrix_refusal(
 
 
 def make_rendering_remark(refusal: Refusal | None) -> str:
-    """Return advice for a search that renders; "" where nothing else is possible."""
+    """Return advice for a search that renders; "" if the user can't change that."""
     advice = "" if refusal is None else ADVICE.get(refusal.cause, "")
     if not advice:
         return ""
@@ -129,24 +129,26 @@ class PredictedSearch(ABC):
     All of it follows from the seed, so that a resumed run computes the same again.
 
     Attributes:
-        method: method, for reports.
-        title: what its preparation does, for the progress.
-        what_it_renders: what the search renders afterwards, for the progress.
+        method: name of the method, for reports.
+        title: text about its preparation, for the progress bar.
+        what_it_renders: text about what the search still renders, for the progress bar.
         is_exact: whether equal configurations have equal objectives.
         problem: problem of the searches.
-        steps: evaluations of a search; those after them belong to the ranking, and are
-            traced.
+        steps: number of evaluations of a search. Later ones belong to the ranking, and
+            are traced.
         draws_conditions: whether each evaluation draws conditions; see
             `Domain.draws_conditions`.
-        deviations: deviations from traced images, of each comparison.
-        n_traced: images that were traced, for the predictor and to compare it.
-        seconds: spent on both.
-        n_renewals: how often the predictor was computed again; None where it never is.
-        first_traced: the evaluation from which on images are traced because
-            predictions were too far off, by kind of search.
-        tracing_reason: why images are traced, as a sentence; None while they are
-            predicted.
-        window: the window of the image that is traced; None for all of it.
+        deviations: deviation of predictions from traced images, for each comparison.
+        n_traced: number of images that were traced, for the predictor and for
+            comparisons.
+        seconds: time that was spent on both.
+        n_renewals: how often the predictor was computed again; None for a predictor
+            that never is.
+        first_traced: by kind of search, index of the first evaluation that is traced
+            because predictions were given up.
+        tracing_reason: why predictions were given up, as a sentence; None if they were
+            not.
+        window: the window of the image that is traced; None for the full image.
     """
 
     method: ClassVar[str] = "matrix"
@@ -179,8 +181,9 @@ class PredictedSearch(ABC):
 
     @property
     def accuracy_refusal(self) -> Refusal | None:
-        """Why it cannot be used, by images that were traced to prepare it; None if it
-        can.
+        """Why it is too inaccurate to be used; None if it is not.
+
+        This was measured with images that were traced to prepare it.
         """
         return None
 
@@ -198,15 +201,16 @@ class PredictedSearch(ABC):
     def evaluate_all(
         self, queries: Sequence[Query], trace: Evaluate
     ) -> Iterator[Evaluation]:
-        """Evaluate queries of a search lazily; `trace` evaluates those not
-        predicted.
+        """Evaluate queries of a search lazily.
+
+        `trace` evaluates queries whose images can't be predicted.
         """
         return map(self.evaluate, queries)
 
     def get_window_renderer(self, kind: str) -> Renderer | None:
-        """Return what traces the window alone, at the end of a kind of search.
+        """Return the renderer of the window at the end of a kind of search.
 
-        None where whole images are rendered.
+        None if full images are rendered.
         """
         return None
 
@@ -235,12 +239,12 @@ class PredictedSearch(ABC):
 
     @abstractmethod
     def measure_size(self) -> tuple[int, int]:
-        """Return the entries of the matrices, for one color channel, and their
-        bytes.
+        """Return the number of entries of the matrices, for one color channel, and their
+        size in bytes.
         """
 
     def summarize_conditions(self) -> BankOfConditions | None:
-        """Return the state of a bank of conditions; None where nothing varies."""
+        """Return the state of a bank of conditions; None without conditions."""
         return None
 
     def count_predicted(self, kind: str, evaluations: int) -> int:
@@ -298,11 +302,16 @@ class PredictedSearch(ABC):
         self.seconds += time.perf_counter() - started
 
     def summarize(self) -> LinearTransport:
-        """Return what a result stores of the predictor."""
+        """Return the summary of the predictor that a result stores.
+
+        A predictor was used even if predictions were given up later; `reason` then says
+        why.
+        """
         entries, n_bytes = self.measure_size()
-        error = None  # of the latest comparison
+        error = None
         if self.deviations:
-            error = PredictionError.from_values(self.deviations[-1])
+            latest_deviation = self.deviations[-1]
+            error = PredictionError.from_values(latest_deviation)
         return LinearTransport(
             used=True,
             method=self.method,
@@ -329,7 +338,7 @@ class CleanMatrix:
 
 @dataclass
 class Transport(PredictedSearch):
-    """The matrices of a run's searches where nothing varies by chance.
+    """The matrices of a run whose searches have no random conditions.
 
     Attributes:
         clean_matrix: the matrix with which every search begins.
@@ -337,11 +346,12 @@ class Transport(PredictedSearch):
 
     is_exact: ClassVar[bool] = True
     clean_matrix: CleanMatrix = field(default_factory=CleanMatrix)
-    # How far predicted scores lie above the lower end of those of trials.
+    # predicted score minus the lower end of the scores of trials (`update_score_bias`)
     _score_bias: float = 0.0
     # the latest matrix of each kind of search
     _current: dict[str, Predictor] = field(default_factory=dict)
-    # where a window is traced, the whole image behind each of them
+    # If there is a window, the full image that surrounds it in each of these. Key
+    # "start": that of the start.
     _full_images: dict[str, FullImage] = field(default_factory=dict)
     _is_prepared: bool = False
 
@@ -360,13 +370,13 @@ class Transport(PredictedSearch):
         if not self._is_prepared:
             with self.count_time():
                 windowing = find_window(self.problem)
-            # Otherwise it is a `Refusal`: there is no window, and full images are
-            # predicted.
+            # It may be a `Refusal`: there is no window, and full images are predicted.
             if isinstance(windowing, Windowing):
                 self.window = windowing.window
                 self._full_images["start"] = windowing.start
-                self.n_traced += N_WINDOW_IMAGES
+                self.n_traced += N_WINDOW_IMAGES  # those of `find_window`
             self._is_prepared = True
+        # `clean_matrix` may be shared with another search that has computed it.
         if self.window not in self.clean_matrix.predictors:
             predictor = self._make_predictor(
                 self.problem.domain.start,
@@ -416,7 +426,8 @@ class Transport(PredictedSearch):
         return predictor
 
     def get_window_renderer(self, kind: str) -> Renderer | None:
-        """Return what traces paths in the window, in the latest surroundings.
+        """Return the renderer that traces paths in the window, in the latest
+        surroundings.
 
         None if there is no window, or the search ended with full images.
         """
@@ -431,7 +442,7 @@ class Transport(PredictedSearch):
     def evaluate(self, query: Query) -> Evaluation:
         """Evaluate a query by its predicted image, or by a traced one.
 
-        It is traced if predictions were given up, or after the search.
+        It is traced if predictions were given up, and in the ranking after the search.
         """
         predictor = self._update_predictor(query)
         if predictor is None:
@@ -447,11 +458,12 @@ class Transport(PredictedSearch):
 
         Queries of the ranking and trials are traced. Every `COMPARISON_INTERVAL`
         queries of a search the predictor is compared with traced images. If it is too
-        far off, it is computed again at the query's configuration. Basis images of
+        inaccurate, it is computed again at the query's configuration. Basis images of
         lights would be the same again: then the rest of the search is traced.
         """
         kind = query.kind
         number = query.index
+        # number of queries of this search whose images are predicted
         n_predicted = self.count_predicted(kind, self.steps)
         if query.phase != "search" or number >= n_predicted:
             return None
@@ -462,7 +474,8 @@ class Transport(PredictedSearch):
         if not is_due or not kind.startswith("search"):
             return predictor
         deviation = self._compare_predictor(predictor, query)
-        has_same_surroundings, current = self._compare_surroundings(kind, query.u)
+        # also if the predictor is rejected: the full image is needed for the next one
+        has_same_surroundings, full_image = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
         # Basis images of lights do not depend on u, so that computing them again would
@@ -472,8 +485,8 @@ class Transport(PredictedSearch):
             self.trace_from(kind, number, f" of the {kind}")
             return None
         self._current[kind] = self._make_predictor(query.u, kind, number)
-        if current is not None:
-            self._full_images[kind] = current
+        if full_image is not None:
+            self._full_images[kind] = full_image
         assert self.n_renewals is not None  # None only for a `Bank`
         self.n_renewals += 1
         return self._current[kind]
@@ -504,11 +517,11 @@ class Transport(PredictedSearch):
 
         Args:
             kind: kind of the search, whose latest full image is in use.
-            u: (d,) where the search is.
+            u: (d,) current configuration of the search.
 
         Returns:
             Whether both are equal up to the allowed deviation, and the full image at u.
-            Without a window nothing is outside, and the result is (True, None).
+            Without a window there are no surroundings, and the result is (True, None).
         """
         if self.window is None:
             return True, None
@@ -518,20 +531,21 @@ class Transport(PredictedSearch):
         return deviation.is_accepted, current
 
     def is_likely_success(self, u: Tensor) -> bool:
-        """Return whether the predicted image of u (d,) would probably pass its trials.
+        """Return whether a configuration (d,) would probably succeed in its trials.
 
-        It would if its predicted score is over 0 after the bias is subtracted, which
-        the trials of the latest configuration showed.
+        It would if its predicted score is over 0 after the bias is subtracted
+        (`update_score_bias`).
         """
         return self._predict_score(u) > self._score_bias
 
     def update_score_bias(self, u: Tensor, scores: Sequence[float]) -> None:
         """Update the bias of predicted scores from the trials of a configuration.
 
-        The bias is the predicted score minus the lower end of the trials' scores. That
-        end is their mean minus 1.64 standard deviations, above which 95 % of normally
-        distributed scores lie. With few trials, or with a score that is not finite, the
-        bias stays.
+        A configuration passes if nearly all of its trials have a score over 0. So the
+        predicted score is compared with the lower end of the trials' scores, above
+        which 95 % of normally distributed scores lie: their mean minus 1.64 standard
+        deviations. The bias is the predicted score minus this lower end. With few
+        trials, or with a score that is not finite, the bias stays.
 
         Args:
             u: (d,) the configuration.

@@ -1,6 +1,6 @@
 """Trials of configurations, stored as rows.
 
-The trials verify what searches found and different failures, also on other models and
+They verify the results of searches and different failures, also on other models and
 under other conditions.
 """
 
@@ -52,7 +52,7 @@ from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.formation import round_sample_count
 from advsearch.tasks import Judgement
 
-# coordinates of a configuration up to which the row of a trial has its values
+# The row of a trial has the values of its configuration if these are at most this many.
 MAX_DESCRIBED_COORDINATES = 64
 
 
@@ -75,10 +75,11 @@ class Verifier:
         journal: evaluates and stores the trials.
         ladder: sample counts to choose from, ascending; a single one is not tested.
         stages: stages of the progress of the run.
-        state: results, images and the count of renders.
-        looks: numbers of trials, ascending, after which the verdict of a group may
-            stand; the last is the size of a group.
-        has_success: whether rows have a success: whether a prediction is sought.
+        state: results, images and the number of renders.
+        looks: numbers of trials, ascending, after which there may be a verdict
+            (`attacks.verify`); the last is the largest number of trials of a group.
+        has_success: whether a certain prediction is sought, so that rows state whether
+            a trial is a success.
     """
 
     journal: Journal
@@ -106,7 +107,7 @@ class Verifier:
 
     @property
     def n_trials(self) -> int:
-        """Trials of a group."""
+        """Largest number of trials of a group."""
         return self.looks[-1]
 
     def evaluate_all(
@@ -118,8 +119,8 @@ class Verifier:
     ) -> Iterator[Evaluation]:
         """Evaluate trials lazily and in order; store their images, and count renders.
 
-        A trial counts as one render, even if it is evaluated several times: its results
-        are stored.
+        A trial counts as one render, even if it is evaluated again: then its result is
+        read from the store.
 
         Args:
             queries: the trials.
@@ -131,7 +132,7 @@ class Verifier:
         evaluate = None
         if predictor is not None:
             evaluate = partial(predictor.evaluate_all, trace=self.journal.evaluator)
-        if not self.has_success:  # no prediction is sought, so that none is a success
+        if not self.has_success:
             queries = [replace(query, has_success=False) for query in queries]
         evaluations = self.journal.evaluate_all(queries, evaluate)
         for query, evaluation in zip(queries, evaluations, strict=True):
@@ -141,10 +142,11 @@ class Verifier:
             if evaluation.predicted:
                 self.state.n_predicted_trials += 1
             else:
-                self._rendered.add(trial)
+                self._rendered.add(trial)  # a set, in which each trial counts once
             self.state.verification_renders = len(self._rendered)
             steps = query.spp if in_samples else 1
-            self.stages.progress.advance(steps, **self.journal.evaluator.progress_stats)
+            worker_stats = self.journal.evaluator.progress_stats
+            self.stages.progress.advance(steps, **worker_stats)
             yield evaluation
 
     def choose_spp(
@@ -162,20 +164,23 @@ class Verifier:
                 conditions vary, the verification may not take more. None for no limit.
         """
         has_conditions = self.problem.conditions is not None
-        # sample counts to choose from, ascending; a single one is no choice
+        # sample counts to choose from, ascending
         ladder = self.ladder
-        has_choice = len(ladder) > 1
-        n_trials = self.looks[0]
+        is_set_by_user = len(ladder) == 1
+        n_trials_of_first_look = self.looks[0]
         # `max_samples` is for the progress bar: samples per pixel of all renders, if
         # every sample count of the ladder is tried.
         if has_conditions:
             choose: Callable[..., SampleCount] = choose_rate_spp
-            if has_choice:
+            if not is_set_by_user:
                 ladder = self._condition_ladder(len(candidates), search_samples)
             max_samples = N_CONDITIONS * len(candidates) * sum(ladder)
         else:
-            choose = partial(choose_spp, trials=n_trials)
-            max_samples = count_max_samples(len(candidates), ladder, n_trials)
+            choose = partial(choose_spp, trials=n_trials_of_first_look)
+            max_samples = count_max_samples(
+                len(candidates), ladder, n_trials_of_first_look
+            )
+        # with a single sample count nothing is rendered
         if len(ladder) > 1:
             self._begin_sample_count_stage(max_samples)
         evaluate = partial(self.evaluate_all, in_samples=True)
@@ -210,8 +215,8 @@ class Verifier:
     ) -> Sequence[int]:
         """Return the sample counts to choose from if conditions vary.
 
-        Counts are left out with which the verification would take more samples than the
-        searches did.
+        A count is left out if the verification would take many more samples with it
+        than the searches did (`limit_ladder`).
 
         Args:
             n_candidates: number of configurations to verify.
@@ -226,11 +231,13 @@ class Verifier:
     def try_clean(self) -> None:
         """Run the trials of the clean configuration, which are the control group.
 
-        They have the same seeds as those of the adversarial configuration. Nothing is
-        done if they were run at this sample count already. If the model seems to be
-        wrong about the clean scene, they are run before the search, at another sample
-        count. After the search they are run once more, and the rows of both are told
-        apart by their kind.
+        They have the same seeds as those of the adversarial configuration. If they were
+        run at this sample count already, nothing is done.
+
+        They may be run twice. If the model seems to be wrong about the clean scene, a
+        first group is run before the search, to confirm that. If it was not wrong, the
+        sample count is chosen again after the search, and may differ. Then a second
+        group is run. The rows of both have different kinds.
         """
         if self.has_clean_trials:
             return
@@ -242,14 +249,15 @@ class Verifier:
             self.problem.domain.start,
             spp=self._clean_spp,
             seed=self.problem.seed,
-            trials=self.looks[0],  # more follow if the first look does not decide
+            # `verify` runs more if the first look does not decide
+            trials=self.looks[0],
             kind=self._clean_kind,
             n_images=MAX_STORED_IMAGES,
         )
 
     @property
     def has_clean_trials(self) -> bool:
-        """Whether the control group was tried at the present sample count."""
+        """Whether the control group was tried at the current sample count."""
         return bool(self.state.clean_trials) and self._clean_spp == self.state.spp
 
     def verify(
@@ -262,9 +270,8 @@ class Verifier:
     ) -> Verification:
         """Verify the configuration that a search found against the control group.
 
-        The control group is the scene without the change that was found, in trials of
-        the same seeds. If it has too few trials it gets more, which later calls use as
-        well.
+        The control group is the clean scene in trials of the same seeds. If it has too
+        few trials it gets more, which later calls use as well.
 
         Args:
             kind: kind of the rows.
@@ -274,12 +281,13 @@ class Verifier:
             with_new_trials: whether both groups get new trials with new seeds, numbered
                 after all others.
         """
+        # with new seeds the control group starts again
         clean_trials = () if with_new_trials else self.state.clean_trials
         verification = verify(
             self.evaluate_all,
             self.problem.domain,
             result.best_u,
-            claim=result.ending,
+            claim=result.ending,  # an ending of FOUND claims a failure
             spp=self.state.spp,
             seed=self.problem.seed,
             trials=self.looks,
@@ -304,11 +312,11 @@ class Verifier:
         has_success: bool = True,
         predictor: PredictedSearch | None = None,
     ) -> Iterator[Judgement]:
-        """Try configurations (d,) once each, every one with a seed of its own.
+        """Try configurations (d,) once each, every one with its own seed.
 
         Args:
             kind: kind of the rows, such as "average".
-            configurations: configurations by their numbers among those of the kind.
+            configurations: configurations by their index among those of the kind.
             has_success: whether rows state if the trial is a success.
             predictor: predicts images in place of renders; None to render all.
         """
@@ -320,6 +328,7 @@ class Verifier:
             # many: the texels of a texture would fill the store.
             values: dict[str, Any] = {}
             if problem.domain.dim <= MAX_DESCRIBED_COORDINATES:
+                # values may depend on the conditions, which follow from the seed
                 values = problem.describe(u, seed)
             query = Query(
                 u,
@@ -412,13 +421,14 @@ class RetrialCondition:
         name: name of the condition.
         problem: judges its images.
         spp: samples per pixel.
-        image_key: conditions with equal keys share the rendered image of a trial,
-            (H, W, 3) sRGB in [0, 1].
-        change_image: from the rendered image and the seed of the trial to the model's
-            image; None for the image itself.
-        radiance_key: conditions of equal light share the linear radiance of a trial, as
-            their scenes are equal and only tone curves or models differ; None for a
-            condition that renders by itself.
+        image_key: key of the rendered image. Conditions with equal keys share the image
+            of a trial, (H, W, 3) sRGB in [0, 1].
+        change_image: function from the rendered image and the seed of the trial to the
+            image that the model gets, such as a compression; None to use the rendered
+            image.
+        radiance_key: key of the linear radiance. Conditions with equal keys share the
+            radiance of a trial, because only their tone curves or models differ. None
+            for a condition that shares none.
     """
 
     name: str
@@ -435,14 +445,8 @@ class Retrials:
     Trials that the run has stored are read. Trial k has the same seed for all
     conditions.
 
-    Args:
-        conditions: conditions that are tried.
-        run: stores the trials.
-        progress: counts them.
-        trials: trials of each configuration under each condition.
-        seed: root seed that nothing else uses.
-        executor: workers that hold the problems by the names of their conditions; None
-            to render in this process.
+    Images and radiances that several conditions need are cached, for trials of one kind
+    at a time.
     """
 
     def __init__(
@@ -462,18 +466,19 @@ class Retrials:
             run: run whose store has the rows.
             progress: progress, which counts the trials.
             trials: number of trials of a configuration under a condition.
-            seed: root of the trials' seeds.
-            executor: evaluates trials on workers, if there are any.
+            seed: root of the trials' seeds; nothing else uses it.
+            executor: workers that have the problems by the names of their conditions;
+                None to render in this process.
         """
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
-        # All journals are copies of the first one, so that rows and notes are read from
-        # the store only once.
-        first_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
+        # All journals are copies of one, so that rows and notes are read from the store
+        # only once. Its own evaluator is replaced in all of them.
+        template_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
         self._journals = {
             condition.name: replace(
-                first_journal,
+                template_journal,
                 evaluator=ParallelEvaluator(
                     condition.problem, executor, condition.name
                 ),
@@ -481,14 +486,14 @@ class Retrials:
             for condition in conditions
         }
         self._clean: dict[str, tuple[Judgement, ...]] = {}
-        # Images and radiances that several conditions need, for trials of the kind
-        # `_shared_kind`. Keys are `image_key` or `radiance_key`, seed, and samples per
-        # pixel.
+        # Cached images and radiances. A key is (`image_key` or `radiance_key`, seed,
+        # samples per pixel).
         self._images: dict[tuple[Hashable, int, int], Tensor] = {}
         self._radiances: dict[tuple[Hashable, int, int], Tensor] = {}
-        self._shared_kind = ""
-        # number of conditions by `radiance_key`; a light is shared if it is over 1
-        self._n_conditions_of_light = Counter(
+        # kind of the trials whose images and radiances are cached
+        self._cached_kind = ""
+        # number of conditions by `radiance_key`; a radiance is shared if it is over 1
+        self._n_conditions_of_radiance = Counter(
             condition.radiance_key
             for condition in conditions
             if condition.radiance_key is not None
@@ -512,9 +517,9 @@ class Retrials:
     ) -> Verification:
         """Try a configuration under one condition, compared with the clean scene.
 
-        Only success rates are compared: the search was run under other conditions, so
-        that it makes no claim that trials could confirm. The rows have the kind "KIND
-        under CONDITION".
+        The search was run under other conditions, so that it claims nothing about this
+        one: its ending is passed on as NOT_VERIFIED. Only success rates are compared.
+        The rows have the kind "KIND under CONDITION".
 
         Args:
             kind: kind of the trials, such as "verification".
@@ -556,28 +561,27 @@ class Retrials:
     ) -> Iterator[Evaluation]:
         """Evaluate trials that are not stored, under one condition.
 
-        Images before that change are cached, since other conditions, such as another
-        compression, may need the same ones. The cache is emptied when trials of another
-        kind begin. Missing images are rendered by workers if there are any, and one by
-        one in this process otherwise.
+        Rendered images are cached before the condition changes them (`change_image`),
+        since other conditions, such as another compression, may need the same ones. The
+        cache is emptied when trials of another kind begin. Missing images are rendered
+        by workers if there are any, and one by one in this process otherwise.
 
         Args:
             kind: kind of the trials, for which images are cached.
             condition: condition of the trials.
-            queries: the trials.
+            queries: the trials; each has another seed, and so another image.
         """
-        if kind != self._shared_kind:
+        if kind != self._cached_kind:
             self._images.clear()
             self._radiances.clear()
-            self._shared_kind = kind
-        problem = condition.problem
+            self._cached_kind = kind
         keys = [(condition.image_key, query.seed, condition.spp) for query in queries]
         missing = [
             replace(query, product="picture")
             for query, key in zip(queries, keys, strict=True)
             if key not in self._images
         ]
-        # in the order of `missing`
+        # The loop below takes the next one for each missing image, in the same order.
         from_workers = self._render_on_workers(condition, missing)
         for query, key in zip(queries, keys, strict=True):
             machine = None  # name of the worker's machine, if one rendered the image
@@ -588,20 +592,26 @@ class Retrials:
                 else:
                     self._images[key] = rendered.picture
                     machine = rendered.machine
-            image = self._images[key]
-            if condition.change_image is not None:
-                image = condition.change_image(image, query.seed)
-            full_u = problem.add_conditions(query.u, query.seed)
-            judgement = problem.judge(round_to_8_bit(image), full_u)
+            judgement = self._judge_changed(condition, self._images[key], query)
             yield Evaluation.from_judgement(judgement, machine=machine)
+
+    @staticmethod
+    def _judge_changed(
+        condition: RetrialCondition, image: Tensor, query: Query
+    ) -> Judgement:
+        """Judge a rendered image (H, W, 3) after the change of a condition."""
+        if condition.change_image is not None:
+            image = condition.change_image(image, query.seed)
+        full_u = condition.problem.add_conditions(query.u, query.seed)
+        return condition.problem.judge(round_to_8_bit(image), full_u)
 
     def _render_on_workers(
         self, condition: RetrialCondition, queries: Sequence[Query]
     ) -> Iterator[Evaluation]:
-        """Yield the images of queries, rendered by workers.
+        """Return an iterator over images of queries, rendered by workers.
 
-        Nothing is yielded without workers, or for a single query: its image is rendered
-        in this process, where conditions can share its radiance.
+        It is empty without workers, and for a single query: its image is rendered in
+        this process, where conditions can share its radiance.
 
         Args:
             condition: condition of the trials.
@@ -615,8 +625,8 @@ class Retrials:
     def _render(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """Return the image (H, W, 3) of a configuration under a condition.
 
-        Conditions with the same light share the radiance, which is cached. They differ
-        only in how the image is formed from it.
+        If several conditions have the same radiance, it is cached. They differ only in
+        how the image is formed from it.
 
         Args:
             condition: the condition.
@@ -624,9 +634,10 @@ class Retrials:
             seed: seed of the noise and of random conditions.
         """
         problem = condition.problem
-        # how many conditions have this light; 0 without a key, which is never shared
-        is_light_shared = self._n_conditions_of_light[condition.radiance_key] >= 2
-        if not is_light_shared:
+        # The count of a key of None is 0.
+        n_conditions = self._n_conditions_of_radiance[condition.radiance_key]
+        is_radiance_shared = n_conditions >= 2
+        if not is_radiance_shared:
             return problem.picture(u, seed, condition.spp)
         renderer = problem.renderer
         full_u = problem.add_conditions(u, seed)
@@ -634,6 +645,7 @@ class Retrials:
         with torch.no_grad():
             if key not in self._radiances:
                 self._radiances[key] = renderer.radiance(full_u, seed, condition.spp)
+            # the same two steps by which `problem.picture` forms an image
             displayed = renderer.formation.display(self._radiances[key])
             return round_to_8_bit(renderer.space.apply_to_image(full_u, displayed))
 
@@ -643,7 +655,7 @@ def read_stored_configuration(directory: Path, problem: Problem) -> torch.Tensor
 
     Args:
         directory: the run directory.
-        problem: problem of the present scene, to whose domain it must fit.
+        problem: problem of the current scene, to whose domain it must fit.
 
     Raises:
         InputError: the scene has another number of coordinates now.

@@ -1,9 +1,10 @@
-"""Find the window of the image outside of which what is searched changes nothing.
+"""Find the window of the image outside of which a search changes nothing.
 
-What is searched may show in a small part of the image. A search then traces the
-smallest window around it for which this holds: outside, whole images at both ends of
-the budget differ from that of the start by less than `MAX_LEVELS` on average, and with
-these surroundings the margin is as without (docs/leaving-out.md, "The rest of the
+What is searched may be visible only in a small part of the image. Then the search
+traces the smallest window around it that fulfils two conditions. Full images are
+rendered at the start and at both bounds of the budget. Outside of the window they
+differ by less than `MAX_LEVELS` on average; and the margin stays the same if the
+window is pasted into the image of the start (docs/leaving-out.md, "The rest of the
 picture").
 """
 
@@ -32,31 +33,33 @@ from advsearch.scene.surface.renderer import find_changed_inputs
 from advsearch.scene.transport.lights import HAZE, find_light_inputs
 from advsearch.scene.window import Window
 
-MIN_STEPS = 16  # evaluations of a search from which on a crop pays
-MAX_AREA = 0.3  # largest window that pays, as a fraction of the image
+MIN_STEPS = 16  # smallest number of evaluations of a search for which a crop pays
+MAX_AREA = 0.3  # area of the largest window that pays, as a fraction of the image
 MAX_LEVELS = 0.1
-"""Difference outside of the window that is allowed, in levels of 255.
-
-It is the root mean square of the means over squares of `SQUARE` pixels.
+"""Allowed difference outside of the window, in levels of 255. It is the root mean square
+of the mean differences over squares of `SQUARE` pixels.
 """
-SQUARE = 8
+SQUARE = 8  # side of these squares in pixels
 MARGINS = (8, 16, 24, 32, 48, 64, 96, 128)  # pixels around the box, smallest first
 PROBE_SPP = 2
-"""Samples per pixel of each half of a whole image that is compared with others.
-
-Few are enough: images of one seed have nearly the same noise.
+"""Samples per pixel of each half of a full image that is compared with others. Few are
+enough, since images of one seed have nearly the same noise.
 """
-N_WINDOW_IMAGES = 3  # full images that `find_window` renders
+N_WINDOW_IMAGES = 3  # number of full images that `find_window` renders
+# endings of inputs that move a mesh, such as "mug.vertices"
 MOVING_SUFFIXES = (".vertices", ".normals")
 
 
 class FullImage(NamedTuple):
-    """A whole image, traced twice with independent noise.
+    """A full image, traced twice with independent noise.
+
+    Linear radiance has three color channels. With a backdrop it has a fourth one, the
+    coverage by the scene.
 
     Attributes:
-        u: (d,) its configuration.
-        halves: both, linear radiance (H, W, 3 or 4) with noise.
-        radiance: their mean (H, W, 3 or 4), denoised.
+        u: (d,) configuration of the image.
+        halves: linear radiance (H, W, 3 or 4) of both, with noise.
+        radiance: mean of both (H, W, 3 or 4), denoised.
     """
 
     u: Tensor
@@ -66,12 +69,13 @@ class FullImage(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Windowing:
-    """A window, and how far images of the ends of the budget are off outside of it.
+    """A window of a search, with the image that surrounds it.
 
     Attributes:
         window: window of the pixels that are traced.
-        start: the whole image at the start.
-        deviation: deviation of images with its surroundings.
+        start: the full image at the start.
+        deviation: error of images at both bounds of the budget if their surroundings
+            are those of the start.
     """
 
     window: Window
@@ -101,11 +105,14 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return Refusal("nothing of what is searched is in the picture")
     if box.grow(MARGINS[0], resolution).area > max_area:
         return Refusal("what is searched fills much of the picture")
-    # the ends of the budget: 0 and 1 in all coordinates, moved into the allowed set
+    # Bounds of the budget: all coordinates as small and as large as it allows. u is in
+    # [0, 1], and `project` moves it into the budget.
     lower = domain.project(torch.zeros_like(domain.start))
     upper = domain.project(torch.ones_like(domain.start))
     start, *extremes = [render_full(problem, u) for u in (domain.start, lower, upper)]
-    for margin in MARGINS:  # at least the first fits, as was checked
+    # The first window is small enough, as was checked above, so that there is a
+    # deviation after the loop: that of the largest window.
+    for margin in MARGINS:
         window = box.grow(margin, resolution)
         if window.area > max_area:
             break
@@ -121,9 +128,11 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
     Whether the search changes anything outside of the crop is measured later.
     """
     renderer = problem.renderer
+    # why the image is composed of several; "" if it is not
     if renderer.composition_reason:
         return Refusal(renderer.composition_reason)
     if problem.conditions is not None:
+        # random conditions change all of the image
         return Refusal("the surroundings of each picture are others")
     if problem.steps < MIN_STEPS:
         return Refusal(
@@ -131,7 +140,8 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
         )
     if renderer.scene.is_volumetric:
         return HAZE
-    if renderer.scene.definition[0].camera_model is not None:
+    definition, *_ = renderer.scene.definition
+    if definition.camera_model is not None:
         return Refusal("the camera has a lens of its own")
     if renderer.formation.denoiser != "oidn":
         return NOISE
@@ -169,7 +179,7 @@ def find_searched_inputs(problem: Problem) -> frozenset[str]:
 
 
 def _find_box(problem: Problem) -> Window | None:
-    """Return the box of all that is searched, at the start; None if it is not seen."""
+    """Return the box around all searched meshes at the start; None if none is visible."""
     surfaces = problem.renderer.surfaces(problem.domain.start)
     mask = torch.zeros(problem.renderer.formation.resolution, dtype=torch.bool)
     for name in find_searched_inputs(problem):
@@ -209,7 +219,7 @@ def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
 def measure_outside(
     problem: Problem, window: Window, before: FullImage, others: Sequence[FullImage]
 ) -> Deviation:
-    """Measure by how much images differ outside of a window, on average.
+    """Measure the mean difference of images outside of a window.
 
     Args:
         problem: problem of the search.
@@ -226,12 +236,12 @@ def measure_outside(
         margin_biases.append(bias)
         margin_changes.append(change)
     count = len(others)
-    # a bias may be a fraction of what the search itself changes
+    # The bias may be a fraction of the change of the margin by the search itself.
     allowed_bias = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * sum(margin_changes) / count)
     return Deviation(
-        # without noise, the mean square can be below 0 by chance
+        # The mean square is an estimate without noise, and may be below 0 by chance.
         levels=math.sqrt(max(0.0, sum(squared_differences) / count)),
-        margin_bias=sum(margin_biases) / count,
+        margin_bias=sum(margin_biases) / count,  # mean error of the margin
         allowed_levels=MAX_LEVELS,
         n_traced=count,
         allowed_margin_bias=allowed_bias,
@@ -255,28 +265,37 @@ def _measure_square(
         after: another full image.
 
     Returns:
-        The square in levels of 255, of means over squares of `SQUARE` pixels; it may be
-        below 0 by chance.
+        The mean over the pixels outside of the window and the color channels, in levels
+        of 255 squared. Differences are averaged over squares of `SQUARE` pixels before
+        they are squared. The result may be below 0 by chance.
     """
+    # (H, W, 1) 1 outside of the window, 0 inside
     outside = window.is_outside(problem.renderer.formation.resolution).float()
-    # levels of the displayed image for a difference of radiance
+    outside = outside[..., None]
+    # converts a small difference of radiance to one of displayed values, in [0, 1]
     slope = _compute_slope(problem, before)
-    # for each of the two seeds, the summed differences over squares of pixels
-    sums = [
-        _sum_squares(255.0 * slope * (new - old)[..., :3] * outside[..., None])
-        for old, new in zip(before.halves, after.halves, strict=True)
-    ]
-    n_pixels = _sum_squares(outside[..., None])
-    products = sums[0] * sums[1] / n_pixels.clamp_min(1.0)
-    return float(products.sum() / (3.0 * n_pixels.sum().clamp_min(1.0)))
+    # for each of the two seeds, differences summed over the squares: (1, 3, h, w)
+    difference_sums = []
+    for old, new in zip(before.halves, after.halves, strict=True):
+        difference = (new - old)[..., :3]  # without coverage
+        levels = 255.0 * slope * difference * outside
+        difference_sums.append(_sum_over_squares(levels))
+    # number of pixels outside of the window in each square, (1, 1, h, w)
+    n_pixels = _sum_over_squares(outside)
+    # mean * mean * n_pixels in each square; the sums are each n_pixels times a mean
+    first_sum, second_sum = difference_sums
+    products = first_sum * second_sum / n_pixels.clamp_min(1.0)
+    n_channels = 3.0
+    return float(products.sum() / (n_channels * n_pixels.sum().clamp_min(1.0)))
 
 
-def _sum_squares(image: Tensor) -> Tensor:
+def _sum_over_squares(image: Tensor) -> Tensor:
     """Return the sums over squares of `SQUARE` pixels of an image (H, W, c).
 
-    The result is (1, c, h, w); squares at the border may be cut off.
+    The result is (1, c, h, w). Squares at the right and lower border may be smaller, if
+    the image is not divisible into full ones.
     """
-    # with a divisor of 1 the average is the sum
+    # `ceil_mode` includes the smaller squares; with a divisor of 1 the average is a sum
     sums: Tensor = functional.avg_pool2d(
         image.movedim(-1, 0)[None], SQUARE, ceil_mode=True, divisor_override=1
     )
@@ -292,12 +311,14 @@ def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
     """
     radiance = image.radiance.clone()
     inputs = _compute_inputs(problem, image.u)
+    renderer = problem.renderer
     with torch.enable_grad():
         radiance.requires_grad_()
-        linear = problem.renderer.finish_image(radiance, inputs, image.u, display=False)
-        displayed = problem.renderer.formation.display(linear)
+        # the two steps of displaying an image, without rounding
+        linear = renderer.finish_image(radiance, inputs, image.u, display=False)
+        displayed = renderer.formation.display(linear)
         (slope,) = torch.autograd.grad(displayed.sum(), radiance)
-    return slope[..., :3]
+    return slope[..., :3]  # without coverage
 
 
 def _measure_margin(
@@ -331,12 +352,14 @@ def _compute_margin(problem: Problem, radiance: Tensor, u: Tensor) -> float:
 
 
 def _describe(deviation: Deviation) -> str:
-    """Return how far a deviation is over its limits, for a sentence."""
-    if deviation.levels_fraction > ACCEPTED_FRACTION:
+    """Return by how much a rejected deviation exceeds its limit, for a sentence."""
+    has_accepted_levels = deviation.levels_fraction <= ACCEPTED_FRACTION
+    if not has_accepted_levels:
         max_levels = ACCEPTED_FRACTION * deviation.allowed_levels
         return (
             f"by {deviation.levels:.2f} levels of 255, where {max_levels:.2f} would do"
         )
+    # the deviation is rejected, so it is the margin
     return (
         f"by {deviation.margin_bias:+.2f} in the margin, where "
         f"{deviation.allowed_margin_bias:.2f} would do"

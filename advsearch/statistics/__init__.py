@@ -1,8 +1,8 @@
 """Statistics of counts and rates: intervals, sequential rules, paired and clustered
 tests.
 
-Pure functions of numbers and arrays, each with its source. Nothing here knows a run, a
-trial or a drive. A module is imported when it is first used, since scipy takes long.
+Pure functions of numbers and arrays, each with its source. They do not depend on the
+rest of the package. A module is imported when it is first used, as scipy takes long.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Agreement of two measurements of the same rows, which are clustered in units.
 
-A unit may be a frame with several objects. Units are independent, their rows are not.
-Rates, kappa and the rank correlation are of all rows. Intervals of kappa and the
-correlation leave out one unit at a time
-(jackknife, Efron and Stein 1981, "The jackknife estimate of variance") on the scale of
-Fisher's z, with a quantile of Student's t of as many degrees of freedom as there are
-units less one.
+A unit may be a frame with several objects, which are its rows. Units are independent;
+the rows of a unit are not. Rates, kappa and the rank correlation are computed from all
+rows. Intervals of kappa and of the correlation are computed by leaving out one unit at
+a time (jackknife, Efron and Stein 1981, "The jackknife estimate of variance"), on the
+scale of Fisher's z, with a quantile of Student's t.
 """
 
 from __future__ import annotations
@@ -27,10 +26,11 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 MIN_UNITS = 5
-"""Units below which kappa, a correlation or a conditional rate has no interval, and the
-event of either side must happen in as many.
+"""Smallest number of units for an interval of kappa, of a correlation or of a
+conditional rate. Each of the two events has to happen in as many units.
 """
-MAX_CORRELATION = 0.9999  # up to which Fisher's z is computed
+# Larger correlations are clipped, as Fisher's z of 1 is infinite.
+MAX_CORRELATION = 0.9999
 
 
 def compute_kappa(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
@@ -149,7 +149,7 @@ def estimate_rate(
     """Return the rate of an event over all rows, and its 95 % interval over units.
 
     Rows of one unit may depend on each other, but units are independent. First the
-    effective number of rows is computed: so many independent rows would give the rate
+    effective number of rows is computed: this many independent rows would give the rate
     the same variance. Then the interval is Clopper and Pearson's for that number (Korn
     and Graubard 1998, "Confidence intervals for proportions with small expected number
     of positive counts estimated from survey data"). If the event happens in all rows or

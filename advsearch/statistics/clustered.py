@@ -1,22 +1,25 @@
 """Intervals and tests of rates over clusters (units) of several rows each.
 
-A unit may be a drive of several frames. Rows of one unit are not independent; units
-are. All units weigh the same, however many rows each has. The rate is the mean over
-units of the rate of each: mean_u k_u / o_u, for units with o_u rows of which k_u count.
-(The pooled rate, sum k_u / sum o_u, weighs a drive by its frames in view. It has no
-interval without a bound on o_u, and the largest o_u that was observed is none.) So each
-unit is a sample in [0, 1].
+A unit may be a drive, whose frames are its rows. Units are independent; the rows of a
+unit are not. All units have equal weights, however many rows each has: the rate is the
+mean over units of k_u / o_u, where unit u has o_u rows and the event happens in k_u of
+them. So each unit is a sample in [0, 1]. (The pooled rate, sum k_u / sum o_u, would
+weight a drive by its number of frames. It has no interval without a known upper bound
+of o_u.)
 
-With m for the true mean, a gambler who stakes a fraction c of the capital at each unit
-on "more than m" wins nothing on average:
+Intervals come from bets. Let m be the true mean. A gambler bets a fraction c of the
+capital on each unit, on "more than m", and gains nothing on average. The capital starts
+at 1 and becomes
 
     K(m, c) = prod_u (1 - c + c k_u / (o_u m))
 
-So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like
-and however few there are. It holds too where each unit has a rate of its own: the
-product's mean is at most 1, by the inequality of the means. The stakes are those of
-`sequential.ConfidenceSequence`. Where each unit has one row, the exact tests of
-independent rows are used, which are sharper: Clopper and Pearson, Newcombe, McNemar.
+So K exceeds 2 / a with a probability of at most a / 2 (Markov), for any distribution
+and any number of units. This also holds if units have different true rates with the
+mean m: by the inequality of arithmetic and geometric means, the mean of K is at most 1.
+The fractions c are those of `sequential.ConfidenceSequence`.
+
+If each unit has one row, the exact methods for independent rows are used, which are
+sharper: Clopper and Pearson, Newcombe, McNemar.
 """
 
 from __future__ import annotations
@@ -130,7 +133,11 @@ def _betting_interval(samples: FloatArray, confidence: float) -> tuple[float, fl
             log_capital(1.0 - mean, 1.0 - values, counts) >= winning_log_capital
         )
 
-    return find_threshold(is_not_too_small), find_threshold(is_too_large)
+    # Both are false for small means and true for large ones. `find_threshold` returns
+    # where they become true: the lower and the upper bound of the interval.
+    lower = find_threshold(is_not_too_small)
+    upper = find_threshold(is_too_large)
+    return lower, upper
 
 
 def mean_interval(
@@ -237,9 +244,10 @@ def _compare_independent_rows(
     return difference, interval, mcnemar(n_first, n_second)
 
 
-# rates, the same inside and outside, under which the bets of the test are computed
+# Rates of right predictions under the null hypothesis, which is that the rate is the
+# same inside and outside of a rule. Bets are computed for each of them.
 NULL_RATES = np.linspace(0.0, 1.0, 402)[1:-1]
-# permutations of units, so that no p-value is below 0.0001
+# number of permutations of a permutation test; no p-value is below 0.0001
 N_PERMUTATIONS = 9_999
 
 
@@ -284,20 +292,23 @@ def one_sided_p_value(
             round(copies * float(right_outside.sum())),
             round(copies * float(rows_outside.sum())),
         )
-    is_inside = rows_inside > 0.0
-    is_outside = rows_outside > 0.0
-    is_cut = bool((is_inside & is_outside).any())  # the rule cuts through a unit
-    if not is_cut and len(np.unique(unit_rows)) == 1:
+    # by unit; a unit may have predictions on both sides
+    has_inside = rows_inside > 0.0
+    has_outside = rows_outside > 0.0
+    is_cut = bool((has_inside & has_outside).any())
+    are_equally_large = len(np.unique(unit_rows)) == 1
+    if not is_cut and are_equally_large:
         return _permutation_p_value(
             right_inside + right_outside,
-            n_inside=round(copies * float(is_inside.sum())),
+            # units are sampled, so their number has to be an integer
+            n_inside=round(copies * float(has_inside.sum())),
             n_right_inside=copies * float(right_inside.sum()),
             times=copies,
         )
     wrong_rate_inside = _divide_or_zero(rows_inside - right_inside, rows_inside)
     right_rate_outside = _divide_or_zero(right_outside, rows_outside)
     rates = np.stack(
-        [wrong_rate_inside, is_inside, right_rate_outside, is_outside], axis=1
+        [wrong_rate_inside, has_inside, right_rate_outside, has_outside], axis=1
     )
     return _betting_p_value(rates, is_cut=is_cut, times=copies)
 
@@ -370,33 +381,37 @@ def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
 
     The null hypothesis is that the rate of right predictions is some m both inside and
     outside. For each m (`NULL_RATES`) a gambler bets on "less than m inside, more than
-    m outside". By Markov's inequality one over the final capital bounds the p-value;
-    the smallest capital over all m is used, as m is unknown. The bound also holds if
-    units have different rates.
+    m outside". By Markov's inequality one over the final capital bounds the p-value.
+    The true m is unknown, so the smallest capital over all m is used. The bound also
+    holds if units have different rates.
 
     Args:
         rates: (n, 4) with columns for each unit: the rate of wrong predictions inside;
             1 if the unit has any predictions inside, else 0; the rate of right ones
             outside; 1 if it has any outside, else 0.
         is_cut: whether some unit has predictions both inside and outside. Then half of
-            the stake is put on each side, so that no unit can lose more than all.
+            the stake is put on each side, since a unit can lose the stakes of both.
         times: number of copies of each unit.
     """
+    # units with equal rates are counted, and computed once
     distinct_rates, n_units = np.unique(rates, axis=0, return_counts=True)
-    wrong_inside, is_inside, right_outside, is_outside = (
+    # columns (distinct, 1), which broadcast with the (m,) null rates to (distinct, m)
+    wrong_inside, has_inside, right_outside, has_outside = (
         column[:, None] for column in distinct_rates.T
     )
-    # What a stake of 1 gains, (distinct rates, m). On average 0, if the rate of right
-    # predictions is m on both sides: that of wrong ones is 1 - m then.
-    gain_inside = wrong_inside / (1.0 - NULL_RATES) - is_inside
-    gains = gain_inside + right_outside / NULL_RATES - is_outside
+    # Gain of a stake of 1. It is 0 on average if the rate of right predictions is m,
+    # and so that of wrong ones 1 - m. A side without predictions gains 0.
+    gain_inside = wrong_inside / (1.0 - NULL_RATES) - has_inside
+    gains = gain_inside + right_outside / NULL_RATES - has_outside
     stake_fraction = 0.5 if is_cut else 1.0
     gains = stake_fraction * gains
-    with np.errstate(divide="ignore"):
-        log_capitals = []
+    log_capitals = []  # (m,) for each stake
+    with np.errstate(divide="ignore"):  # the logarithm of a lost capital is -inf
         for stake in STAKES:
             log_factors = np.log(np.maximum(1.0 + stake * gains, 0.0))
             log_capitals.append(times * (n_units[:, None] * log_factors).sum(axis=0))
-    # the capital is the mean over stakes
-    mean_log_capital = np.logaddexp.reduce(log_capitals, axis=0) - np.log(len(STAKES))
-    return float(min(1.0, np.exp(-mean_log_capital.min())))
+    # (m,) the capital is the mean over stakes
+    log_capital_of_rate = np.logaddexp.reduce(log_capitals, axis=0)
+    log_capital_of_rate = log_capital_of_rate - np.log(len(STAKES))
+    smallest_log_capital = log_capital_of_rate.min()
+    return float(min(1.0, np.exp(-smallest_log_capital)))

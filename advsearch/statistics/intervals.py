@@ -17,12 +17,11 @@ def clopper_pearson(
 ) -> tuple[float, float]:
     """Return the exact two-sided binomial interval of a success rate.
 
-    It covers the true rate at least as often as its confidence says, for any number of
-    trials (Clopper and Pearson 1934). With k successes in n trials and a = 1 -
-    confidence, the lower bound is the rate at which k successes or more have the
-    probability a/2, the upper bound that at which k or fewer have it. Both are
-    quantiles of beta distributions: B(a/2; k, n - k + 1), or 0 for k = 0, and B(1 -
-    a/2; k + 1, n - k), or 1 for k = n.
+    It covers the true rate with at least the stated confidence, for any number of
+    trials (Clopper and Pearson 1934). Let there be k successes in n trials, and a = 1 -
+    confidence. At the lower bound, k successes or more have the probability a/2; at the
+    upper bound, k or fewer have it. Both are quantiles of beta distributions: B(a/2; k,
+    n - k + 1), or 0 for k = 0, and B(1 - a/2; k + 1, n - k), or 1 for k = n.
 
     Args:
         successes: k, from 0 to n.

@@ -1,4 +1,4 @@
-"""Rates that fall along an axis: isotonic fit, and a test for where they do not."""
+"""Rates that fall along an axis: isotonic fit, and a test for places where they rise."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIGNIFICANCE = 0.05
-"""Fraction of falling curves of which a dip is reported, at most."""
+"""Largest fraction of falling curves for which a dip is reported by chance."""
 
 
 @dataclass(frozen=True)
 class Dip:
-    """A distance at which an object is recognised less often than beyond it.
+    """A distance at which an object is recognized less often than farther away.
 
     Attributes:
-        distance: the nearer one.
-        counts: images that are right there, and how many there are.
-        until: the farthest of the distances beyond it that are compared with it.
-        counts_beyond: images that are right at these, and how many there are.
-        p_value: probability of so large a difference if the rate falls with the
+        distance: distance of the dip.
+        counts: number of right images and of all images at this distance.
+        until: largest of the farther distances that are compared with it.
+        counts_beyond: number of right images and of all images at these distances.
+        p_value: probability of such a large difference if the rate falls with the
             distance, times the number of comparisons.
     """
 
@@ -33,7 +33,7 @@ class Dip:
 
     @property
     def is_significant(self) -> bool:
-        """Whether chance is no explanation."""
+        """Whether the dip is too clear to be explained by chance."""
         return self.p_value <= SIGNIFICANCE
 
 
@@ -57,7 +57,7 @@ def _fit_falling(
 def find_dips(
     distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[Dip, ...]:
-    """Find dips: distances at which an object is recognised less often than beyond.
+    """Find dips: distances at which an object is recognized less often than beyond.
 
     Each distance is compared with every range of distances that begins right behind it,
     by Fisher's exact one-sided test. The p-values are multiplied by the number of

@@ -1,4 +1,4 @@
-"""Intervals that hold however often one looks: confidence sequences by bets."""
+"""Confidence sequences: intervals that may be checked after every sample, by bets."""
 
 from __future__ import annotations
 
@@ -41,36 +41,38 @@ def find_threshold(is_beyond: Callable[[float], bool]) -> float:
 
 
 STAKES = np.array([1.0, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125])
-"""Stakes among which the capital is split equally.
-
-Large ones decide soon where nearly all samples agree.
+"""Stakes, as fractions of the capital. The capital is divided equally among gamblers,
+each with one of these stakes. Large stakes decide soon if nearly all samples agree.
 """
 
 
 @dataclass
 class ConfidenceSequence:
-    """Samples in [0, 1], and an interval of their mean that holds after each of them:
-    one may stop as soon as it decides.
+    """Samples in [0, 1], and an interval of their mean that is valid after each of them.
 
-    For samples x_1, x_2, ... whose mean is m given those before, a gambler who stakes a
-    fraction c of his capital on "more than m" (K) or on "less than m" (L) plays a fair
-    game:
+    So sampling may stop as soon as the interval decides a question.
+
+    Let x_1, x_2, ... be samples whose mean is m, given the samples before. A gambler
+    bets a fraction c of the capital on each sample, on "more than m" (K) or on "less
+    than m" (L). The game is fair, and the capital becomes
 
         K_t(m, c) = prod_s (1 - c + c x_s / m)
         L_t(m, c) = prod_s (1 - c + c (1 - x_s) / (1 - m))
 
-    His capital, a mean over stakes c, exceeds 2 / a at some time with a probability of
-    a / 2 at most (Ville 1939). So the m at which neither does are an interval that
-    holds m at all times with a probability of 1 - a at least: the hedged capital of
-    Waudby-Smith and Ramdas 2024, "Estimating means of bounded random variables by
-    betting", with stakes that are fixed (`benchmarks/sequential.py`).
+    The mean capital over several c exceeds 2 / a at some time with a probability of at
+    most a / 2 (Ville 1939). So the values of m at which neither K nor L exceeds it are
+    an interval. It contains the true mean at all times with a probability of at least 1
+    - a. This is the hedged capital of Waudby-Smith and Ramdas 2024, "Estimating means
+    of bounded random variables by betting", with fixed stakes
+    (`benchmarks/sequential.py`).
 
     Attributes:
-        confidence: confidence of the interval, at all times together; over 0 and under
+        confidence: confidence that the interval is right at all times; over 0 and under
             1.
-        sides: 2 for the interval; 1 for each bound by itself, to decide a claim "the
-            mean is at least m": if it is true only `is_under` can be wrong, and if not
-            only `is_over`, so that each may be wrong as often as the confidence allows.
+        sides: 2 for the interval. 1 if only a claim "the mean is at least m" is to be
+            decided. If the claim is true only `is_under` can be wrong, and if it is
+            false only `is_over`. So each may be wrong as often as the confidence
+            allows.
     """
 
     confidence: float = CONFIDENCE
@@ -101,20 +103,23 @@ class ConfidenceSequence:
         return sum(value * count for value, count in self._counts.items()) / self.count
 
     def is_over(self, mean: float) -> bool:
-        """Return whether the true mean is shown to be over a number in (0, 1)."""
+        """Return whether the samples show that the true mean exceeds `mean`, in (0, 1)."""
         return self._has_won(mean, self._counts)
 
     def is_under(self, mean: float) -> bool:
-        """Return whether the true mean is shown to be under a number in (0, 1)."""
+        """Return whether the samples show that the true mean is below `mean`, in (0, 1)."""
         mirrored = {1.0 - value: count for value, count in self._counts.items()}
         return self._has_won(1.0 - mean, mirrored)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Lower and upper bound of the true mean: the numbers of which it is shown neither
-        that the mean is over them, nor that it is under them.
+        """Lower and upper bound of the true mean.
+
+        The samples show that the true mean is over every number below the lower bound,
+        and under every number above the upper bound.
         """
-        # Both conditions are monotone: a mean over a number is over every smaller one.
+        # `find_threshold` needs conditions that are false below a number and true above
+        # it. `is_over` holds below the lower bound, so it is negated.
         lower = find_threshold(lambda mean: not self.is_over(mean))
         upper = find_threshold(self.is_under)
         return lower, upper

@@ -24,7 +24,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import advsearch
-from advsearch.attacks.domain import NET, ProductIndex, SampleSequence
+from advsearch.attacks.domain import POINTS_PER_NET as NET
+from advsearch.attacks.domain import ProductIndex, SampleSequence
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.judging import make_domain

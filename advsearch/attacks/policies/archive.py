@@ -17,29 +17,36 @@ from torch import Tensor
 
 from advsearch.extend import InputError, Policy, errors, policies, seeds
 
-MAX_DIM = 10_000  # more numbers are refused: every cell keeps a whole configuration
-MAX_CELLS = 1_000_000  # an archive has no more
-# parameters that span it; with more, nearly every configuration has a cell of its own
+# The archive is a grid of cells over a few parameters of the domain. These are called
+# the measures, as in ribs.
+
+# Domains of more numbers are rejected, because every cell stores a full configuration.
+MAX_DIM = 10_000
+MAX_CELLS = 1_000_000  # largest number of cells of an archive
+# Largest number of measures. With more, nearly every configuration would have its own
+# cell.
 MAX_MEASURES = 4
-# fraction of the configurations, and of the discrete choices, that are sampled anew
 RESAMPLED_FRACTION = 0.1
-# stored configurations that are drawn for an offspring; the one with the largest
-# objective is its first parent
+"""Fraction of a generation that are random samples of the domain, and probability that
+a discrete choice of an offspring is sampled again.
+"""
+
+# Number of stored configurations that are sampled for an offspring. The one with the
+# largest objective is its first parent.
 TOURNAMENT = 4
 SIGMA = 0.1
 LINE_SIGMA = 0.3
-"""Standard deviations of a step, in half ranges, and of a step along the line through
-both parents, in their distance.
+"""Standard deviation of a random step, in half ranges, and of a step along the line
+through both parents, as a fraction of their distance.
 """
 
-# how much larger steps are in the parameters that span the archive: that is where there
-# are cells to fill
+# factor of random steps in the measures, so that offspring reach other cells
 MEASURE_SIGMA_FACTOR = 4.0
-N_CANDIDATES = 300  # configurations that the surrogate chooses a generation from
-# fraction of these whose parameters of the archive are sampled anew
+N_CANDIDATES = 300  # number of candidates that the surrogate chooses a generation from
+# fraction of the candidates whose measures are uniform samples
 ANY_CELL_FRACTION = 0.5
-# weight of a larger objective in a cell that fails already; that of a failure in
-# another cell is 1
+# Weight of a larger objective in a cell that has a failure already. The weight of a
+# first failure in a cell is 1.
 IMPROVEMENT_WEIGHT = 0.1
 # number of the best, and of the latest, configurations that the surrogate is fitted to
 MEMORY = 300
@@ -54,13 +61,13 @@ class ArchiveState:
         seed: seed of random numbers.
         measure_indices: (k,) indices in u of the parameters that span the archive.
         half_widths: (d,) half of the range of each element of u.
-        archive: archive of ribs; never written to again.
-        generation: index of the present generation.
-        points: (n, d) its configurations.
-        values: objectives of the first of them.
-        successes: whether these are failures of the model.
-        observations: what the surrogate is fitted to; None if there are too many
-            numbers for one, or a norm ball.
+        archive: archive of ribs; it is copied before it is changed.
+        generation: index of the current generation.
+        points: (n, d) configurations of the current generation.
+        values: objectives of those points that were evaluated, which are the first.
+        successes: whether the model failed at these points.
+        observations: evaluations that the surrogate is fitted to; None if the domain
+            does not suit a surrogate (`_make_observations`).
     """
 
     domain: policies.Domain
@@ -99,19 +106,22 @@ class ArchiveState:
 
         Each has two parents. Its numbers are those of the first, plus noise, plus a
         random step along the line to the second. Its discrete choices are those of the
-        first, or with probability `RESAMPLED_FRACTION` those of a sample.
+        first parent; with probability `RESAMPLED_FRACTION` a choice is that of a random
+        sample instead.
 
         Args:
-            samples: (n, d) new random configurations.
+            samples: (n, d) random configurations of the domain, one for each offspring,
+                from which choices are taken.
             rng: generator of random numbers; it advances.
         """
         count, dim = samples.shape
         first, second = self._sample_parents(count)
         noise = torch.randn(count, dim, generator=rng)
         noise[:, self.measure_indices] *= MEASURE_SIGMA_FACTOR
-        line_step = LINE_SIGMA * torch.randn(count, 1, generator=rng)
+        # (n, 1) fraction of the way from the first parent to the second
+        line_fraction = LINE_SIGMA * torch.randn(count, 1, generator=rng)
         offspring: Tensor = (
-            first + SIGMA * self.half_widths * noise + line_step * (second - first)
+            first + SIGMA * self.half_widths * noise + line_fraction * (second - first)
         )
         is_resampled = torch.rand(count, dim, generator=rng) < RESAMPLED_FRACTION
         for block, part in self.domain.list_block_slices():
@@ -232,9 +242,12 @@ def _make_candidates(
 ) -> Tensor:
     """Return candidates (n, d) for a surrogate to choose from.
 
-    They are offspring of the archive, moved into the bounds. In a part of them
+    They are offspring of the archive, moved into the bounds. In a fraction of them
     (`ANY_CELL_FRACTION`), the parameters that span the archive are sampled uniformly,
     so that they reach cells far from their parents.
+
+    A surrogate is used only in domains without norm balls (`_make_observations`). There
+    every element of u is a box coordinate, with the same index.
 
     Args:
         state: state of the search.
@@ -246,9 +259,9 @@ def _make_candidates(
     samples = box.low + box.width * uniform
     offspring = state.make_offspring(samples, rng)
     n_any_cell = int(ANY_CELL_FRACTION * N_CANDIDATES)
-    offspring[:n_any_cell, state.measure_indices] = samples[
-        :n_any_cell, state.measure_indices
-    ]
+    measures = state.measure_indices
+    offspring[:n_any_cell, measures] = samples[:n_any_cell, measures]
+    # Points of the unit box are moved into the bounds, then converted back.
     x = box.normalize((offspring - box.low) / box.width)
     return box.to_configuration(offspring, x)
 
@@ -281,8 +294,9 @@ def _make_archive(
 
 
 def _make_observations(domain: policies.Domain) -> policies.Observations | None:
-    """Return what a surrogate is fitted to, without a point yet; None if the domain has
-    norm balls, or too many numbers for a surrogate.
+    """Return empty observations for a surrogate, or None for a search without one.
+
+    A search has no surrogate if the domain has norm balls, or too many numbers.
     """
     box = policies.find_box_coordinates(domain)
     has_norm_balls = box.count < domain.dim
@@ -296,33 +310,37 @@ class MapElites(Policy[ArchiveState]):
     """MAP-Elites (Mouret and Clune 2015, "Illuminating search spaces by mapping
     elites") with the package ribs.
 
-    The archive is a grid over a few parameters. Each cell keeps the configuration with
-    the largest objective that fell into it, whatever the parameters beyond are there. A
-    new configuration is made of two kept ones, a the best of four that are drawn, b one
-    that is drawn, as by Vassiliades and Mouret 2018, "Discovering the elite hypervolume
-    by leveraging interspecies correlation":
+    The archive is a grid over a few parameters. Each cell stores the configuration with
+    the largest objective whose parameters lie in the cell, whatever its other
+    parameters are. A new configuration is made from two stored ones. The first, a, is
+    the best of four random ones; the second, b, is a random one. As in Vassiliades and
+    Mouret 2018, "Discovering the elite hypervolume by leveraging interspecies
+    correlation", it is
 
         P(a + 0.1 s z + 0.3 (b - a) y),
 
-    z a vector and y a number, standard normal, s half of each number's range, four
-    times that for the parameters of the archive: what makes the model fail in one cell
-    is tried in others. A discrete choice is that of a, or, one in ten, drawn anew. One
-    in ten configurations is drawn anew, so that no part of the domain is out of reach.
+    where P is the projection onto the domain, the vector z and the number y are
+    standard normal, and s is half of each number's range. For the parameters of the
+    archive s is four times as large, so that a change that makes the model fail in one
+    cell is tried in others. A discrete choice is that of a, or with probability 0.1 a
+    random one. A tenth of all configurations are random, so that every part of the
+    domain can be reached.
 
-    In a box of few numbers (16) renders are saved as by Gaier, Asteroth and Mouret 2017
-    (arXiv 1702.03713): 300 are made so, of half of them the parameters of the archive
-    drawn anew, and a Gaussian process fitted to what was seen chooses a generation
-    among them: of different cells, those that most likely fail where nothing does yet.
+    In a box of at most 16 numbers, renders are saved as in Gaier, Asteroth and Mouret
+    2017 (arXiv 1702.03713). 300 candidates are made this way; in half of them the
+    parameters of the archive are random. A Gaussian process that is fitted to all
+    evaluations chooses a generation among them: from different cells, those that most
+    likely fail where no failure is known yet.
 
-    The objective is noisy, so a cell may keep a configuration that was lucky; only
+    The objective is noisy, so a cell may store a configuration that was lucky. Only
     verified ones count as failures.
 
     Attributes:
-        over: the parameters that span the archive, at most 4, separated by commas, by
-            name ("pose.yaw", "camera.target.0"); empty for the first two.
-        cells: how many parts each number's range has in the archive, 2 to 1,000; a
-            discrete choice has its options.
-        population: configurations a generation, at least 2.
+        over: names of the parameters that span the archive, at most 4, separated by
+            commas ("pose.yaw", "camera.target.0"); empty for the first two.
+        cells: number of cells that each number's range is divided into, 2 to 1,000. A
+            discrete choice has a cell for each option.
+        population: number of configurations of a generation, at least 2.
     """
 
     over: str = ""
@@ -358,7 +376,7 @@ class MapElites(Policy[ArchiveState]):
         Args:
             domain: domain of the search.
             generator: source of the seed.
-            steps: renders of the search, which are not needed here.
+            steps: renders of the search; not used.
 
         Raises:
             InputError: the domain has too many numbers, or the archive too many cells.
@@ -370,7 +388,8 @@ class MapElites(Policy[ArchiveState]):
             )
         seed = policies.draw_seed(generator)
         measure_indices = self._find_measure_indices(domain)
-        # the range of a number, which has 0 options, is divided into `cells`
+        # A choice has a cell for each option. A number has 0 options, and `cells`
+        # cells.
         cells_of_axes = [
             n_options or self.cells
             for n_options in domain.options[measure_indices].tolist()
@@ -426,29 +445,32 @@ class MapElites(Policy[ArchiveState]):
     def failures(self, state: ArchiveState) -> policies.Failures:
         """Return how many cells contain a failure, and diverse examples of these.
 
-        A generation that is not complete yet is counted as well.
+        The evaluations of the current generation are counted as well, even if it is not
+        complete yet.
         """
         archive = state.add_generation().archive
         measure_indices = tuple(state.measure_indices.tolist())
+        # one row for each cell that stores a configuration
         elites = archive.data()
         failed_rows = np.flatnonzero(elites["wrong"])
-        grid_indices = archive.int_to_grid_index(elites["index"][failed_rows])
+        # Below, everything has one entry for each cell with a failure.
+        configurations = elites["solution"][failed_rows]
         objectives = elites["objective"][failed_rows].tolist()
-        is_periodic = policies.find_periodic(state.domain)[state.measure_indices]
-        is_choice = state.domain.options[state.measure_indices] > 0
-        diverse_indices = policies.select_diverse(
-            # position of each cell in the grid, in fractions of each axis
-            torch.from_numpy(grid_indices / archive.dims),
+        grid_indices = archive.int_to_grid_index(elites["index"][failed_rows])
+        # position of each cell in the grid, as a fraction of each axis
+        positions = torch.from_numpy(grid_indices / archive.dims)
+        diverse = policies.select_diverse(
+            positions,
             objectives,
-            is_periodic,
-            is_choice,
+            is_periodic=policies.find_periodic(state.domain)[state.measure_indices],
+            is_discrete=state.domain.options[state.measure_indices] > 0,
         )
         examples = []
-        for index in diverse_indices:
+        for index in diverse:
             ranges = _find_cell_ranges(
                 measure_indices, archive.boundaries, grid_indices[index]
             )
-            u = torch.from_numpy(elites["solution"][failed_rows[index]].copy())
+            u = torch.from_numpy(configurations[index].copy())
             examples.append(policies.FoundFailure(u, objectives[index], ranges))
         return policies.Failures(
             tuple(examples),
@@ -461,32 +483,35 @@ class MapElites(Policy[ArchiveState]):
     def _start_generation(self, state: ArchiveState) -> ArchiveState:
         """Begin the next generation: sample or choose its configurations.
 
-        About one in ten is a random sample of the domain. The others are offspring of
-        the archive; if there is a surrogate, it chooses them among many candidates.
-        While the archive is empty, all are random samples.
+        Each is a random sample of the domain with probability `RESAMPLED_FRACTION`. The
+        others are offspring of the archive; if there is a surrogate, it chooses them
+        among many candidates. While the archive is empty, all are random samples.
         """
+        # no configuration of the new generation is evaluated yet
         state = replace(state, generation=state.generation + 1, values=(), successes=())
         domain = state.domain
         rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:  # nothing could be evaluated so far
             return replace(state, points=domain.sample(rng, self.population))
-        # A binomial number of configurations is sampled; their order has no meaning.
-        is_sampled = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
-        n_new = int(is_sampled.sum())
+        # The order in a generation has no meaning, so random samples come first.
+        is_random = torch.rand(self.population, generator=rng) < RESAMPLED_FRACTION
+        n_random = int(is_random.sum())
         samples = domain.sample(rng, self.population)
+        random_points = samples[:n_random]
         observations = state.observations
         if observations is None:
+            # The other samples supply new options for choices of the offspring.
             offspring = [
-                domain.project(u) for u in state.make_offspring(samples[n_new:], rng)
+                domain.project(u) for u in state.make_offspring(samples[n_random:], rng)
             ]
-            return replace(state, points=torch.stack([*samples[:n_new], *offspring]))
+            return replace(state, points=torch.stack([*random_points, *offspring]))
         with policies.limit_to_single_thread():
             surrogate, observations = observations.fit_surrogate()
             candidates = _make_candidates(state, observations, rng)
-            points = state.select_most_promising(
-                surrogate, candidates, self.population - n_new
+            promising_points = state.select_most_promising(
+                surrogate, candidates, self.population - n_random
             )
-        points = torch.cat([samples[:n_new], points])
+        points = torch.cat([random_points, promising_points])
         return replace(state, points=points, observations=observations)
 
     def _find_measure_indices(self, domain: policies.Domain) -> Tensor:
@@ -497,7 +522,7 @@ class MapElites(Policy[ArchiveState]):
 
         Raises:
             UnknownNameError: the domain has no parameter of that name.
-            InputError: a name is there twice, or there are too many.
+            InputError: a name occurs twice, or there are too many.
         """
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:

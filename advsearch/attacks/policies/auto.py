@@ -1,6 +1,8 @@
-"""The policy to use first (it looks everywhere, then where a surrogate of the objective
-promises most, then uphill), and policies that wrap others: several policies on one
-budget, or several starts of one.
+"""The policy to use first, and policies that wrap others.
+
+`Auto` explores the domain evenly, then searches where a surrogate of the objective is
+promising, then follows the gradient. `Restarts` runs one policy from several starts,
+and `Portfolio` several policies on one budget.
 """
 
 from __future__ import annotations
@@ -40,52 +42,56 @@ from advsearch.attacks.policies.surrogate import (
 )
 from advsearch.errors import InputError
 
-# fraction of the renders that the screen takes: in a domain of box coordinates alone,
-# and in one with norm balls too ("mixed")
+# Fraction of the renders that the screen takes. The screen are evenly spread points
+# that are evaluated first. "Mixed" domains have norm balls besides box coordinates.
 SCREEN_FRACTION = 0.5
 SCREEN_FRACTION_MIXED = 0.25
-# fraction of the renders after which an ascent takes over, if there is one
+# fraction of the renders after which the gradient ascent begins, if there is one
 ASCENT_START = 0.75
 ASCENT_START_MIXED = 0.5
 LOW_DIM = 10
-"""Largest number of box coordinates that is worth the full screen. Of more coordinates
-a screen sees less and less; so, if gradients cost nothing, it is shorter in proportion
-and the ascent follows at once.
+"""Largest number of box coordinates that is worth the full screen. Evenly spread points
+tell less about more coordinates. So, if gradients cost nothing, the screen is shortened
+in proportion and the ascent follows at once.
 """
 
 MIN_DERIVATIVES_PER_RENDER = 4
-"""In a domain without norm balls, a gradient is worth its renders if it brings at least
-this many derivatives for each, and at least this many gradients fit into the ascent. A
-gradient by differences never is: it brings half a derivative for each render, and the
-surrogate was better on average.
+MIN_GRADIENTS = 4
+"""In a domain without norm balls, there is a gradient ascent only if a gradient yields
+at least `MIN_DERIVATIVES_PER_RENDER` derivatives for each render that it costs, and at
+least `MIN_GRADIENTS` gradients fit into the ascent. Gradients by differences are never
+worth it: they yield half a derivative for each render, and the surrogate was better on
+average.
 """
 
-# unit step of the ascent in a box, as a fraction of the usual one: the screen has been
-# everywhere else
+# Unit step of the ascent in a box, as a fraction of the usual one. It is small, because
+# the screen has explored the rest of the box.
 ASCENT_REACH = 0.1
 EXACT_MOMENTUM = 0.75
 RANDOM_CONDITIONS_MOMENTUM = 0.95
-"""Momentum of PGD if evaluations have no noise, and if each has other conditions; with
-noise PGD's default is better.
+"""Momentum of PGD if evaluations have no noise, and if each one draws new conditions.
+With noise PGD's default is better.
 """
 
 UCB_KAPPA = 2.0
-"""How many standard deviations of the surrogate are added to the mean of a candidate.
-One does as well without noise; but with noise as large as all differences one settles
-too soon on a lucky point.
+"""Number of standard deviations of the surrogate that are added to the mean of a
+candidate. Without noise 1 is as good. If the noise is as large as all differences, 1
+settles too soon on a lucky point.
 """
 
-# candidates near the best points, candidates anywhere, and the number of best points
-N_NEAR_CANDIDATES = 256
-N_FAR_CANDIDATES = 128
-N_CENTERS = 4
-UNAFFORDABLE_COST = 1 << 30  # renders of a gradient that no search can pay
+N_NEAR_CANDIDATES = 256  # number of random moves of the best points
+N_FAR_CANDIDATES = 128  # number of uniform points
+N_CENTERS = 4  # number of best points that are moved
+UNAFFORDABLE_COST = (
+    1 << 30
+)  # a cost of a gradient that exceeds the renders of any search
 
 
 @dataclass(frozen=True)
 class BudgetPlan:
-    """How the renders of a search are divided. The surrogate has those between the
-    screen and the ascent.
+    """How the renders of a search are divided among its phases.
+
+    The surrogate gets the renders between the screen and the ascent.
 
     Attributes:
         steps: renders in all.
@@ -118,19 +124,21 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
         return BudgetPlan(steps, screen=0, ascent_start=0, gradient=True)
     has_norm_balls = box.count < domain.dim
     if has_norm_balls:
-        has_free_part = domain.gradient_cost and domain.partial_gradients
+        # Elements whose gradient costs renders can be left out of it ("free").
+        can_avoid_cost = domain.gradient_cost > 0 and domain.partial_gradients
         return BudgetPlan(
             steps,
             screen=math.ceil(SCREEN_FRACTION_MIXED * steps),
             ascent_start=math.ceil(ASCENT_START_MIXED * steps),
-            gradient="free" if has_free_part else True,
+            gradient="free" if can_avoid_cost else True,
         )
     plan = _plan_box_ascent(box, steps)
-    n_numbers = _count_numbers(box)
+    n_numbers = _count_numbers(box)  # number of derivatives of a gradient
     cost = domain.gradient_cost
     is_worth_renders = MIN_DERIVATIVES_PER_RENDER * cost <= n_numbers
-    renders_left = steps - plan.ascent_start
-    fits = MIN_DERIVATIVES_PER_RENDER * (1 + cost) <= renders_left
+    # the configuration is rendered as well, which is the 1
+    renders_needed = MIN_GRADIENTS * (1 + cost)
+    fits = renders_needed <= steps - plan.ascent_start
     if n_numbers and is_worth_renders and fits:
         return plan
     # `ascent_start=steps` means that the ascent never begins. Nothing has to be saved
@@ -147,8 +155,9 @@ def _count_numbers(box: BoxCoordinates) -> int:
 def _plan_box_ascent(box: BoxCoordinates, steps: int) -> BudgetPlan:
     """Divide renders in a domain of box coordinates alone, with an ascent.
 
-    With more than `LOW_DIM` numbers, evenly spread points tell little. Then the screen
-    is shorter, and the ascent follows it without a surrogate.
+    With more than `LOW_DIM` numbers, evenly spread points say little about the
+    objective. Then the screen is shorter, and the ascent follows it without a
+    surrogate.
 
     Args:
         box: box coordinates of the domain.
@@ -176,15 +185,16 @@ class AutoState:
 
     Attributes:
         domain: domain of the search.
-        observations: evaluations of the screen and the surrogate, with norm balls at
-            their start.
+        observations: evaluations of the screen and the surrogate. Norm balls are at
+            their start in these.
         plan: how the renders are divided.
         seed: seed of random numbers.
-        screen: (m, k) box coordinates of the screen's points after the initial one.
-        renders_spent: renders spent by the evaluations so far.
-        ascent: state of PGD, once it has begun.
-        is_climbing: whether the latest proposal was the ascent's.
-        latest_objective: latest objective of the ascent.
+        screen: (m, k) box coordinates of the points of the screen. The initial point,
+            which is evaluated before them, is not included.
+        renders_spent: number of renders of the evaluations so far.
+        ascent: state of PGD; None before the ascent.
+        is_climbing: whether the latest proposal is one of the ascent.
+        latest_objective: objective of the latest evaluation of the ascent.
         box_before_trial: (k,) box coordinates before the latest proposal moved them at
             random; None if it did not.
     """
@@ -217,23 +227,23 @@ class AutoState:
 class Auto(Policy[AutoState]):
     """What to use first; it has no options.
 
-    - Norm balls alone (a texture): `PGD`, bit for bit; with more momentum where
-    evaluations have no noise.
-    - Box coordinates alone (poses, cameras, lights, choices): the start and scrambled
+    - Only norm balls (a texture): `PGD`, bit for bit; with more momentum if evaluations
+      have no noise.
+    - Only box coordinates (poses, cameras, lights, choices): the start and scrambled
       Sobol points take half of the renders. Then a Gaussian process is fitted to all
-      that was seen, and the next point is the candidate with the largest mean plus
-      `UCB_KAPPA` standard deviations (GP-UCB, Srinivas et al. 2010), among moves of the
-      best points, points anywhere, and the best point itself. The process models the
-      noise, so a lucky value does not pass for a peak, and rendering the best point
-      again is one of its choices. Where gradients cost no renders (adjoints), `PGD`
-      with small steps takes the last quarter; with more than `LOW_DIM` coordinates it
-      begins right after a shorter screen.
+      evaluations. The next point is the candidate with the largest mean plus
+      `UCB_KAPPA` standard deviations (GP-UCB, Srinivas et al. 2010). Candidates are
+      random moves of the best points, uniform points, and the best point itself, which
+      may be rendered again. The process models the noise, so that a lucky value is not
+      taken for a peak. If gradients cost no renders (adjoints), `PGD` with small steps
+      takes the last quarter. With more than `LOW_DIM` coordinates it begins right after
+      a shorter screen.
     - Both: screen and surrogate over the box coordinates, with the balls at their
-      start, take half of the renders and `PGD` over everything the rest. If the box
-      coordinates' gradient costs renders and can be left out
-      (`Domain.partial_gradients`), PGD follows what is free, and every second
-      evaluation tries a random move of the box coordinates, which is taken back if the
-      objective falls.
+      start, take half of the renders. `PGD` over everything takes the rest. If the
+      gradient of the box coordinates costs renders and can be left out
+      (`Domain.partial_gradients`), PGD follows the free gradient, and every second
+      evaluation tries a random move of the box coordinates. The move is taken back if
+      the objective falls.
     """
 
     name: ClassVar[str] = "auto"
@@ -289,6 +299,8 @@ class Auto(Policy[AutoState]):
             with limit_to_single_thread():
                 state = self._begin_ascent(state)
         if state.ascent is not None:
+            # `_make_pgd` only reads whether the domain has noise. The domain that the
+            # ascent searches is part of its own state.
             steps, ascent = _make_pgd(state.domain).propose(state.ascent, n)
             if steps:
                 (proposal,) = steps
@@ -297,7 +309,8 @@ class Auto(Policy[AutoState]):
             if has_norm_balls:
                 return (), state
         points = self._list_screen(state, n)
-        if not points:
+        is_screen_complete = not points
+        if is_screen_complete:
             with limit_to_single_thread():
                 x, state = self._choose_next_point(state)
             points = [state.to_configuration(x)]
@@ -314,9 +327,11 @@ class Auto(Policy[AutoState]):
         points = []
         if n_observed == 0:
             points.append(state.domain.initial_point)
+        # The initial point is evaluated first, and is not one of `state.screen`.
         n_screened = max(0, n_observed - 1)
-        next_points = state.screen[n_screened:][: n - len(points)]
-        points += map(state.to_configuration, next_points)
+        next_points = state.screen[n_screened:]
+        n_requested = n - len(points)
+        points += map(state.to_configuration, next_points[:n_requested])
         return points
 
     def _propose_ascent_step(
@@ -336,11 +351,12 @@ class Auto(Policy[AutoState]):
         proposal = replace(proposal, gradient=state.plan.gradient)
         state = replace(state, is_climbing=True)
         has_full_gradient = proposal.gradient is True
-        if has_full_gradient or count % 2 == 0:
+        moves_box = not has_full_gradient and count % 2 == 1  # every second step
+        if not moves_box:
             return (proposal,), state
         box = state.box
         x = box.from_configuration(proposal.u)
-        # Stream numbers below `plan.steps` are used by the surrogate.
+        # The surrogate draws with numbers below `plan.steps`, so these are new.
         rng = seeded(state.seed, state.plan.steps + count)
         moved_x = box.sample_moves(x[None], rng)[0]
         u = state.domain.project(box.to_configuration(proposal.u, moved_x))
@@ -360,10 +376,12 @@ class Auto(Policy[AutoState]):
     ) -> AutoState:
         """Pass the evaluation of a step to the ascent.
 
-        If the step also moved the box coordinates at random, and the objective fell,
-        that move is taken back.
+        If the step also moved the box coordinates at random, and the objective fell
+        since the evaluation before, that move is taken back. Norm balls keep their
+        step. The next objective is compared with this one in any case.
         """
         ((_, evaluation),) = evaluated  # an ascent proposes one at a time
+        # After this, `ascent.u` is the configuration of the next step.
         ascent = _make_pgd(state.domain).update(ascent, evaluated)
         has_fallen = evaluation.objective < state.latest_objective
         if state.box_before_trial is not None and has_fallen:
@@ -391,6 +409,7 @@ class Auto(Policy[AutoState]):
         random point.
         """
         box = state.box
+        # The number of evaluations gives every point new random numbers.
         generator = seeded(state.seed, len(state.observations.values))
         if not state.observations.has_finite:
             random_point = torch.rand(box.count, generator=generator)
@@ -399,7 +418,8 @@ class Auto(Policy[AutoState]):
         surrogate, observations = state.observations.fit_surrogate()
         candidates = _sample_candidates(surrogate, generator)
         mean, std = surrogate.predict(candidates)
-        best_candidate = candidates[int((mean + UCB_KAPPA * std).argmax())]
+        upper_bound = mean + UCB_KAPPA * std
+        best_candidate = candidates[int(upper_bound.argmax())]
         return best_candidate, replace(state, observations=observations)
 
     def _begin_ascent(self, state: AutoState) -> AutoState:
@@ -415,16 +435,19 @@ class Auto(Policy[AutoState]):
         if state.observations.has_finite:
             surrogate, observations = state.observations.fit_surrogate()
             state = replace(state, observations=observations)
-            mean, _ = surrogate.predict(surrogate.x)
-            x = surrogate.x[int(mean.argmax())]
+            observed_points = surrogate.x
+            mean, _ = surrogate.predict(observed_points)
+            x = observed_points[int(mean.argmax())]
         ascent_blocks = []
         for block in state.domain.blocks:
+            # the reach of a box is its unit step; a norm ball has none
             reach = ASCENT_REACH * block.radius if block.norm == "box" else None
             ascent_blocks.append(replace(block, reach=reach))
         domain = replace(state.domain, blocks=tuple(ascent_blocks))
         renders_left = max(1, state.plan.steps - state.renders_spent)
         ascent = _make_pgd(domain).start(domain, seeded(state.seed, 0), renders_left)
-        # PGD starts at the initial point of the domain: it is moved to the best one
+        # PGD starts at the initial point of the domain, so it is moved to the best
+        # point. `to_configuration` puts norm balls at their start.
         return replace(state, ascent=replace(ascent, u=state.to_configuration(x)))
 
 
@@ -454,8 +477,8 @@ def _sample_candidates(surrogate: Surrogate, generator: torch.Generator) -> Tens
 
 @dataclass(frozen=True)
 class WithoutAscent(Auto):
-    """Screen and surrogate of `Auto` alone, over box coordinates, for a model that has
-    no gradient.
+    """`Auto` without its gradient ascent, for a model that has no gradient: screen and
+    surrogate over box coordinates.
     """
 
     uses_gradient: ClassVar[bool] = False
@@ -463,7 +486,10 @@ class WithoutAscent(Auto):
     def start(
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> AutoState:
-        """Start as `Auto` does where no gradient can be paid: no plan has an ascent."""
+        """Start like `Auto`, with gradients that cost more than all renders.
+
+        So its plan has no ascent.
+        """
         return super().start(
             replace(domain, gradient_cost=UNAFFORDABLE_COST), generator, steps
         )
@@ -474,19 +500,20 @@ class WithoutAscent(Auto):
 
 @dataclass(frozen=True)
 class Restarts(RacingPolicy[Race]):
-    """Lets a policy search `times` times, each with an equal share of the renders; they
-    take turns, step by step.
+    """Runs a policy `times` times, each with an equal fraction of the renders.
 
-    The first begins where the policy would begin by itself, the others at samples of
-    the domain (`Domain.sample`); the norm balls stay where they are. One that has
-    nothing more to propose leaves its renders to the rest. For an objective with
-    several peaks, where a gradient finds the nearest. Discrete choices are fixed
-    outside (`Choices`), so every combination of options has its own restarts.
+    The runs take turns, step by step. The first begins where the policy would begin by
+    itself, the others at samples of the domain (`Domain.sample`); norm balls stay
+    around the start. A run that has nothing more to propose leaves its renders to the
+    others. This is for an objective with several peaks, of which a gradient finds the
+    nearest. Discrete choices are fixed outside (`Choices`), so every combination of
+    options has its own restarts.
 
     Attributes:
-        policy: what searches; in `make_policy` a name, or a mapping with a name and
-            options.
-        times: at least 1; fewer if the renders do not suffice for one evaluation each.
+        policy: policy that searches; in `make_policy` a name, or a mapping with a name
+            and options.
+        times: number of runs, at least 1. There are fewer if the renders do not suffice
+            for one evaluation each.
     """
 
     policy: Policy[Any] = field(default_factory=PGD)
@@ -532,20 +559,20 @@ class Restarts(RacingPolicy[Race]):
 
 @dataclass(frozen=True)
 class Portfolio(RacingPolicy[Race]):
-    """Lets several policies search side by side and goes on with those that reached
-    more.
+    """Runs several policies in parallel and continues with the better ones.
 
     With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see
-    `choices`. Within a round every policy that is still in has an equal share; after it
-    the better half goes on, by the largest objective so far. So of two policies each
-    has a quarter of the renders, and the better one the other half.
+    `choices`. In a round, its renders are divided equally among the policies that are
+    left. After it the better half continues, by the largest objective so far. So with
+    two policies each gets a quarter of the renders, and the better one the other half.
 
-    A policy that cannot search the domain (it says so with an InputError: a grid over a
-    texture) is left out; if none can, the first one's error is passed on.
+    A policy that cannot search the domain, for example a grid over a texture, raises an
+    InputError when it starts. It is left out. If no policy can search the domain, the
+    error of the first one is raised.
 
     Attributes:
-        policies: at least one; in `make_policy` a list of names, or of mappings with a
-            name and options.
+        policies: at least one policy; in `make_policy` a list of names, or of mappings
+            with a name and options.
     """
 
     policies: tuple[Policy[Any], ...] = (Auto(), CMAES())
@@ -584,7 +611,8 @@ class Portfolio(RacingPolicy[Race]):
         for policy in self.policies:
             wrapped = wrap_choices(policy, domain)
             try:
-                # This only tests whether the policy can search the domain.
+                # This only tests whether the policy can search the domain. The race
+                # starts it again, when the number of searches is known.
                 wrapped.start(domain, seeded(seed, 0), steps_each)
             except InputError as error:
                 errors.append(error)

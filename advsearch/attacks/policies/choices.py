@@ -1,9 +1,11 @@
-"""Discrete choices around a policy that knows only numbers: options outside, the
-continuous search inside. Searches race by successive halving (Karnin, Koren and Somekh
-2013, "Almost optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016):
-1 + ceil(log2 n) rounds with equally many renders, divided equally among the searches
-that are still in. They take turns: the one with the most renders left comes first. A
-proposal is charged with what it may cost.
+"""Races of several searches, and discrete choices for a policy that only searches
+numbers: each combination of options has its own search, and these race.
+
+A race is successive halving (Karnin, Koren and Somekh 2013, "Almost optimal exploration
+in multi-armed bandits"; Jamieson and Talwalkar 2016). It has 1 + ceil(log2 n) rounds
+with equally many renders, divided equally among the searches that are left. In a round
+the searches take turns: the one with the most renders left comes next. A proposal is
+charged with the largest cost that it may have.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ class Runner:
         domain: domain that it searches.
         state: state of the policy.
         renders_left: renders that it may still use in this round.
-        best_objective: the largest so far.
+        best_objective: the largest objective of the search so far.
         is_over: whether it has nothing more to propose.
     """
 
@@ -62,16 +64,17 @@ Racing = TypeVar("Racing", bound="Race")
 
 @dataclass(frozen=True, eq=False)
 class Race:
-    """The state of a race.
+    """The state of a race. In its methods, k is the index of a search in `runners`.
 
     Attributes:
         runners: the searches.
         steps: renders of the race.
         n_rounds: number of rounds of the race.
-        active_runners: indices of the searches in this round, the best first.
-        round: index of the present round.
-        spent: renders that the evaluations so far took.
-        runner_of_proposal: index of the search of each of the latest proposals.
+        active_runners: indices of the searches that take part in this round, the best
+            first.
+        round: index of the current round.
+        spent: number of renders of the evaluations so far.
+        runner_of_proposal: for each of the latest proposals, the index of its search.
     """
 
     runners: tuple[Runner, ...]
@@ -84,8 +87,8 @@ class Race:
 
     @property
     def leader(self) -> int:
-        """The index of the search with the largest objective so far, the first of
-        equals.
+        """Index of the search with the largest objective so far; the first if several
+        are equal.
         """
         return max(
             range(len(self.runners)), key=lambda k: self.runners[k].best_objective
@@ -113,10 +116,11 @@ class Race:
     def propose(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
         """Return up to n proposals of this round that do not depend on each other.
 
-        There are none if the round is over. Proposals are taken one by one from the
-        search with the most renders left. Each search makes its proposals in one call,
-        its part of n. The batch ends when it is the turn of a search whose proposals
-        are used up, because its next ones depend on evaluations of this batch.
+        There are none if the round is over. Each search makes its proposals in one
+        call: n divided by the number of searches. From these they are taken one by one,
+        the next always from the search with the most renders left. The batch ends when
+        it is the turn of a search whose proposals are used up, because its next ones
+        depend on evaluations of this batch.
 
         Args:
             n: largest number of proposals.
@@ -135,21 +139,25 @@ class Race:
                 proposals[k], state = proposer.policy.propose(
                     proposer.state, min(max_proposals, proposer.renders_left)
                 )
-                # put into `runners` only if one of its proposals is used
+                # `charge` below stores it in `runners`. A search without a proposal
+                # stays in its state before.
                 proposer = replace(proposer, state=state)
-            if not proposals[k]:
+            has_nothing_to_propose = not proposals[k]
+            if has_nothing_to_propose:
                 self._retire(runners, k)
-            elif n_used[k] == len(proposals[k]):  # all used up: the batch ends
+                waiting = self._find_waiting(runners)
+                continue
+            are_used_up = n_used[k] == len(proposals[k])
+            if are_used_up:
                 break
-            else:
-                proposal = self._limit_proposal(proposals[k][n_used[k]], proposer)
-                batch.append(proposal)
-                runner_of_proposal.append(k)
-                n_used[k] += 1
-                runners[k] = proposer.charge(proposal)
+            proposal = self._limit_proposal(proposals[k][n_used[k]], proposer)
+            batch.append(proposal)
+            runner_of_proposal.append(k)
+            n_used[k] += 1
+            runners[k] = proposer.charge(proposal)
             waiting = self._find_waiting(runners)
-        # A search whose proposals were not all used proposes again, only as many as
-        # were used, so that its state does not expect evaluations of the others.
+        # A search expects evaluations of all its proposals. If not all were used, it
+        # proposes again from its state before the batch, only as many as were used.
         for k, count in n_used.items():
             if count < len(proposals[k]):
                 state = self._propose_again(k, count)
@@ -182,9 +190,12 @@ class Race:
         renders = runners[k].renders_left
         runners[k] = replace(runners[k], renders_left=0, is_over=True)
         others = [other for other in self.active_runners if not runners[other].is_over]
-        for index, other in enumerate(others):
-            # the first ones get one more if the renders do not divide evenly
-            added = (renders + len(others) - 1 - index) // len(others)
+        if not others:
+            return
+        renders_each, remainder = divmod(renders, len(others))
+        for position, other in enumerate(others):
+            # the remainder goes to the first ones, one render each
+            added = renders_each + 1 if position < remainder else renders_each
             renders_left = runners[other].renders_left + added
             runners[other] = replace(runners[other], renders_left=renders_left)
 
@@ -193,8 +204,9 @@ class Race:
         proposal = replace(proposal, samples=min(runner.renders_left, proposal.samples))
         renders_left = runner.renders_left
         has_later_round = self.round + 1 < self.n_rounds
-        # `limit_cost` drops the gradient of the last evaluation, as no step follows it.
-        # With a later round a step follows: its first render counts as left.
+        # `limit_cost` drops a gradient that uses up the renders, because no step could
+        # follow it. With a later round a step does follow, so one render more is
+        # stated.
         if has_later_round:
             renders_left += 1
         return proposal.limit_cost(runner.domain, renders_left)
@@ -218,8 +230,13 @@ def max_runners(steps: int, each: int, limit: int) -> int:
         each: renders that a search needs in every round.
         limit: upper limit of the result.
     """
+
+    def count_renders(n_searches: int) -> int:
+        # All rounds have as many renders as the first, in which all searches take part.
+        return count_rounds(n_searches) * n_searches * each
+
     count = 1
-    while count < limit and (count + 1) * count_rounds(count + 1) * each <= steps:
+    while count < limit and count_renders(count + 1) <= steps:
         count += 1
     return count
 
@@ -242,9 +259,10 @@ def start_race(
         rounds: number of rounds; by default as many as leave a single search.
     """
     steps = max(1, steps)
-    rounds = rounds or count_rounds(len(searches))
-    # A search plans with the renders that it gets if it is never dropped. All rounds
-    # have equally many renders, which are divided among the searches that are left.
+    if rounds is None:
+        rounds = count_rounds(len(searches))
+    # Every search is started with the number of renders that it gets if it is never
+    # dropped. All rounds have equally many, divided among the searches that are left.
     planned_renders = 0.0
     n_active = len(searches)
     for _ in range(rounds):
@@ -258,7 +276,9 @@ def start_race(
         )
         for number, (policy, domain) in enumerate(searches)
     )
-    return Race(runners, steps, rounds).begin_round(range(len(runners)), number=0)
+    race = Race(runners, steps, n_rounds=rounds)
+    all_runners = range(len(runners))
+    return race.begin_round(all_runners, number=0)
 
 
 class RacingPolicy(Policy[Racing]):
@@ -274,17 +294,22 @@ class RacingPolicy(Policy[Racing]):
             batch, state = state.propose(n)
             if batch or all(runner.is_over for runner in state.runners):
                 return batch, state
-            # Renders may be left after the last round, which then is repeated.
-            next_round = min(state.round + 1, state.n_rounds - 1)
-            state = state.begin_round(self._select_continuing(state), next_round)
+            # An empty batch means that the round is over. After the last round some
+            # renders may be left, as proposals may have cost less than they were
+            # charged. Then another round begins, with the index of the last.
+            last_round = state.n_rounds - 1
+            next_round = min(state.round + 1, last_round)
+            continuing = self._select_continuing(state)
+            state = state.begin_round(continuing, next_round)
 
     @staticmethod
     def _select_continuing(race: Race) -> list[int]:
         """Return the indices of the searches of the next round, the best first.
 
-        They are the better half of this round, without searches that are over. After
-        the last round, or if all of that half are over, only the best search that is
-        not over continues, even if it was dropped before.
+        The better half of this round continues, without searches that are over. Two
+        cases are different: this was the last round, or the whole better half is over.
+        Then a single search continues. It is the best of all that are not over, also of
+        those that were dropped in an earlier round.
         """
         runners = race.runners
         ranked = sorted(
@@ -292,7 +317,8 @@ class RacingPolicy(Policy[Racing]):
         )
         better_half = ranked[: math.ceil(len(ranked) / 2)]
         continuing = [k for k in better_half if not runners[k].is_over]
-        if continuing and race.round + 1 < race.n_rounds:
+        has_later_round = race.round + 1 < race.n_rounds
+        if continuing and has_later_round:
             return continuing
         remaining = [k for k, runner in enumerate(runners) if not runner.is_over]
         return sorted(remaining, key=lambda k: -runners[k].best_objective)[:1]
@@ -330,12 +356,16 @@ class RacingPolicy(Policy[Racing]):
         return runner.policy.distribution(runner.state)
 
     def failures(self, state: Racing) -> Failures | None:
-        """Return the failures of the search that has met the most; None if no search
-        looks for different ones.
+        """Return the failures of the search that has met the most of them, or None if
+        no search looks for different failures.
         """
-        known = [runner.policy.failures(runner.state) for runner in state.runners]
+        failures_of_runners = [
+            runner.policy.failures(runner.state) for runner in state.runners
+        ]
         return max(
-            filter(None, known), key=lambda failures: failures.n_failures, default=None
+            filter(None, failures_of_runners),
+            key=lambda failures: failures.n_failures,
+            default=None,
         )
 
     def counts(self, state: Racing) -> Counts:
@@ -344,22 +374,26 @@ class RacingPolicy(Policy[Racing]):
         )
 
 
-# limits of the combinations that take part: their number, and the elements of all their
-# configurations together, of which each search stores several; two always may
+# Limits of the combinations of options that take part: their number, and the number of
+# elements that all their configurations have together, as searches store these.
 MAX_COMBINATIONS = 256
 MAX_NUMBERS = 2**24
-MIN_LISTED_COMBINATIONS = 1024  # so many are always listed, and not sampled
+# Up to this many combinations are always listed, and not sampled.
+MIN_LISTED_COMBINATIONS = 1024
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ChoicesState(Race):
-    """State of the search: a race over the numbers alone.
+    """State of the search: a race with one search for each combination of options.
+
+    The searches of the race only have the numbers of the domain. Search k has
+    combination k.
 
     Attributes:
         domain: domain of numbers and choices.
         numbers: (k,) indices of the numbers in u.
         choices: (c,) indices of the discrete choices in u.
-        combinations: (n, c) elements of u at the choices, for each search of the race.
+        combinations: (n, c) elements of u that are choices, for each search.
     """
 
     domain: Domain
@@ -368,10 +402,13 @@ class ChoicesState(Race):
     combinations: Tensor
 
     def join_choices(self, numbers: Tensor, combination: int) -> Tensor:
-        """Return the configuration (d,) with numbers (k,) and a combination of options,
-        by its index.
+        """Return the configuration (d,) of a search's numbers and options.
 
-        If the domain has no numbers, the search has a single one, which is dropped.
+        Args:
+            numbers: (k,) elements of u that are numbers. If the domain has none, this
+                is a dummy, and ignored.
+            combination: index of the combination of options, which is that of the
+                search.
         """
         u = self.domain.initial_point.clone()
         u[self.numbers] = numbers[: len(self.numbers)]
@@ -381,14 +418,13 @@ class ChoicesState(Race):
 
 @dataclass(frozen=True)
 class Choices(RacingPolicy[ChoicesState]):
-    """Searches combinations of options outside and, with another policy, the numbers
-    inside.
+    """Searches discrete choices with a policy that only searches numbers.
 
-    Every combination of options has a search of its own over the numbers, and the
-    combinations race. If there are more combinations than can have an evaluation (with
-    its gradient) in every round, a random subset takes part, that of the start always
-    included. `search` wraps every policy whose `handles_choices` is false in this, also
-    those of users.
+    Every combination of options has its own search over the numbers, and these race.
+    The renders have to suffice for an evaluation (with its gradient) of every
+    combination in each of its rounds. If there are too many, a random subset takes
+    part, which always includes the combination of the start. `search` wraps every
+    policy whose `handles_choices` is false in this, also those of users.
     """
 
     policy: Policy[Any]
@@ -408,8 +444,9 @@ class Choices(RacingPolicy[ChoicesState]):
     ) -> ChoicesState:
         """Start one search of the numbers for each combination of options.
 
-        If all parameters are choices, the inner search is a random one over a dummy
-        number, which `ChoicesState.join_choices` drops.
+        If all parameters are choices, the searches have no numbers. But a policy needs
+        one, so each is a random search of a dummy number, which is dropped from its
+        proposals (`ChoicesState.join_choices`).
 
         Args:
             domain: domain of numbers and choices.
@@ -430,12 +467,12 @@ class Choices(RacingPolicy[ChoicesState]):
         combinations = _select_combinations(
             domain.options[choices].tolist(),
             domain.initial_point[choices],
-            _count_runners(domain, policy, steps),
-            seeded(seed, 0),
+            max_combinations=_count_runners(domain, policy, steps),
+            generator=seeded(seed, 0),
         )
         race = start_race([(policy, inner_domain)] * len(combinations), steps, seed)
         return ChoicesState(
-            **vars(race),  # the fields of the race itself
+            **vars(race),  # all fields of `Race`, which `ChoicesState` inherits
             domain=domain,
             numbers=numbers,
             choices=choices,
@@ -446,14 +483,14 @@ class Choices(RacingPolicy[ChoicesState]):
         self, state: ChoicesState, n: int
     ) -> tuple[tuple[Proposal, ...], ChoicesState]:
         """Propose what the race proposes, each with the options of its search."""
-        proposals, state = super().propose(state, n)
-        joined = tuple(
-            replace(proposal, u=state.join_choices(proposal.u, runner))
-            for proposal, runner in zip(
-                proposals, state.runner_of_proposal, strict=True
-            )
-        )
-        return joined, state
+        # The proposals of the race only have numbers. The state that it returns says
+        # which search made each of them; search k has combination k.
+        inner_proposals, state = super().propose(state, n)
+        proposals = []
+        for proposal, k in zip(inner_proposals, state.runner_of_proposal, strict=True):
+            u = state.join_choices(proposal.u, combination=k)
+            proposals.append(replace(proposal, u=u))
+        return tuple(proposals), state
 
     def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
         """Update each inner search with the evaluations of its proposals.
@@ -471,17 +508,19 @@ class Choices(RacingPolicy[ChoicesState]):
         return super().update(state, inner_evaluated)
 
     def distribution(self, state: ChoicesState) -> Distribution | None:
-        """Return the distribution (d,) of the leading search, with its options fixed.
+        """Return the distribution (d,) of the leading search.
 
-        The search itself has only the k numbers: its mean is completed by its choices,
-        which have no deviation.
+        That search only has the numbers of the domain. Its options are added to the
+        mean, with a standard deviation of zero.
         """
+        # that of the leading search, which has the index `state.leader`
         inner_distribution = super().distribution(state)
         if inner_distribution is None:
             return None
         deviation = torch.zeros_like(state.domain.start)
         number_indices = state.numbers
         deviation[number_indices] = inner_distribution.deviation
+        # search k has combination k
         mean = state.join_choices(inner_distribution.mean, combination=state.leader)
         return Distribution(mean, deviation)
 
@@ -490,8 +529,10 @@ class Choices(RacingPolicy[ChoicesState]):
 
 
 def wrap_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
-    """Return the policy, inside `Choices` if the domain has discrete choices that it
-    does not handle itself.
+    """Return a policy that can search a domain with discrete choices.
+
+    If the domain has choices and the policy only searches numbers, it is wrapped in
+    `Choices`. Otherwise the policy itself is returned.
     """
     has_choices = any(block.options for block in domain.blocks)
     if has_choices and not policy.handles_choices:
@@ -515,12 +556,13 @@ def _drop_choices(domain: Domain, numbers: Tensor) -> Domain:
 def _count_runners(domain: Domain, policy: Policy[Any], steps: int) -> int:
     """Return how many combinations of options can be searched in `steps` renders."""
     n_combinations = math.prod(domain.options[domain.options > 0].tolist())
+    # two may take part, however large a configuration is
     max_in_memory = max(2, MAX_NUMBERS // domain.dim)
     limit = min(MAX_COMBINATIONS, n_combinations, max_in_memory)
     renders_per_evaluation = 1
     if policy.uses_gradient:
         renders_per_evaluation += domain.gradient_cost
-    return max_runners(steps, renders_per_evaluation, limit)
+    return max_runners(steps, each=renders_per_evaluation, limit=limit)
 
 
 def _select_combinations(
@@ -531,8 +573,9 @@ def _select_combinations(
 ) -> Tensor:
     """Select combinations of options, the initial one first.
 
-    If there are few combinations, all are listed and the others follow in a random
-    order. Otherwise different ones are sampled; these are sorted.
+    If there are few combinations, all are listed, and the others follow the initial one
+    in a random order. Otherwise different ones are sampled, and follow in ascending
+    order.
 
     Args:
         n_options: number of options of each of the c choices.
@@ -557,6 +600,7 @@ def _select_combinations(
         selected = _sample_combinations(
             n_options, tuple(initial.tolist()), max_combinations - 1, generator
         )
+    # `selected` has indices; option i of n has the center (i + 1/2) / n
     centers = option_center((selected + 0.5) / sizes, sizes)
     return torch.cat([initial_point[None], centers.to(initial_point.dtype)])
 

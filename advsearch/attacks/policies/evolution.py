@@ -1,6 +1,8 @@
-"""Evolution strategies, without gradients: a natural one of independent elements, which
-follows the gradient of the expected objective, and covariance matrix adaptation, which
-learns where to look from ranks alone.
+"""Evolution strategies, which need no gradients of the model.
+
+`NES`, a natural evolution strategy with independent elements, follows the gradient of
+the expected objective. `CMAES`, covariance matrix adaptation, only uses the ranks of
+objectives.
 """
 
 from __future__ import annotations
@@ -36,19 +38,19 @@ from advsearch.errors import InputError
 from advsearch.seeds import stream
 
 MAX_FULL_DIM = 80
-"""Largest dimension with a full covariance matrix; above it only its diagonal is
-adapted (Ros and Hansen 2008). Also about the size from which the linear algebra would
-use several threads, whose last bits may differ.
+"""Largest dimension with a full covariance matrix. Above it only the diagonal is
+adapted (Ros and Hansen 2008). From about this size on, the linear algebra would also
+use several threads, so that last bits could differ.
 """
 
-# more numbers are refused: a generation would take longer than renders, and an ascent
-# is far ahead
+# More numbers are rejected: a generation would take longer than its renders, and a
+# gradient ascent is far better there.
 MAX_DIM = 10_000
 MAX_STEP_SIZE = 10.0
 MIN_STEP_SIZE = 1e-3
-"""In half ranges. The step size grows no further than the maximum (it does grow if all
-objectives are equal), and a run is over when its largest standard deviation is no more
-than the minimum.
+"""Limits of the step size, in half ranges. It can only reach the maximum if many
+objectives are equal. A run of CMA-ES is over when its largest standard deviation is at
+or below the minimum.
 """
 
 Float64Array = npt.NDArray[np.float64]
@@ -84,11 +86,11 @@ class NESState:
         domain: domain of the search.
         seed: seed of random numbers.
         half_widths: (d,) half of the range of each element of u.
-        mean: (d,) of the distribution, in u.
-        deviation: (d,) its standard deviation, in half ranges.
-        population: samples of a generation, an even number.
-        generation: index of the present generation.
-        values: objectives of its first samples.
+        mean: (d,) mean of the distribution, in u.
+        deviation: (d,) standard deviation of the distribution, in half ranges.
+        population: number of samples of a generation, even.
+        generation: index of the current generation.
+        values: objectives of those of its samples that were evaluated, the first ones.
     """
 
     domain: Domain
@@ -142,20 +144,20 @@ class NES(Policy[NESState]):
         mean      <- P(mean + deviation * sum_k w_k s_k)
         deviation <- deviation * exp(rate / 2 * sum_k w_k (s_k^2 - 1))
 
-    with w_k = max(0, ln(n/2 + 1) - ln(rank_k)) normalised to the sum 1, less 1/n, and
-    rate = (3 + ln d) / (5 sqrt d). We depart from it in that samples come in pairs s
-    and -s, and equal objectives share their weights.
+    with w_k = max(0, ln(n/2 + 1) - ln(rank_k)) normalized to the sum 1, minus 1/n, and
+    rate = (3 + ln d) / (5 sqrt d). Two things differ from the paper: samples come in
+    pairs s and -s, and equal objectives share their weights.
 
-    Its result is the distribution, beside the best configuration met: a set of
-    configurations that are bad on average. Memory and time a render are a few vectors
-    of the domain's size, so it takes textures too; but it needs twenty to a hundred
-    renders for each number.
+    Its result is the distribution, besides the best configuration: a set of
+    configurations that are bad on average. Memory and time of a step are those of a few
+    vectors of the size of the domain, so it can search textures too. But it needs
+    twenty to a hundred renders for each number.
 
     Attributes:
-        sigma: first standard deviation in units of half of each number's range (half of
-            what the ball leaves), over 0, at most 2.
-        population: samples a generation, even, at least 4; 0 for 4 + 3 ln d, rounded up
-            to even.
+        sigma: first standard deviation, over 0 and at most 2, in units of half of each
+            number's range (in a ball, of the part of it inside the ball).
+        population: number of samples of a generation, even, at least 4; 0 for 4 + 3 ln
+            d, rounded up to an even number.
     """
 
     sigma: float = 0.3
@@ -166,12 +168,10 @@ class NES(Policy[NESState]):
 
     def __post_init__(self) -> None:
         """Check that all settings are within their limits."""
-        if not 0.0 < self.sigma <= 2.0:
-            raise InputError(
-                "sigma: expected a number in (0, 2], a share of half the "
-                f"range, got {self.sigma}"
-            )
-        if self.population and (self.population < 4 or self.population % 2):
+        _check_sigma(self.sigma)
+        has_default_population = self.population == 0
+        is_odd = self.population % 2 == 1
+        if not has_default_population and (self.population < 4 or is_odd):
             raise InputError(
                 "population: expected an even number of at least 4, or "
                 f"0, got {self.population}"
@@ -185,7 +185,7 @@ class NES(Policy[NESState]):
         Args:
             domain: domain of the search.
             generator: source of the seed.
-            steps: renders of the search, which are not needed here.
+            steps: renders of the search; not used.
         """
         # the default of CMA-ES (Hansen 2016), made even for pairs
         default_population = 4 + int(3 * math.log(domain.dim))
@@ -223,12 +223,12 @@ class NES(Policy[NESState]):
             return state
         d = state.domain.dim
         mean_gradient, square_sum = state.sum_weighted_noise()
-        # Weights sum to zero, so that the -1 in the formula of the deviation cancels.
-        # The rate is that of Wierstra et al. 2014.
+        # the rate of Wierstra et al. 2014
         rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
-        deviation = (state.deviation * square_sum.mul_(rate / 2.0).exp_()).clamp_(
-            MIN_STEP_SIZE, MAX_STEP_SIZE
-        )
+        # The sum over w_k (s_k^2 - 1) is that over w_k s_k^2, as the weights sum to 0.
+        growth = square_sum.mul_(rate / 2.0).exp_()
+        deviation = (state.deviation * growth).clamp_(MIN_STEP_SIZE, MAX_STEP_SIZE)
+        # the deviation is in half ranges, the mean in u
         mean = state.domain.project(
             state.mean + state.half_widths * state.deviation * mean_gradient
         )
@@ -242,6 +242,15 @@ class NES(Policy[NESState]):
 
     def distribution(self, state: NESState) -> Distribution:
         return Distribution(state.mean, state.half_widths * state.deviation)
+
+
+def _check_sigma(sigma: float) -> None:
+    """Raise InputError if the first standard deviation is outside of (0, 2]."""
+    if not 0.0 < sigma <= 2.0:
+        raise InputError(
+            "sigma: expected a number in (0, 2], in units of half the range, got "
+            f"{sigma}"
+        )
 
 
 def _sample_normal(*shape: int) -> Float64Array:
@@ -260,7 +269,7 @@ def _isolate_numpy_random(seed: int, generation: int) -> Iterator[None]:
 
     Args:
         seed: seed of the search.
-        generation: index of the generation; each has random numbers of its own.
+        generation: index of the generation; each has its own random numbers.
     """
     state_before = np.random.get_state()  # noqa: NPY002
     np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
@@ -279,18 +288,18 @@ class CMAESState:
     Attributes:
         domain: domain of the search.
         seed: seed of random numbers.
-        origin: (d,) configuration at x = 0, where the present run began.
+        origin: (d,) configuration at x = 0, where the current run began.
         half_widths: (d,) half of the range of each element of u.
-        is_periodic: (d,) which elements wrap, and so are never out of the domain.
-        strategy: pycma's object after the latest `ask`; never written to again.
-        generation: index of the present generation.
-        points: (n, d) its points, in x.
-        values: objectives of its first points.
-        violations: violations of the same points, mean squared distance from the
-            domain.
-        best: largest objective of the present run.
-        best_run: largest objective of the runs before and the distribution at the end
-            of the run that met it; None in the first run.
+        is_periodic: (d,) which elements wrap, so that they are never out of the domain.
+        strategy: pycma's object after the latest `ask`; it is copied before it is
+            changed.
+        generation: index of the current generation.
+        points: (n, d) points of the generation, in x.
+        values: objectives of those points that were evaluated, the first ones.
+        violations: mean squared distance of the same points from the domain.
+        best: largest objective of the current run.
+        best_run: largest objective of all earlier runs, and the final distribution of
+            the run that reached it; None in the first run.
     """
 
     domain: Domain
@@ -340,35 +349,38 @@ class CMAESState:
     def ask(self) -> CMAESState:
         """Return the state with the points of the next generation, sampled by pycma.
 
-        It changes the strategy, pycma's object, which no other state may hold yet.
+        pycma's object, the strategy, is changed in place. So it must not be shared with
+        another state: it has to be a new one, or the copy that `tell` made.
         """
-        number = self.generation + 1
-        with _isolate_numpy_random(self.seed, number):
+        generation = self.generation + 1
+        with _isolate_numpy_random(self.seed, generation):
             points = np.array(self.strategy.ask())
-        return replace(self, generation=number, points=points, values=(), violations=())
+        return replace(
+            self, generation=generation, points=points, values=(), violations=()
+        )
 
     def tell(self) -> CMAESState:
         """Return the state after passing a complete generation to a copy of pycma.
 
-        A point that could not be evaluated gets an objective below the smallest, by the
-        interquartile range. For a point outside of the domain, its projection was
-        evaluated; it is penalised by its squared distance from the domain.
+        If a point could not be evaluated, its objective is the smallest one minus the
+        interquartile range. If a point is outside of the domain, its projection was
+        evaluated. Its objective is made worse in proportion to its squared distance
+        from the domain: by the interquartile range at a distance of one step size.
         """
         values = np.array(self.values)
-        spread = 0.0
+        interquartile_range = 0.0
         is_finite = np.isfinite(values)
         if is_finite.any():
             lower_quartile, upper_quartile = np.percentile(values[is_finite], (25, 75))
-            spread = float(upper_quartile - lower_quartile)
-            values[~is_finite] = values[is_finite].min() - spread
-        else:  # all equal: nothing is learnt
+            interquartile_range = float(upper_quartile - lower_quartile)
+            values[~is_finite] = values[is_finite].min() - interquartile_range
+        else:  # equal values teach pycma nothing
             values[:] = 0.0
         strategy = copy.deepcopy(self.strategy)
-        # At a distance of one step size the penalty is one interquartile range.
         step_size = max(strategy.sigma, 1e-30)  # avoids a division by 0
-        penalty = spread * np.array(self.violations) / step_size**2
+        penalty = interquartile_range * np.array(self.violations) / step_size**2
         with _isolate_numpy_random(self.seed, self.generation):
-            # pycma minimises
+            # pycma minimizes, so the objective is negated and the penalty added
             strategy.tell(list(self.points), list(penalty - values))
         strategy.sigma = min(strategy.sigma, MAX_STEP_SIZE)
         return replace(self, strategy=strategy)
@@ -377,35 +389,36 @@ class CMAESState:
 @dataclass(frozen=True)
 class CMAES(Policy[CMAESState]):
     """CMA-ES (Hansen and Ostermeier 2001; Hansen 2016, "The CMA evolution strategy: a
-    tutorial") as pycma has it.
+    tutorial") as implemented in pycma.
 
-    Each generation draws points from a normal distribution and moves its mean, its step
-    size and its covariance towards the better half. It needs ranks only, so a noisy or
-    saturated objective does not upset it. A generation that the renders cut short is
-    lost, so it wants at least ten generations.
+    Each generation draws points from a normal distribution, and moves its mean, its
+    step size and its covariance towards the better half. Only ranks are used, so a
+    noisy or saturated objective does little harm. The last generation may be cut short
+    by the number of renders, and is lost then. So a search should have at least ten
+    generations.
 
     A point outside the domain is projected and evaluated there. Its objective is made
     worse by
 
         spread * ||x - P(x)||^2 / (d sigma^2),
 
-    spread the distance between the quartiles of the generation, so that the mean does
-    not drift outside. Angles wrap.
+    where spread is the interquartile range of the generation's objectives, so that the
+    mean does not drift outside. Angles wrap.
 
-    A run whose largest deviation has fallen under a thousandth of half a range has
-    nothing more to find. The next one begins at a sample of the domain with twice the
-    population (Auger and Hansen 2005, "A restart CMA evolution strategy with increasing
-    population size"). The distribution returned is that of the run that met the largest
+    A run ends when its largest standard deviation has fallen to a thousandth of half a
+    range. The next one begins at a sample of the domain with twice the population
+    (Auger and Hansen 2005, "A restart CMA evolution strategy with increasing population
+    size"). The distribution that is returned is that of the run with the largest
     objective.
 
-    pycma's object changes as it goes and draws from numpy's global generator. Here it
-    is copied before every change, and the generator is seeded for it and put back at
-    once, so that states can be replayed and pickled.
+    pycma's object changes in place and draws from numpy's global generator. Here it is
+    copied before every change, and the generator is seeded for it and restored at once,
+    so that states can be replayed and pickled.
 
     Attributes:
-        sigma: first standard deviation in units of half of each number's range (half of
-            what the ball leaves), over 0, at most 2.
-        population: points a generation, at least 2; 0 for 4 + 3 ln d.
+        sigma: first standard deviation, over 0 and at most 2, in units of half of each
+            number's range (in a ball, of the part of it inside the ball).
+        population: number of points of a generation, at least 2; 0 for 4 + 3 ln d.
     """
 
     sigma: float = 0.3
@@ -416,11 +429,7 @@ class CMAES(Policy[CMAESState]):
 
     def __post_init__(self) -> None:
         """Check that all settings are within their limits."""
-        if not 0.0 < self.sigma <= 2.0:
-            raise InputError(
-                "sigma: expected a number in (0, 2], a share of half the "
-                f"range, got {self.sigma}"
-            )
+        _check_sigma(self.sigma)
         if self.population < 0 or self.population == 1:
             raise InputError(
                 "population: expected at least 2, or 0 for the default, "
@@ -435,7 +444,7 @@ class CMAES(Policy[CMAESState]):
         Args:
             domain: domain of the search.
             generator: source of the seed.
-            steps: renders of the search, which are not needed here.
+            steps: renders of the search; not used.
 
         Raises:
             InputError: the domain has more than `MAX_DIM` numbers.
@@ -490,17 +499,18 @@ class CMAES(Policy[CMAESState]):
         has_converged = float(state.stds.max()) <= MIN_STEP_SIZE
         if not has_converged:
             return state.ask()
-        # best objective and distribution of the best run so far
+        # (best objective, final distribution) of the best run so far
         best_run = state.best_run
         if best_run is None or state.best > best_run[0]:
             best_run = (state.best, state.distribution)
-        strategy = self._make_strategy(
-            state.domain.dim, 2 * len(state.points), state.seed
-        )
+        doubled_population = 2 * len(state.points)
+        strategy = self._make_strategy(state.domain.dim, doubled_population, state.seed)
+        # the index of the generation gives each run another origin
         origin = state.domain.sample(seeded(state.seed, state.generation))[0]
-        return replace(
+        new_run = replace(
             state, origin=origin, strategy=strategy, best=-math.inf, best_run=best_run
-        ).ask()
+        )
+        return new_run.ask()
 
     def distribution(self, state: CMAESState) -> Distribution:
         if state.best_run is not None and state.best_run[0] > state.best:

@@ -11,33 +11,34 @@ from torch import Tensor
 
 from advsearch.extend import InputError, Policy, policies
 
-# more numbers are rejected: there would never be enough samples to learn from
+# More numbers are rejected, as there would never be enough samples to learn from.
 MAX_DIM = 50
-WINDOW = 1000  # latest samples that a mixture is fitted to
+WINDOW = 1000  # number of the latest samples that a mixture is fitted to
 ELITE_FRACTION = 0.1
 MIN_ELITE = 10
-"""A mixture is fitted to the samples that failed. If fewer than `MIN_ELITE` did, the
-samples with the largest objectives stand in for them: a tenth of all, `MIN_ELITE` at
-least.
+"""A mixture is fitted to the samples that failed. If fewer than `MIN_ELITE` failed, it
+is also fitted to the samples with the largest objectives: a fraction `ELITE_FRACTION`
+of all samples, but at least `MIN_ELITE`.
 """
 
-N_FIT_ROUNDS = 8
+N_FIT_ROUNDS = 8  # number of steps of expectation maximization
 UNIFORM_STD = 12**-0.5
 PRIOR_COUNT = 3.0
-"""Standard deviation of the uniform distribution on [0, 1], the prior of each element;
-it counts as much as `PRIOR_COUNT` samples of a component, so that an element that does
-not matter stays wide.
+"""The prior of each element is the uniform distribution on [0, 1], whose standard
+deviation is `UNIFORM_STD`. It counts as much as `PRIOR_COUNT` samples of a component,
+so that an element that does not matter stays wide.
 """
 
-UNIFORM_WEIGHT = 0.25  # part of the weights of components that is uniform
+# fraction of the total weight that is divided equally among the components
+UNIFORM_WEIGHT = 0.25
 # standard deviation of a component before the first round of its fit
 INITIAL_STD = 0.5 * UNIFORM_STD
 # limits of the standard deviation of a number, as fractions of its range
 MIN_STD = 0.02
 MAX_STD = 10.0
 DISTINCTIVE_FRACTION = 0.5
-"""A number distinguishes a component if its standard deviation is less than this
-fraction of the uniform one's; an option, if its probability is more than this.
+"""A number is distinctive of a component if its standard deviation is less than this
+fraction of `UNIFORM_STD`. An option is distinctive if its probability exceeds this.
 """
 
 # columns of `MixtureState.log`
@@ -63,14 +64,16 @@ class Ranges:
     is_periodic: Tensor
 
     def find_option(self, x: Tensor, max_options: int) -> Tensor:
-        """Return the index (n, d) of the option that points x (n, d) lie in; 0 for a
-        number.
+        """Return the index (n, d) of the option that each element of x (n, d) means.
+
+        Option i of n is [i / n, (i + 1) / n). The index is 0 for a number.
         """
         return (x * self.n_options).long().clamp(max=max_options - 1)
 
     def compute_offset(self, x: Tensor, mean: Tensor) -> Tensor:
-        """Return the offset of x from a mean; for an angle the shorter way round, in
-        [-0.5, 0.5).
+        """Return the offset of x from a mean.
+
+        For an angle it is that of the shorter direction, in [-0.5, 0.5).
         """
         offset = x - mean
         wrapped_offset = torch.remainder(offset + 0.5, 1.0) - 0.5
@@ -93,13 +96,13 @@ class Components:
 
     A component is a product over the d elements of a point: a normal distribution
     truncated to the element's range, or a categorical distribution if the element is
-    a choice. Each element has the tensors of both; `Ranges.n_options` tells which one
-    holds.
+    a choice. Each element has the tensors of both; it is a choice if `Ranges.n_options`
+    is over 0.
 
     Attributes:
-        weights: (k,) of the components; their sum is 1.
-        means: (k, d) of the normal distributions, in fractions of each range.
-        stds: (k, d) their standard deviations before truncation, likewise.
+        weights: (k,) weights of the components, with the sum 1.
+        means: (k, d) means of the normal distributions, as fractions of each range.
+        stds: (k, d) standard deviations before truncation, as fractions of each range.
         option_probs: (k, d, m) probabilities of options, m the largest number of
             options of an element.
     """
@@ -182,7 +185,7 @@ class Components:
     def maximize(
         self, x: Tensor, weights: Tensor, ranges: Ranges, uniform_probs: Tensor
     ) -> Components:
-        """Return the components after one step of expectation maximisation (EM).
+        """Return the components after one step of expectation maximization (EM).
 
         The fraction `UNIFORM_WEIGHT` of the total weight is divided equally among the
         components, so that none vanishes.
@@ -194,18 +197,20 @@ class Components:
             ranges: kinds of the d elements.
             uniform_probs: (k, d, m) uniform probabilities of options, the prior.
         """
+        # E step: (n, k) probability that a sample comes from a component, weighted
         log_densities = self.compute_log_densities(x, ranges)
-        # probability that a sample comes from a component, times its weight: (n, k)
         responsibility = log_densities.softmax(dim=1) * weights[:, None]
-        counts = responsibility.sum(dim=0)  # (k,) samples of each component
-        # (k, n); clamped, since a component may have no samples at all
+        counts = responsibility.sum(dim=0)  # (k,) number of samples of each component
+        # M step. (k, n) weights of the samples in each component, with the sum 1;
+        # clamped, since a component may have no samples at all.
         sample_weights = (responsibility / counts.clamp(min=1e-12)).T
+        # Means are computed from offsets to the old means, in which angles do not wrap.
         offset = ranges.compute_offset(x[:, None], self.means)  # (n, k, d)
         mean_offset = torch.einsum("kn,nkd->kd", sample_weights, offset)
         squared_residual = (offset - mean_offset).square()
         variance = torch.einsum("kn,nkd->kd", sample_weights, squared_residual)
-        means, stds = self._divide_out_prior(
-            mean_offset, variance, counts[:, None], ranges
+        means, stds = _correct_truncation(
+            self.means + mean_offset, variance, counts[:, None], ranges
         )
         option = ranges.find_option(x, max_options=uniform_probs.shape[2])
         option_probs = _estimate_option_probs(
@@ -216,44 +221,46 @@ class Components:
         new_weights += UNIFORM_WEIGHT / len(fraction)
         return Components(new_weights, means, stds, option_probs)
 
-    def _divide_out_prior(
-        self, mean_offset: Tensor, variance: Tensor, counts: Tensor, ranges: Ranges
-    ) -> tuple[Tensor, Tensor]:
-        """Estimate normal distributions from samples that are truncated to [0, 1].
 
-        A truncated normal density is a normal density times the uniform one. If the
-        uniform density is replaced by a normal one of equal mean (1/2) and variance,
-        precisions (1 / variance) add up. So the precision of the uniform density is
-        subtracted from that of the samples, and the mean is corrected in the same way.
-        The mean of an angle is not corrected, as angles wrap and are not truncated.
+def _correct_truncation(
+    sample_means: Tensor, variance: Tensor, counts: Tensor, ranges: Ranges
+) -> tuple[Tensor, Tensor]:
+    """Estimate normal distributions from samples that are truncated to [0, 1].
 
-        Args:
-            mean_offset: (k, d) means of the samples minus the old means.
-            variance: (k, d) variances of the samples.
-            counts: (k, 1) number of samples of each component.
-            ranges: kinds of the d elements.
+    The density of the samples is a normal density times the uniform one on [0, 1]. The
+    uniform one is approximated by a normal density with its mean (1/2) and variance. In
+    a product of normal densities, precisions (1 / variance) add up, and so do means
+    times precisions. So the contribution of the uniform density is subtracted from
+    both. The mean of an angle is not corrected, as angles wrap and are not truncated.
 
-        Returns:
-            Means and standard deviations, (k, d) each.
-        """
-        # The variance is averaged with that of the uniform density, the prior. It stays
-        # below that, so that the difference of precisions is positive.
-        shrunk_variance = (
-            (counts * variance + PRIOR_COUNT * UNIFORM_STD**2) / (counts + PRIOR_COUNT)
-        ).clamp(max=0.999 * UNIFORM_STD**2)
-        # of a product of normal densities, precisions (1 / variance) add up
-        precision = 1.0 / shrunk_variance - 1.0 / UNIFORM_STD**2
-        stds = (1.0 / precision).sqrt().clamp(MIN_STD, MAX_STD)
-        sample_means = self.means + mean_offset
-        corrected_means = stds.square() * (
-            sample_means / shrunk_variance - 0.5 / UNIFORM_STD**2
-        )
-        means = torch.where(
-            ranges.is_periodic,
-            torch.remainder(sample_means, 1.0),
-            corrected_means.clamp(0.0, 1.0),
-        )
-        return means, stds
+    Args:
+        sample_means: (k, d) means of the samples.
+        variance: (k, d) variances of the samples.
+        counts: (k, 1) number of samples of each component.
+        ranges: kinds of the d elements.
+
+    Returns:
+        Means and standard deviations before truncation, (k, d) each.
+    """
+    uniform_mean = 0.5
+    uniform_variance = UNIFORM_STD**2
+    # The variance is averaged with that of the prior, which is uniform.
+    pooled_variance = (counts * variance + PRIOR_COUNT * uniform_variance) / (
+        counts + PRIOR_COUNT
+    )
+    # It has to be below that of the prior, so that `precision` is positive.
+    pooled_variance = pooled_variance.clamp(max=0.999 * uniform_variance)
+    precision = 1.0 / pooled_variance - 1.0 / uniform_variance
+    stds = (1.0 / precision).sqrt().clamp(MIN_STD, MAX_STD)
+    corrected_means = stds.square() * (
+        sample_means / pooled_variance - uniform_mean / uniform_variance
+    )
+    means = torch.where(
+        ranges.is_periodic,
+        torch.remainder(sample_means, 1.0),
+        corrected_means.clamp(0.0, 1.0),
+    )
+    return means, stds
 
 
 def _estimate_option_probs(
@@ -284,20 +291,21 @@ def _estimate_option_probs(
 class MixtureState:
     """State of the search.
 
-    Points are in fractions of each range.
+    The values of a point are fractions of each range.
 
     Attributes:
         domain: domain of the search.
         seed: seed of its random numbers.
         ranges: ranges of the elements of u.
-        generation: index of the present generation.
-        mixtures: mixtures of the generations in the window; None of a uniform one.
-        points: (n, d) samples of the present generation.
-        evaluated_points: (m, d) the latest `WINDOW` samples that were evaluated.
-        log: (t, 5) float64, of all samples: objective, failed, unknown (no objective
-            could be computed), importance weight and largest weight that it could have
-            had; see `estimate_failure_rate`.
-        n_evaluated: samples of the present generation that were evaluated.
+        generation: index of the current generation.
+        mixtures: mixture of each generation in the window, the current one last; None
+            for a generation of uniform samples.
+        points: (n, d) samples of the current generation.
+        evaluated_points: (m, d) the latest evaluated samples, about `WINDOW` of them.
+        log: (t, 5) float64, a row for each evaluated sample: objective; failed; unknown
+            (no objective could be computed); importance weight; and the largest
+            importance weight that it could have had (see `estimate_failure_rate`).
+        n_evaluated: number of samples of the current generation that were evaluated.
     """
 
     domain: policies.Domain
@@ -310,6 +318,11 @@ class MixtureState:
     log: Tensor
     n_evaluated: int = 0
 
+    @property
+    def window_log(self) -> Tensor:
+        """(m, 5) rows of `log` that belong to `evaluated_points`, the latest ones."""
+        return self.log[len(self.log) - len(self.evaluated_points) :]
+
     def to_configuration(self, x: Tensor) -> Tensor:
         """Return the configuration (d,) of x, which is in fractions of each range."""
         width = self.domain.upper - self.domain.lower
@@ -320,7 +333,7 @@ class MixtureState:
     ) -> dict[int, tuple[float, float]]:
         """Return the ranges (low, high) that distinguish component k, by index in u.
 
-        They describe the failures that a component stands for. The range of a number
+        They describe the failures that a component represents. The range of a number
         extends two standard deviations below and above the mean; that of a choice is
         its most probable option. An element whose distribution is nearly uniform is
         left out.
@@ -353,9 +366,14 @@ class MixtureState:
     def _option_bounds(
         probabilities: Tensor, n_options: int
     ) -> tuple[float, float] | None:
-        """Return the range of the most probable option; None if it is not distinct."""
+        """Return the range of the most probable option, or None if it is not probable
+        enough to be distinctive.
+
+        Option i of n is [i / n, (i + 1) / n), in fractions of the full range.
+        """
         option = int(probabilities.argmax())
-        if not float(probabilities[option]) > DISTINCTIVE_FRACTION:
+        is_distinctive = float(probabilities[option]) > DISTINCTIVE_FRACTION
+        if not is_distinctive:
             return None
         return option / n_options, (option + 1) / n_options
 
@@ -383,22 +401,25 @@ class Mixture(Policy[MixtureState]):
     with a mixture, as in the population Monte Carlo of Cappe, Douc, Guillin, Marin and
     Robert 2008, "Adaptive importance sampling in general mixture classes".
 
-    Each generation is drawn from a mixture of as many products of normal distributions,
-    cut to the ranges, and of probabilities of options, with a share that is drawn
-    evenly whatever was learnt (Hesterberg 1995, "Weighted average importance sampling
-    and defensive mixture distributions"). The first is even. The next is fitted by
-    expectation and maximisation to the draws that failed (as long as these are few, to
-    those with the largest objectives), weighed by the even density over the mean
-    density that they came from (the balance heuristic of Veach and Guibas 1995).
+    Each generation is sampled from a mixture. Its components are products of truncated
+    normal distributions and of probabilities of options. A fraction of the samples is
+    uniform, whatever was learned (Hesterberg 1995, "Weighted average importance
+    sampling and defensive mixture distributions"). The first generation is all uniform.
+    Each next mixture is fitted by expectation maximization to the samples that failed;
+    as long as these are few, to those with the largest objectives. A sample is weighted
+    by the uniform density divided by the mean density of the mixtures (the balance
+    heuristic of Veach and Guibas 1995).
 
-    Its result is a failure for each component, and with the share of all configurations
-    that fail: see `estimate_failure_rate`. That share is of single renders with the
-    search's samples. In an l2 ball no share is told.
+    Its result is a failure for each component, and an estimate of the fraction of all
+    configurations that fail (`estimate_failure_rate`). It counts failures in single
+    renders with the samples per pixel of the search. With an l2 ball there is no
+    estimate.
 
     Attributes:
-        components: components of the mixture, 1 to 20.
-        even: share of the draws that is even, 0.05 to 1; weights are 1 / even at most.
-        population: draws a generation, at least 2.
+        components: number of components of the mixture, 1 to 20.
+        even: fraction of the samples that is uniform, 0.05 to 1. Importance weights are
+            at most 1 / `even`.
+        population: number of samples of a generation, at least 2.
     """
 
     components: int = 4
@@ -418,8 +439,8 @@ class Mixture(Policy[MixtureState]):
             )
         if not 0.05 <= self.even <= 1.0:
             raise InputError(
-                "even: expected a number in [0.05, 1], a share of the "
-                f"draws, got {self.even}"
+                "even: expected a number in [0.05, 1], the fraction of samples that is "
+                f"uniform, got {self.even}"
             )
         if self.population < 2:
             raise InputError(f"population: expected at least 2, got {self.population}")
@@ -432,7 +453,7 @@ class Mixture(Policy[MixtureState]):
         Args:
             domain: domain of the search.
             generator: source of the seed.
-            steps: renders of the search, which are not needed here.
+            steps: renders of the search; not used.
 
         Raises:
             InputError: the domain has more than `MAX_DIM` numbers.
@@ -471,13 +492,16 @@ class Mixture(Policy[MixtureState]):
         The importance weight of a sample is the uniform density divided by the density
         from which it was drawn.
         """
+        # Samples are proposed and evaluated in order, so these are the next ones.
         points = state.points[state.n_evaluated :][: len(evaluated)]
-        mixture = state.mixtures[-1]
+        mixture = state.mixtures[-1]  # that of the current generation
         with policies.limit_to_single_thread():
             weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
-        # The fraction `even` of samples is uniform, so the density is at least `even`.
+        # Without a mixture the density is 1. With one, the fraction `even` of samples
+        # is uniform, so that the density is at least `even`.
         max_weight = 1.0 if mixture is None else 1.0 / self.even
-        # in the order of the columns of `log`
+        # A success of the search is a failure of the model, the column "failed". The
+        # values are in the order of the columns of `log`.
         rows = [
             (
                 evaluation.objective,
@@ -502,8 +526,9 @@ class Mixture(Policy[MixtureState]):
     def failures(self, state: MixtureState) -> policies.Failures:
         """Return the worst failure of each component, and the estimated failure rate.
 
-        With an l2 ball no rate is estimated: points are projected onto the ball, so
-        that they are not uniform in it.
+        The mixture has no cells, so samples are counted instead. With an l2 ball no
+        rate is estimated: points are projected onto the ball, so that they are not
+        uniform in it.
         """
         has_failed = state.log[:, FAILED_COLUMN] > 0
         is_unknown = state.log[:, UNKNOWN_COLUMN] > 0
@@ -531,14 +556,15 @@ class Mixture(Policy[MixtureState]):
         A component without failures is left out. Only samples in the window, the latest
         ones, are used. Before the first mixture all samples form one component.
         """
-        log = state.log[-len(state.evaluated_points) :]
+        log = state.window_log
         mixture = state.mixtures[-1]
         is_failure = log[:, FAILED_COLUMN].bool() & ~log[:, UNKNOWN_COLUMN].bool()
         points = state.evaluated_points[is_failure]
         objectives = log[is_failure, OBJECTIVE_COLUMN]
         if not len(points):
             return ()
-        component_of_point = torch.zeros(len(points))
+        # index of the component that each point most likely comes from
+        component_of_point = torch.zeros(len(points), dtype=torch.long)
         if mixture is not None:
             log_densities = mixture.compute_log_densities(points, state.ranges)
             component_of_point = log_densities.argmax(dim=1)
@@ -585,16 +611,17 @@ class Mixture(Policy[MixtureState]):
                 stays_uniform = float(torch.rand(1, generator=rng)) < self.even
                 if not stays_uniform:
                     points[row] = mixture.sample(rng, state.ranges)
-        # The window has whole generations: at least one, and the one that begins here.
+        # The window consists of complete generations. Their samples are stored, and
+        # their mixtures besides that of the generation that begins here.
         n_past_generations = max(1, WINDOW // self.population)
-        window = n_past_generations * self.population
-        n_generations = n_past_generations + 1
+        n_past_points = n_past_generations * self.population
+        n_mixtures = n_past_generations + 1
         return replace(
             state,
             generation=generation,
             points=points,
-            mixtures=(*state.mixtures, mixture)[-n_generations:],
-            evaluated_points=state.evaluated_points[-window:],
+            mixtures=(*state.mixtures, mixture)[-n_mixtures:],
+            evaluated_points=state.evaluated_points[-n_past_points:],
             n_evaluated=0,
         )
 
@@ -629,7 +656,7 @@ class Mixture(Policy[MixtureState]):
         generations in the window. The components begin at failures that differ most
         from each other. The result is None if nothing could be evaluated.
         """
-        log = state.log[-len(state.evaluated_points) :]
+        log = state.window_log
         ranges = state.ranges
         is_elite = self._find_elite(log)
         points = state.evaluated_points[is_elite]
@@ -639,9 +666,11 @@ class Mixture(Policy[MixtureState]):
             densities = [
                 self._density(mixture, points, ranges) for mixture in state.mixtures
             ]
+            # The logged weights are those of a sample's own generation. Here the mean
+            # density of all generations is used instead.
             weights = 1.0 / torch.stack(densities).mean(dim=0)
-            # Their sum becomes the effective sample size (sum w)^2 / sum w^2, which the
-            # prior, of `PRIOR_COUNT` samples, is set against.
+            # Scaled so that their sum is the effective sample size, (sum w)^2 / sum
+            # w^2. It is compared with the `PRIOR_COUNT` samples of the prior.
             weights *= weights.sum() / weights.square().sum()
             center_index = policies.select_diverse(
                 points,

@@ -1,7 +1,7 @@
-"""Ascents along gradients: projected gradient ascent with momentum, and Adam with
-projection. A gradient through a renderer has at times no useful variance, so outliers
-are cut to what is usual (Zhang et al. 2020, Why are adaptive methods good for attention
-models?), at the price of a bias.
+"""Gradient ascents: projected gradient ascent with momentum (`PGD`), and Adam with
+projection. The variance of a gradient through a renderer may be very large, so outliers
+are clipped (Zhang et al. 2020, "Why are adaptive methods good for attention models?").
+This introduces a bias.
 """
 
 from __future__ import annotations
@@ -26,14 +26,16 @@ from advsearch.attacks.evaluation import (
 )
 from advsearch.errors import InputError
 
-# An outlier is larger than this many medians: of the elements of an l-infinity block,
-# and of the lengths of the latest gradients.
+# An element of an l-infinity block is an outlier if it exceeds this many medians of the
+# elements. A gradient is too long if it exceeds this many medians of the latest
+# lengths.
 CLIP = 3.0
-MEMORY = 15  # latest gradients whose lengths have the median
-# the same for elements of an l2 block, whose true gradient may be uneven and whose
-# direction must be preserved
+MEMORY = 15  # number of the latest gradients whose lengths are compared
+# The same as `CLIP` for the elements of an l2 block. It is larger, because the true
+# gradient may be uneven and its direction must be preserved.
 CLIP_L2 = 10.0
-MIN_CLIPPED_SIZE = 8  # smaller blocks have no meaningful median
+# smallest block whose elements are clipped: fewer elements have no meaningful median
+MIN_CLIPPED_SIZE = 8
 
 
 def clip_gradient(
@@ -47,8 +49,8 @@ def clip_gradient(
       of gradients but no single step. In an l2 ball it is `CLIP_L2`.
     - Then a gradient that is longer than `CLIP` times the median of the last `MEMORY`
       lengths, this one included, is scaled down to that length.
-    - If the domain is `exact` or `draws_conditions`, renders have no noise, and nothing
-      is clipped.
+    - If the domain is `exact` or `draws_conditions`, images are predicted and not
+      rendered. So gradients have no noise, and nothing is clipped.
 
     Args:
         domain: domain of the gradient.
@@ -74,7 +76,8 @@ def clip_gradient(
     # of an even number, the larger of the two in the middle
     median_length = sorted(lengths)[len(lengths) // 2]
     max_length = CLIP * median_length
-    is_too_long = length > max_length > 0.0
+    # with a median of 0 there is no usual length to compare with
+    is_too_long = length > max_length and max_length > 0.0
     if is_too_long:
         clipped_gradient = clipped_gradient * (max_length / length)
     counts = Counts(cut=int(has_outliers), shortened=int(is_too_long))
@@ -95,29 +98,31 @@ def _find_element_limit(block: Block, gradient: Tensor) -> float:
     return n_medians * float(magnitudes[magnitudes > 0].median())
 
 
+# The steps of a search are divided into windows. At the end of a window, the
+# checkpoint, the step size may be halved.
+
 FIRST_WINDOW = 0.22
 WINDOW_DECREASE = 0.03
 MIN_WINDOW_FRACTION = 0.06
-"""Length of the first window, how much each next one is shorter, and the shortest, as
-fractions of the steps.
+"""Length of the first window, its decrease from one window to the next, and its lower
+limit, as fractions of the steps.
 """
 
-# no window is shorter than this: two noisy values say nothing about a trend
+# Lower limit of the length of a window, in steps: two noisy values do not show a trend.
 MIN_WINDOW = 3
-# fraction of a window's steps that must improve the objective to keep the step size
-# (Auto-PGD's rho)
+# Fraction of a window's steps that must improve the objective. Otherwise the step size
+# is halved (Auto-PGD's rho).
 MIN_IMPROVING_FRACTION = 0.75
-# what is left of the step size at the end of a search without noise, as a fraction of
-# the first
+# final step size of a search without noise, as a fraction of the first
 FINAL_STEP_FRACTION = 0.05
-# the same as `MIN_WINDOW` without noise, where all windows have the shortest length
+# `MIN_WINDOW` of a search without noise, in which all windows are equally long
 MIN_WINDOW_EXACT = 5
-# without noise, what a window must add to the best of the one before, as a fraction of
-# all that was gained
+# Without noise, the best objective of a window must exceed that of the window before by
+# this fraction of the gain of the whole search.
 MIN_WINDOW_GAIN = 1e-3
-# windows in a row that add less, after which there is nothing to gain
+# The search ends after this many windows in a row that gain less.
 MAX_IDLE_WINDOWS = 3
-# evaluations in a row without any gradient after which there is nothing to follow
+# The search ends after this many gradients of zero in a row.
 MAX_FLAT_GRADIENTS = 5
 
 
@@ -140,13 +145,13 @@ class StepWindow:
     """The evaluations between two checkpoints, at which the step size may be halved.
 
     Attributes:
-        length: number of evaluations until the next checkpoint.
-        values: objectives since the last checkpoint.
-        previous: the objective before these; NaN at the start.
-        n_improved: how many of them exceed the one before.
-        reference_best: the best objective of the search at the last checkpoint; in a
-            domain without noise, that of the window before it alone.
-        was_halved: whether the step size was halved at the last checkpoint.
+        length: number of evaluations of the window.
+        values: objectives of the evaluations so far.
+        previous: objective of the evaluation before the window; NaN at the start.
+        n_improved: number of evaluations whose objective exceeds the one before.
+        reference_best: best objective of the search when the window began. In a domain
+            without noise, best objective of the window before.
+        was_halved: whether the step size was halved when the window began.
     """
 
     length: int
@@ -164,9 +169,10 @@ class StepWindow:
     def stalled(self, best: float) -> bool:
         """Return whether the step size should be halved (Auto-PGD, conditions 1 and 2).
 
-        It should if too few steps of this window improved the objective; or if the best
-        objective has not grown since the last checkpoint, although the step size was
-        not halved there.
+        1. Too few steps of this window improved the objective.
+        2. The best objective of the search has not grown in this window, and the step
+           size was not halved just before it. (After halving, the search gets a window
+           of time to improve.)
 
         Args:
             best: largest objective of the search so far.
@@ -193,24 +199,22 @@ class StepWindow:
 
         Args:
             steps: evaluations of the search.
-            best: objective of the search so far.
-            halved: whether the step size is halved between the two.
+            best: best objective of the search so far.
+            halved: whether the step size is halved between the two windows.
         """
-        # Shorter than this one by a fixed fraction of the steps; the first two are
-        # lower limits.
-        length = max(
-            MIN_WINDOW,
-            round(MIN_WINDOW_FRACTION * steps),
-            self.length - max(1, round(WINDOW_DECREASE * steps)),
-        )
+        decrease = max(1, round(WINDOW_DECREASE * steps))
+        min_length = max(MIN_WINDOW, round(MIN_WINDOW_FRACTION * steps))
         return StepWindow(
-            length,
-            previous=self.values[-1],
+            length=max(min_length, self.length - decrease),
+            previous=self.values[
+                -1
+            ],  # the first of the next window is compared with it
             reference_best=best,
             was_halved=halved,
         )
 
 
+# `Ascent.mean_square` before the first gradient; it broadcasts to (d,)
 NO_SQUARES = torch.zeros(())
 
 
@@ -220,23 +224,22 @@ class Ascent:
 
     Attributes:
         domain: domain of the search.
-        steps: evaluations that are planned.
+        steps: planned number of evaluations.
         seed: seed of random numbers.
-        u: (d,) to propose next.
-        direction: (d,) accumulated gradient; of Adam, the mean of gradients.
-        step_size: before it is decayed, in units of each block's radius.
-        mean_square: (d,) of Adam, the mean of squared gradients.
+        u: (d,) configuration to propose next.
+        direction: (d,) accumulated gradient; for Adam, the mean of gradients.
+        step_size: step size before it is decayed, in units of each block's radius.
+        mean_square: (d,) for Adam, the mean of squared gradients.
         peak: the best evaluation; None as long as none is finite.
-        count: evaluations so far.
-        n_updates: gradients that were accumulated.
-        n_flat: gradients of zero in a row.
+        count: number of evaluations so far.
+        n_updates: number of gradients that were accumulated.
+        n_flat: number of gradients of zero in a row.
         lengths: lengths of the latest gradients, see `clip_gradient`.
-        counts: outliers and rejected steps.
-        window: window of PGD, the present window.
-        start_objective: start objective of PGD, the objective of its first evaluation;
-            NaN before it.
-        n_idle_windows: number of idle windows of PGD without noise, windows in a row
-            that added nothing.
+        counts: numbers of outliers and of rejected steps.
+        window: for PGD, the current window.
+        start_objective: for PGD, objective of the first evaluation; NaN before it.
+        n_idle_windows: for PGD without noise, number of windows in a row that gained
+            too little.
     """
 
     domain: Domain
@@ -257,8 +260,10 @@ class Ascent:
     n_idle_windows: int = 0
 
     def decay_step_size(self, number: int) -> float:
-        """Return the step size of evaluation `number` if it falls linearly over the
-        planned ones, down to `FINAL_STEP_FRACTION`.
+        """Return the step size of evaluation `number`, which falls linearly.
+
+        It reaches the fraction `FINAL_STEP_FRACTION` of the first one at the end of the
+        planned evaluations.
         """
         return self.step_size * max(FINAL_STEP_FRACTION, 1.0 - number / self.steps)
 
@@ -271,21 +276,22 @@ class AscentPolicy(Policy[Ascent]):
     def propose(self, state: Ascent, n: int) -> tuple[tuple[Proposal, ...], Ascent]:
         """Propose the next configuration, alone and with its gradient.
 
-        There is none after too many gradients of zero, or windows that added nothing.
+        There is none after too many gradients of zero, or windows without a gain.
         """
-        if (
-            state.n_flat >= MAX_FLAT_GRADIENTS
-            or state.n_idle_windows >= MAX_IDLE_WINDOWS
-        ):
+        has_no_gradient = state.n_flat >= MAX_FLAT_GRADIENTS
+        has_no_gain = state.n_idle_windows >= MAX_IDLE_WINDOWS
+        if has_no_gradient or has_no_gain:
             return (), state
-        return (Proposal(state.u, gradient=True, step_size=self.pace(state)),), state
+        # The search logs the step size; it does not move u.
+        proposal = Proposal(state.u, gradient=True, step_size=self.pace(state))
+        return (proposal,), state
 
     def update(self, state: Ascent, evaluated: Evaluated) -> Ascent:
         """Accumulate the gradient, store the best evaluation so far, and take a step.
 
-        If the objective could not be computed, the search goes back (`retreat`) with
-        half the step size. Without a gradient, e.g. when the renders do not suffice for
-        it, the step follows the accumulated one.
+        If the objective could not be computed, the step is rejected: the search goes
+        back (`retreat`) with half the step size. Without a gradient, e.g. when the
+        renders do not suffice for it, the step follows the accumulated one.
 
         Args:
             state: state of the ascent.
@@ -301,6 +307,7 @@ class AscentPolicy(Policy[Ascent]):
         if evaluation.gradient is not None:
             state = self._accumulate(state, evaluation.gradient)
         if state.peak is None or evaluation.objective > state.peak.objective:
+            # the direction includes the gradient at u already
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
         return self.step(state, u, evaluation.objective)
 
@@ -310,10 +317,10 @@ class AscentPolicy(Policy[Ascent]):
         A gradient of zero ("flat") is not accumulated; such gradients are counted as
         long as they follow each other.
         """
-        clipped_gradient, lengths, outliers = clip_gradient(
+        clipped_gradient, lengths, outlier_counts = clip_gradient(
             state.domain, gradient, state.lengths
         )
-        state = replace(state, lengths=lengths, counts=state.counts + outliers)
+        state = replace(state, lengths=lengths, counts=state.counts + outlier_counts)
         if not bool(clipped_gradient.any()):
             return replace(state, n_flat=state.n_flat + 1)
         return replace(
@@ -331,21 +338,33 @@ class AscentPolicy(Policy[Ascent]):
 
     @abstractmethod
     def retreat(self, state: Ascent) -> Ascent:
-        """Return the state after an objective that could not be computed; the step size
-        is halved already.
+        """Return the state after an objective could not be computed.
+
+        The step size of `state` is halved already.
         """
 
     @abstractmethod
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
-        """Return the state with a gradient (d,), not all zero, among those
-        accumulated.
-        """
+        """Return the state after accumulating a gradient (d,), which is not all zero."""
 
     @abstractmethod
     def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
-        """Return the state with the next configuration, after u with its objective."""
+        """Return the state with the next configuration to propose.
+
+        Args:
+            state: state of the ascent.
+            u: (d,) the configuration that was evaluated.
+            objective: its objective.
+        """
 
     def make_range_error(self, field: str, expected: str, example: float) -> InputError:
+        """Return the error for a field whose value is out of range.
+
+        Args:
+            field: name of the field.
+            expected: the range, e.g. "[0, 1)".
+            example: a value to try.
+        """
         return InputError(
             f"{field}: expected a number in {expected}, got "
             f"{getattr(self, field)}; try {example}"
@@ -369,30 +388,32 @@ class PGD(AscentPolicy):
 
     The step size is halved at checkpoints when the objective stalls, by the two
     conditions of Auto-PGD (Croce and Hein 2020, section 3.1; see `StepWindow.stalled`).
-    There we depart from Auto-PGD: it always goes on from the best configuration after
-    halving; a noisy best is often only a lucky one, so we go back only if the last
-    window lags behind it by two of the window's standard deviations.
+    One thing differs from Auto-PGD, which always continues from the best configuration
+    after halving. With noise the best is often only a lucky one. So the search returns
+    to it only if the last window lags behind it by two standard deviations of the
+    window.
 
     In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size
-    falls in a line over the planned steps, which came farther than Auto-PGD's rule at
-    every budget that was tried (docs/policies/pgd.md). It is halved besides after a
-    window that added less than `MIN_WINDOW_GAIN` of what the search has gained; after
-    `MAX_IDLE_WINDOWS` of these in a row there is nothing more to propose. Where
-    evaluations sample conditions (`Domain.draws_conditions`) the step size falls
-    likewise, and windows are ignored: what one gained depends on its conditions.
+    falls linearly over the planned steps. This reached larger objectives than
+    Auto-PGD's rule at every budget that was tried (docs/policies/pgd.md). In addition
+    it is halved after a window that gained less than `MIN_WINDOW_GAIN` of the gain of
+    the search. After `MAX_IDLE_WINDOWS` of these in a row there is nothing more to
+    propose. If evaluations sample conditions (`Domain.draws_conditions`), the step size
+    falls linearly as well, but windows are not used: their gain depends on the
+    conditions.
 
-    An evaluation with the objective -inf sends the search back to its best
-    configuration, which is evaluated again and left with half the step size. A gradient
-    of zero leaves the accumulated one in charge; if that is zero too, the step goes in
-    a random direction; and after `MAX_FLAT_GRADIENTS` zero gradients in a row there is
-    nothing more to propose.
+    After an objective of -inf the search returns to its best configuration, evaluates
+    it again, and continues with half the step size. After a gradient of zero the step
+    follows the accumulated gradient; if that is zero too, the step has a random
+    direction. After `MAX_FLAT_GRADIENTS` zero gradients in a row there is nothing more
+    to propose.
 
     Attributes:
-        step_size: the first step in units of each block's radius (epsilon; half the
-            diagonal for a box), over 0, at most 2.
-        momentum: weight of the past, in [0, 1).
-        random_start: start from a uniform sample of the domain, not from where it
-            begins.
+        step_size: length of the first step, over 0 and at most 2, in units of each
+            block's radius (epsilon; half the diagonal for a box).
+        momentum: weight of the accumulated gradient, in [0, 1).
+        random_start: whether to start from a random sample of the domain, and not at
+            its initial point.
     """
 
     step_size: float = 0.5
@@ -405,10 +426,10 @@ class PGD(AscentPolicy):
         """Check that all settings are within their limits."""
         if not 0.0 < self.step_size <= 2.0:
             raise self.make_range_error(
-                "step_size", "(0, 2], a fraction of epsilon", 0.5
+                "step_size", "(0, 2], a fraction of epsilon", example=0.5
             )
         if not 0.0 <= self.momentum < 1.0:
-            raise self.make_range_error("momentum", "[0, 1)", 0.5)
+            raise self.make_range_error("momentum", "[0, 1)", example=0.5)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         """Start at the initial point, or at a random sample if `random_start` is set.
@@ -446,15 +467,17 @@ class PGD(AscentPolicy):
         return state.step_size
 
     def retreat(self, state: Ascent) -> Ascent:
-        """Go back to the best configuration, or else try a random step from the start
-        (a direction of zero means a random one).
+        """Go back to the best configuration, and propose it again.
+
+        Without one, as no objective could be computed so far, a random step is taken
+        from the initial point.
         """
-        if state.peak is None:
-            return self._move_uphill(
-                replace(state, direction=torch.zeros_like(state.u)),
-                state.domain.initial_point,
-            )
-        return replace(state, u=state.peak.u, direction=state.peak.direction)
+        peak = state.peak
+        if peak is not None:
+            return replace(state, u=peak.u, direction=peak.direction)
+        # `_move_uphill` moves at random if the direction is zero
+        without_direction = replace(state, direction=torch.zeros_like(state.u))
+        return self._move_uphill(without_direction, state.domain.initial_point)
 
     def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
         """Add a gradient, scaled to mean magnitude 1, to the decayed earlier ones."""
@@ -473,12 +496,14 @@ class PGD(AscentPolicy):
         If every evaluation draws other conditions, objectives can't be compared, so
         that there are no windows.
         """
-        if math.isnan(state.start_objective):
+        is_first = math.isnan(state.start_objective)
+        if is_first:
             state = replace(state, start_objective=objective)
         if state.domain.draws_conditions:
             return self._move_uphill(state, u)
         window = state.window.add(objective)
-        if len(window.values) < window.length:
+        is_complete = len(window.values) >= window.length
+        if not is_complete:
             return self._move_uphill(replace(state, window=window), u)
         if state.domain.exact:
             return self._move_uphill(self._end_exact_window(state, window), u)
@@ -488,13 +513,17 @@ class PGD(AscentPolicy):
         """End a window of a search without noise, and start one of equal length.
 
         The step size is halved if the best objective of the window is not clearly above
-        that of the window before. It is not compared with the best of the search: that
-        may have been predicted by another light transport matrix.
+        that of the window before: the gain must exceed a fraction (`MIN_WINDOW_GAIN`)
+        of the gain since the first evaluation.
+
+        The window is not compared with the best objective of the search. During a
+        search the matrix that predicts the images may be renewed, and the best may have
+        been predicted by an earlier one, with another error.
         """
         best = max(window.values)
         gain = best - window.reference_best
-        gain_of_search = best - state.start_objective
-        is_idle = gain <= MIN_WINDOW_GAIN * gain_of_search
+        gain_since_start = best - state.start_objective
+        is_idle = gain <= MIN_WINDOW_GAIN * gain_since_start
         if is_idle:
             step_size = state.step_size / 2
             n_idle_windows = state.n_idle_windows + 1
@@ -512,9 +541,9 @@ class PGD(AscentPolicy):
         """End a window of a noisy search, and take a step.
 
         If the objective stalled in the window, the step size is halved. If the window
-        also lags behind the best evaluation of the search (the peak), the step starts
-        at the peak, with the direction that was accumulated there. The steps since the
-        peak are then counted as one rejected step.
+        also lags behind the best evaluation of the search (the peak), the search goes
+        back: the step starts at the peak, with the direction that was accumulated
+        there. This is counted as one rejected step.
 
         Args:
             state: state of the ascent.
@@ -533,7 +562,7 @@ class PGD(AscentPolicy):
                 direction=peak.direction,
                 counts=state.counts + Counts(rejected=1),
             )
-        next_window = window.next(state.steps, best, is_stalled)
+        next_window = window.next(state.steps, best, halved=is_stalled)
         return self._move_uphill(replace(state, window=next_window), u)
 
     def _move_uphill(self, state: Ascent, u: Tensor) -> Ascent:
@@ -554,22 +583,22 @@ class Adam(AscentPolicy):
         u <- P(u + rate * scale * m' / (sqrt(v') + tiny))
         m' = m / (1 - beta1^t),   v' = v / (1 - beta2^t)
 
-    `scale` is half of each number's range (half of what a ball leaves), so a step means
-    the same in every block. The rate falls in a line from `step_size` to a twentieth of
-    it over the planned evaluations. We depart from the paper in beta2, 0.9 by default,
-    since a search has tens of steps and not thousands; and in an l2 ball g^2 is the
-    mean over the block, since there the best step for a constant gradient is along it
-    and not along its signs.
+    `scale` is half of each number's range (in a ball, of the part of it inside the
+    ball), so that a step means the same in every block. The rate falls linearly from
+    `step_size` to a twentieth of it over the planned evaluations. Two things differ
+    from the paper. beta2 is 0.9 by default, since a search has tens of steps and not
+    thousands. In an l2 ball g^2 is the mean over the block, since there the best step
+    for a constant gradient is along the gradient and not along its signs.
 
-    g is clipped first (see `pgd.clip_gradient`). An evaluation without a gradient goes
-    on along m. One whose objective could not be computed sends the search back to its
-    best configuration, with m = v = 0 and half the rate. While there is no gradient but
-    zero the step is random; after five zero gradients in a row there is nothing more to
-    propose.
+    g is clipped first (see `pgd.clip_gradient`). After an evaluation without a
+    gradient, the step follows m. After an objective that could not be computed, the
+    search returns to its best configuration, with m = v = 0 and half the rate. As long
+    as all gradients are zero, steps are random; after five of these in a row there is
+    nothing more to propose.
 
     Attributes:
         step_size: the first rate, over 0, at most 2.
-        beta1, beta2: beta1 and beta2 in [0, 1).
+        beta1, beta2: decay of the means of gradients and of their squares, in [0, 1).
     """
 
     step_size: float = 0.3
@@ -582,11 +611,11 @@ class Adam(AscentPolicy):
         """Check that all settings are within their limits."""
         if not 0.0 < self.step_size <= 2.0:
             raise self.make_range_error(
-                "step_size", "(0, 2], a share of half the range", 0.3
+                "step_size", "(0, 2], in units of half the range", example=0.3
             )
         for beta in ("beta1", "beta2"):
             if not 0.0 <= getattr(self, beta) < 1.0:
-                raise self.make_range_error(beta, "[0, 1)", 0.9)
+                raise self.make_range_error(beta, "[0, 1)", example=0.9)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Ascent:
         """Start at the domain's initial point, with means of zero."""
@@ -614,7 +643,7 @@ class Adam(AscentPolicy):
             state,
             u=u,
             direction=torch.zeros_like(u),
-            mean_square=NO_SQUARES,
+            mean_square=NO_SQUARES,  # broadcast to (d,) with the next gradient
             n_updates=0,
         )
 
@@ -644,15 +673,16 @@ class Adam(AscentPolicy):
             u: (d,) the latest configuration.
             objective: its objective, which Adam does not use.
         """
-        if state.n_updates:
-            # m' / sqrt(v'), without the bias of means that began at zero
+        has_gradient = state.n_updates > 0
+        if has_gradient:
+            # m' and v', without the bias of means that began at zero
             mean = state.direction / (1.0 - self.beta1**state.n_updates)
             mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
             direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
-        else:  # without any gradient so far, in a direction of random signs
+        else:  # random signs
             noise = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
             direction = noise.sign_()
-        # `count` includes the latest evaluation already
+        # the index of the latest evaluation, which `count` includes already
         rate = state.decay_step_size(state.count - 1)
         half_widths = compute_half_widths(state.domain)
         u = torch.addcmul(u, half_widths, direction, value=rate)

@@ -1,6 +1,6 @@
-"""Policies that look without learning: random search, the baseline of every worst-case
-claim; quasi-random points, which fill the domain more evenly; and a grid, as fine as
-the renders allow.
+"""Policies that do not learn from evaluations: random search, the baseline of every
+worst-case claim; quasi-random points, which fill the domain more evenly; and a grid, as
+fine as the renders allow.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from advsearch.attacks.domain import Block, Domain, option_center
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.errors import InputError
 
-# dimensions that scipy has direction numbers for (Joe and Kuo 2008)
+# largest number of dimensions of scipy's Sobol sequences (Joe and Kuo 2008)
 MAX_SOBOL_DIM = 21_201
-# largest number of elements of the points of a Sobol sequence that are computed at
-# once; but at least one point is
+# About the largest number of values of Sobol points that are computed at once. The
+# number of points is rounded up to a power of two, so there may be twice as many.
 MAX_CHUNK_NUMBERS = 2**20
 
 
@@ -29,14 +29,14 @@ NO_POINTS = torch.empty(0, 0)
 
 @dataclass(frozen=True, eq=False)
 class PointsState:
-    """State of a search that does not look at evaluations.
+    """State of a search that does not use evaluations.
 
     Attributes:
         domain: domain of the search.
         seed: seed of random numbers.
-        points: (n, k) that the next configurations come from: the full grid, or the
-            present chunk of a sequence. Empty if they come from the seed alone.
-        n_proposed: configurations that were proposed so far.
+        points: (n, k) points from which configurations are made: the full grid, or the
+            current chunk of a sequence. Empty for random samples.
+        n_proposed: number of configurations that were proposed so far.
     """
 
     domain: Domain
@@ -64,13 +64,13 @@ class NonAdaptivePolicy(Policy[PointsState]):
 
 @dataclass(frozen=True)
 class Random(NonAdaptivePolicy):
-    """Independent samples within the budget, by turns at the extremes of the norm balls
-    and in their interior.
+    """Independent samples within the budget, alternately at the extremes of the norm
+    balls and in their interior.
 
-    The first is an extreme one: in many dimensions the corners of an l-infinity ball
-    beat its interior (a random corner moves a linear objective sqrt(3) times as far as
-    a uniform sample), so a baseline without them would be too easy to win against. See
-    `Domain.sample`.
+    The first is an extreme one. In many dimensions the corners of an l-infinity ball
+    are better than its interior: a random corner changes a linear objective sqrt(3)
+    times as much as a uniform sample. So a baseline without them would be too easy to
+    beat. See `Domain.sample`.
     """
 
     name: ClassVar[str] = "random"
@@ -96,16 +96,18 @@ class Sobol(NonAdaptivePolicy):
     """A scrambled Sobol sequence over the whole domain (Sobol 1967; scrambled as by
     Owen 1998, Matousek 1998).
 
-    - bounds and l-infinity balls: the sequence's number, stretched to what bounds and
-    ball leave;
-    - a discrete choice: the middle of the option it falls on;
-    - an l2 ball: a direction from the normal quantiles of the block's numbers, and a
-      radius from one number more, so that points are uniform in the ball; then
-      projected onto the bounds.
+    A point of the sequence, in [0, 1]^k, becomes a configuration:
 
-    In a few dimensions it finds what `random` finds in fewer renders; the advantage is
-    gone after a dozen. The points of one sequence do not depend on what they are worth,
-    so they are a fair sample of the domain's average too.
+    - bounds and l-infinity balls: a number is scaled to the intersection of bounds and
+      ball;
+    - a discrete choice: a number becomes the center of its option;
+    - an l2 ball: normal quantiles of the block's numbers give a direction, and one more
+      number gives the distance from the center, so that points are uniform in the ball;
+      then they are projected onto the bounds.
+
+    In a few dimensions it needs fewer renders than `random`. The advantage is gone
+    after a dozen. The points do not depend on evaluations, so they are also a fair
+    sample for the average over the domain.
     """
 
     name: ClassVar[str] = "sobol"
@@ -114,7 +116,8 @@ class Sobol(NonAdaptivePolicy):
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> PointsState:
         """Start the sequence, with its first chunk of points."""
-        # one dimension for each element, and one for the radius in each l2 ball
+        # One dimension for each element, and one for the distance from the center of
+        # each l2 ball. Its elements only decide the direction (`to_domain`).
         n_l2_balls = sum(block.norm == "l2" for block in domain.blocks)
         size = domain.dim + n_l2_balls
         if size > MAX_SOBOL_DIM:
@@ -125,7 +128,8 @@ class Sobol(NonAdaptivePolicy):
         seed = draw_seed(generator)
         max_points = max(1, MAX_CHUNK_NUMBERS // size)
         n_points = min(steps, max_points)
-        # rounded up to a power of two, as Sobol points are balanced in such numbers
+        # Rounded up to a power of two, because Sobol points are balanced in such
+        # numbers. So `MAX_CHUNK_NUMBERS` may be exceeded, but not by a factor of 2.
         chunk_size = 2 ** max(0, (n_points - 1).bit_length())
         points = sample_sobol_points(size, seed, begin=0, count=chunk_size)
         return PointsState(domain, seed, points)
@@ -150,7 +154,7 @@ def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
     """Return points (count, size) float32 of a scrambled Sobol sequence.
 
     Args:
-        size: dimensions.
+        size: number of dimensions.
         seed: seed of the scrambling.
         begin: number of the first point.
         count: number of points; a power of two, which keeps them balanced.
@@ -166,7 +170,8 @@ def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
 def to_domain(domain: Domain, x: Tensor) -> Tensor:
     """Return the configuration (d,) for a point of the unit cube.
 
-    Uniform points give uniform configurations, but for l2 balls that bounds cut.
+    Uniform points give uniform configurations, except in l2 balls that are cut by
+    bounds.
 
     Args:
         domain: domain of the configuration.
@@ -174,15 +179,16 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
             u; the others decide the distance from the center in each l2 ball.
     """
     u = torch.lerp(domain.lower, domain.upper, x[: domain.dim])
-    radii = iter(x[domain.dim :].tolist())
+    distance_numbers = iter(x[domain.dim :].tolist())  # one for each l2 ball, in order
     for block, part in domain.list_block_slices():
         if block.options:
             u[part] = option_center(x[part], block.options)
         elif block.norm == "l2" and block.epsilon is not None:
-            # normal quantiles, clamped to be finite also at 0 and 1
+            # Normal quantiles of uniform numbers are a normal vector, whose direction
+            # is uniform. They are infinite at 0 and 1, hence the clamp.
             direction = torch.special.ndtri(x[part].double().clamp(1e-9, 1.0 - 1e-9))
-            # the radius of a uniform point of the ball
-            length = block.epsilon * next(radii) ** (1.0 / block.size)
+            # volume grows with distance**size, so this is uniform in the ball
+            length = block.epsilon * next(distance_numbers) ** (1.0 / block.size)
             norm = max(float(torch.linalg.vector_norm(direction)), 1e-30)
             u[part] = domain.start[part] + (direction * (length / norm)).float()
     return domain.project(u)
@@ -192,18 +198,19 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
 class Grid(NonAdaptivePolicy):
     """Every combination of evenly spaced values, then nothing more.
 
-    A number takes both its ends and what lies evenly between; an angle does not repeat
-    its end; a discrete choice takes every option. Without `points`, numbers get one
-    more value by turns as long as the whole grid fits into the renders. Points come
-    coarse to fine: ends first, then middles, then quarters, so that a grid that is cut
-    short has looked everywhere.
+    The values of a number are both bounds and evenly spaced values between them. For an
+    angle both bounds are the same, so only one of them is a value. A discrete choice
+    has all its options. Without `points`, each number in turn gets one more value, as
+    long as the grid fits into the renders. Points are ordered from coarse to fine:
+    bounds first, then centers, then quarters. So a grid that is cut short covers the
+    whole domain.
 
-    An l-infinity ball is a box to a grid. Points outside an l2 ball are projected onto
-    it, so they are not evenly spaced there. Either is of use in a few numbers only: a
-    grid that does not fit into the renders is refused.
+    An l-infinity ball is a box. Points outside an l2 ball are projected onto it, so
+    they are not evenly spaced there. A grid is only useful for few numbers; it is
+    rejected if it does not fit into the renders.
 
     Attributes:
-        points: values for each number, at least 2; 0 for as many as fit.
+        points: number of values of each number, at least 2; 0 for as many as fit.
     """
 
     points: int = 0
@@ -271,24 +278,26 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
 def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Tensor:
     """Return the indices of all points of a grid, (n,), the coarse ones first.
 
-    A value at the end of an axis has level 0, in the middle 1, at a quarter 2, and so
-    on. Points are sorted by the largest level of their values, then by the sum of the
-    levels. So a search that ends early has seen a coarse grid. The last axis of the
-    grid varies fastest.
+    A value at a bound of an axis has level 0, at the center 1, at a quarter 2, and so
+    on (`_compute_levels`). Points are sorted by the largest level of their values, then
+    by the sum of the levels. So a search that ends early has evaluated a coarse grid.
+    Indices are those of `torch.cartesian_prod`, in which the last axis varies fastest.
 
     Args:
         blocks: block of each axis.
         counts: number of values of each axis.
     """
-    # for all points of the grid over the axes so far
+    # (n,) for all points of the grid over the axes so far, which is empty at first
     max_level = torch.zeros(1, dtype=torch.long)
     level_sum = torch.zeros(1, dtype=torch.long)
-    for level in map(_compute_levels, blocks, counts):
-        # each point so far with each value of this axis
-        max_level = torch.maximum(max_level[:, None], level).flatten()
-        level_sum = (level_sum[:, None] + level).flatten()
-    # Like a number of two digits: the sum decides only if `max_level` is equal.
-    sort_key = max_level * (int(level_sum.max()) + 1) + level_sum
+    for axis_level in map(_compute_levels, blocks, counts):
+        # Every point so far is combined with every value of this axis: (n, count),
+        # which `flatten` numbers with the last axis fastest.
+        max_level = torch.maximum(max_level[:, None], axis_level).flatten()
+        level_sum = (level_sum[:, None] + axis_level).flatten()
+    # Sorts by the pair (max_level, level_sum): the factor exceeds every sum.
+    factor = int(level_sum.max()) + 1
+    sort_key = max_level * factor + level_sum
     return sort_key.argsort(stable=True)
 
 
@@ -358,13 +367,14 @@ def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
 def _compute_levels(block: Block, count: int) -> Tensor:
     """Return the level (count,) of each value of an axis.
 
-    It is how often the axis must be halved until the value is reached: 0 at both ends,
-    1 in the middle. All options of a choice have level 0.
+    It is how often the axis must be halved until the value is reached: 0 at both
+    bounds, 1 at the center. All options of a choice have level 0.
     """
     level = torch.zeros(count, dtype=torch.long)
     if block.options:
         return level
-    # the end of an angle is its beginning, which is no value of its own
+    # The upper bound of an angle has the index `count`. It equals the lower bound, and
+    # is no value of the axis.
     last = count if block.periodic else count - 1
     gaps = [(0, last, 1)]  # (lower index, upper index, level of the middle between)
     while gaps:

@@ -1,7 +1,7 @@
 """A Gaussian process (Matérn-5/2, a length scale for each coordinate, noise) over the
-box blocks of a domain as one unit box. All is fitted by maximum likelihood over fixed
-grids, and every proposal is one of finitely many, so that last bits of a factorisation
-do not change a result.
+box blocks of a domain, which form one unit box. It is fitted by maximum likelihood over
+fixed grids, and every proposal is one of finitely many candidates, so that the last
+bits of a factorization do not change a result.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain, find_periodic, option_center
 from advsearch.attacks.evaluation import Evaluated, seeded
 
-# more coordinates than this are screened with independent points; Sobol's advantage is
-# long gone
+# Largest number of coordinates for which the screen is a Sobol sequence. With more of
+# them it has independent points, as Sobol's advantage is long gone.
 MAX_SOBOL_DIM = 1000
 # expected number of coordinates that a local move changes
 N_MOVED_COORDINATES = 4
@@ -35,7 +35,7 @@ class BoxCoordinates:
         indices: (k,) of the elements of u.
         low: (k,) their lower bounds.
         width: (k,) of their ranges.
-        periodic: (k,) whether 0 and 1 are the same place (an angle).
+        periodic: (k,) whether 0 and 1 mean the same value, as for an angle.
         options: (k,) number of options of a discrete choice; 0 for a number.
     """
 
@@ -73,8 +73,9 @@ class BoxCoordinates:
         )
 
     def sample_screen(self, seed: int, n: int) -> Tensor:
-        """Return points (n, k) spread evenly: a scrambled Sobol sequence, or, of very
-        many coordinates, independent points.
+        """Return evenly spread points (n, k), of a scrambled Sobol sequence.
+
+        With very many coordinates they are independent points instead.
         """
         if n == 0:
             return torch.empty(0, self.count)
@@ -86,9 +87,10 @@ class BoxCoordinates:
     def sample_moves(self, x: Tensor, generator: torch.Generator) -> Tensor:
         """Return the points x (n, k) after a random move of each, (n, k).
 
-        A few coordinates of each point move, at least one. Numbers change by normal
-        noise of a random size. Choices are sampled again with the probability
-        `RESAMPLED_FRACTION`.
+        A few coordinates of each point are selected to move, at least one. A selected
+        number changes by normal noise of a random size. A selected choice is sampled
+        again with the probability `RESAMPLED_FRACTION`, and otherwise stays. Points are
+        moved back into the box at the end (`normalize`).
 
         Args:
             x: (n, k) points of the unit box.
@@ -181,7 +183,8 @@ MIN_LIKELIHOOD_GAIN = 1.0
 REFIT_INTERVAL = 5
 # number of the best points, and of the latest points, that a process is fitted to
 MEMORY = 100
-# largest number of coordinates with length scales of their own; more share one
+# Largest number of coordinates that have their own length scales. More of them share
+# one.
 MAX_SCALED_DIM = 16
 
 
@@ -203,7 +206,7 @@ class Surrogate:
     """A process fitted to n points.
 
     Attributes:
-        box: what the coordinates are.
+        box: kinds of the k coordinates.
         x: (n, k) points of the unit box.
         scales: hyperparameters.
         factor: (n, n) Cholesky factor of the kernel matrix with noise, for a signal of
@@ -247,13 +250,13 @@ class Observations:
     """The evaluations of a search, and the scales of the process behind them.
 
     Attributes:
-        box: what the coordinates are.
-        points: (n, k) that were evaluated.
+        box: kinds of the k coordinates.
+        points: (n, k) points that were evaluated.
         values: n objectives; not finite if a point could not be evaluated.
-        scales: as they were last fitted; None before that.
-        n_fitted: number of points at that time.
-        memory: how many of the best and of the latest points a process is fitted to;
-            its scales are fitted to `MEMORY` of each.
+        scales: scales of the latest fit; None before the first.
+        n_fitted: number of points when the scales were fitted.
+        memory: number of the best points, and of the latest points, that a process is
+            fitted to. Its scales are always fitted to `MEMORY` of each.
     """
 
     box: BoxCoordinates
@@ -293,9 +296,11 @@ class Observations:
         n_fitted = self.n_fitted
         refit_interval = max(REFIT_INTERVAL, n_fitted // 10)
         if scales is None or n_points - n_fitted >= refit_interval:
-            # from `MEMORY` points of each kind, however many the process uses
-            fitted = _select_best_and_latest(values, MEMORY)
-            scales = _find_best_scales(self.box, self.points[fitted], values[fitted])
+            # the `MEMORY` best and the `MEMORY` latest points, whatever `self.memory`
+            scale_points = _select_best_and_latest(values, MEMORY)
+            scales = _find_best_scales(
+                self.box, self.points[scale_points], values[scale_points]
+            )
             n_fitted = n_points
         used = _select_best_and_latest(values, self.memory)
         surrogate = fit(self.box, self.points[used], values[used], scales)
@@ -303,8 +308,11 @@ class Observations:
 
 
 def _select_best_and_latest(values: Tensor, memory: int) -> Tensor:
-    """Return the indices of the `memory` last values, after those of the `memory`
-    largest before them; of all values, in their order, if there are no more.
+    """Return the indices of the best and of the latest values.
+
+    The latest are the last `memory` values; the best are the `memory` largest of the
+    earlier ones, and come first. If there are at most 2 * `memory` values, the indices
+    of all are returned in order.
     """
     n_earlier = len(values) - memory
     if n_earlier <= memory:
@@ -315,7 +323,7 @@ def _select_best_and_latest(values: Tensor, memory: int) -> Tensor:
 
 
 def kernel(a: Tensor, b: Tensor) -> Tensor:
-    """Matérn-5/2 correlation between points (n, f) and (m, f)."""
+    """Return the Matérn-5/2 correlations (n, m) between points (n, f) and (m, f)."""
     r = math.sqrt(5.0) * torch.cdist(a, b)
     return (1.0 + r + r.square() / 3.0) * torch.exp(-r)
 
@@ -325,7 +333,7 @@ def fit(
 ) -> Surrogate:
     """Fit a Gaussian process to values at points of the unit box.
 
-    Its mean and variance maximise the likelihood.
+    Its mean and variance maximize the likelihood.
 
     Args:
         box: kinds of the k coordinates.

@@ -18,24 +18,30 @@ from advsearch.scene.gradients import GradientPlan
 from advsearch.scene.renderer import Renderer
 
 Loss = Callable[[Tensor], Tensor]
-"""From a picture (H, W, 3) sRGB to a number, by differentiable torch operations."""
+"""From an image (H, W, 3) sRGB to a number, by differentiable torch operations."""
 
-# fraction of a full turn between the start of periodic coordinates and where gradients
-# are measured
+# Periodic coordinates are moved from their start by this fraction of a full turn.
 PERIODIC_OFFSET = 0.0317
-# coordinates of a group up to which they are treated one by one; more are a texture's
+# A larger group of coordinates is a texture or another image.
 MAX_SMALL_GROUP = 64
 
 
 def find_interior_point(renderer: Renderer, fraction: float = 0.12) -> Tensor:
     """Return a point (d,) near the start at which gradients are measured.
 
-    Discrete choices and groups of more than `MAX_SMALL_GROUP` coordinates stay at
-    their start. But a
-    large group that starts at its bounds with all coordinates, as a projector's black
-    image does, is measured in the middle: a bound has a kink, and no difference to
-    either side. Periodic coordinates are turned a little, as starts are often
-    symmetric. All others are at least `fraction` of their range off its bounds.
+    At a bound the objective has a kink, and a central difference can't be taken. So the
+    point is inside the bounds.
+
+    - Discrete choices stay at their start.
+    - Periodic coordinates are turned a little, as starts are often symmetric.
+    - Other coordinates of small groups keep a distance from their bounds.
+    - Groups of more than `MAX_SMALL_GROUP` coordinates stay at their start. But if all
+      of their coordinates start at a bound, as those of a projector's black image, they
+      are moved to the center of their range.
+
+    Args:
+        renderer: renderer with the start and the groups.
+        fraction: smallest distance from the bounds, as a fraction of the range.
     """
     u = renderer.start.clone()
     for group in renderer.plan.groups:

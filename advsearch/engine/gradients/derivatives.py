@@ -1,6 +1,8 @@
-"""Measures gradient estimators on a scene as it is: error, noise and cost, along
-*probes*, directions in u, against central differences with common random numbers at two
-step sizes (docs/gradients.md).
+"""Measure the error, noise and cost of gradient estimators on a scene.
+
+Derivatives are measured along *probes*, which are directions in u. The reference are
+central differences at two step sizes, with the same noise on both sides
+(docs/gradients.md).
 """
 
 from __future__ import annotations
@@ -21,39 +23,45 @@ from advsearch.engine.gradients.bench import Bench, Loss, restrict_plan
 from advsearch.runs.results import GradientStatus, Measured
 from advsearch.scene.gradients import STEP_RANGE, Group, select_compared
 
-# size that a derivative has at least for the limits below, as a fraction of the largest
-# derivative of its control
+# Errors are relative to the size of a derivative, but at least to this fraction of the
+# largest derivative of the same control.
 MIN_SIZE_FRACTION = 0.1
-MAX_SINGLE_PROBES = 8  # groups of at most this many coordinates are probed one by one
-MIXED_STEP = 0.03  # along a direction through more than 64 coordinates
-# relative error that the mean of an estimator may have beyond the noise
-MAX_BIAS = 0.05
-# noise of one gradient, relative to its size, from which on it is called noisy
-MAX_NOISE = 0.2
-# standard error of a reference, relative to its size, from which on it gets no more
-# seeds
-MAX_REFERENCE_ERROR = 0.02
-N_STANDARD_ERRORS = 2.5  # standard errors within which two means agree
-# coordinates of a group up to which its planned step is also one along all of them at
-# once
+# Groups of at most this many coordinates get a probe for each of them. Larger groups
+# get a single "mixed" probe, along which all coordinates change.
+MAX_SINGLE_PROBES = 8
+# Up to this size of a group, the planned step for one coordinate is also that of the
+# mixed probe. Larger groups have the step `MIXED_STEP` there.
 MAX_COMMON_STEP_SIZE = 64
-# waves of a smooth loss, and how many of them fit into the image at most
-N_WAVES = 6
-MAX_FREQUENCY = 1.2
+MIXED_STEP = 0.03
+# allowed relative error of the mean of an estimator, besides that by noise
+MAX_BIAS = 0.05
+# allowed noise of one gradient, relative to its size; above it the status is "noisy"
+MAX_NOISE = 0.2
+# A reference gets more seeds until its standard error, relative to its size, is this.
+MAX_REFERENCE_ERROR = 0.02
+N_STANDARD_ERRORS = 2.5  # two means agree within this many standard errors
+N_WAVES = 6  # number of waves of a smooth loss
+MAX_FREQUENCY = 1.2  # largest number of periods of a wave in the image
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
-"""Steps of differences that are tried in turn, as multiples of the plan's. A step that
-moves an outline by a pixel is as wide as a classifier's loss allows; a smooth loss
-allows more, and noise falls with the step. What moves no outline has a share of its
-range for a step, which may be too wide.
+"""Steps of differences that are tried in turn, as multiples of the planned one. If an
+outline moves, the planned step moves it by a pixel, which is the largest step that the
+loss of a classifier allows. A smooth loss allows larger steps, and noise falls with the
+step. If no outline moves, the planned step is a fraction of the range, which may be too
+large.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """A `direction` (d,) along which a derivative is measured, largest element 1, zero
-    outside the group; a difference along it has the half-width `step`. The name is
-    `control.parameter`, with the coordinate's number if a group has several and they
-    are probed singly.
+    """A direction along which a derivative is measured.
+
+    Attributes:
+        group: group of coordinates that change along it.
+        name: name of the group, such as "pose.yaw". If a group has several coordinates
+            with a probe for each, the index of the coordinate is added.
+        direction: (d,) direction; its largest element is 1, and it is zero outside of
+            the group.
+        step: half of the width of a difference along it.
     """
 
     group: Group
@@ -63,10 +71,14 @@ class Probe:
 
 
 class Reference(NamedTuple):
-    """A derivative by high-sample central differences: the mean over seeds,
-    extrapolated from two `steps` to zero (Richardson). Its `noise` is the standard
-    error together with a quarter of the steps' disagreement; `factor` is the larger
-    step as a multiple of the probe's.
+    """A derivative by central differences with many samples.
+
+    Attributes:
+        value: mean over seeds, extrapolated from two steps to a step of 0 (Richardson).
+        noise: standard error of the value, together with a quarter of the difference
+            between both steps.
+        steps: mean derivative at the larger and at the smaller step.
+        factor: the larger step as a multiple of that of the probe.
     """
 
     value: float
@@ -76,9 +88,15 @@ class Reference(NamedTuple):
 
 
 class GradientEstimate(NamedTuple):
-    """What one estimator says along a probe: the mean over seeds, the standard
-    deviation (`noise`) and median seconds of one estimate. Differences are `factor`
-    times as wide as planned.
+    """The derivative along a probe by one estimator.
+
+    Attributes:
+        estimator: name of the estimator.
+        value: mean over seeds.
+        noise: standard deviation of a single estimate.
+        repeats: number of estimates, each with its own seed.
+        seconds: median time of an estimate.
+        factor: step of differences as a multiple of the planned one.
     """
 
     estimator: str
@@ -132,20 +150,23 @@ def _rate_estimate(
 ) -> GradientStatus:
     """Return the first status that holds for an estimate.
 
-    - "reference unusable": the reference's noise exceeds `MAX_NOISE`, and the error of
-      the mean is within doubt;
-    - "biased": the error of the mean exceeds `MAX_BIAS` by more than doubt;
-    - "noisy": the estimate's noise exceeds `MAX_NOISE`;
+    The error is the difference of the estimate and the reference. A part of it, the
+    doubt, may be due to the noise of both.
+
+    - "reference unusable": the noise of the reference exceeds `MAX_NOISE`, and the
+      error may be due to noise alone;
+    - "biased": the error exceeds `MAX_BIAS` by more than the doubt;
+    - "noisy": the noise of the estimate exceeds `MAX_NOISE`;
     - "ok".
 
     Args:
         estimate: estimate to rate.
         reference: reference of the same probe.
-        size: size to which the limits are relative.
-        doubt: difference of both values that may be due to their noise.
+        size: size of the derivative; `MAX_NOISE` and `MAX_BIAS` are fractions of it.
+        doubt: largest error that may be due to noise.
     """
     difference = abs(estimate.value - reference.value)
-    # only where the reference's noise may be the reason of the difference
+    # An error beyond the doubt shows a bias even with a noisy reference.
     if difference <= doubt and reference.noise > MAX_NOISE * size:
         return "reference unusable"
     if difference > MAX_BIAS * size + doubt:
@@ -162,12 +183,12 @@ def compare_with_reference(
     probe: Probe | None = None,
     spp: int = 0,
 ) -> Measured:
-    """Return how good an estimate is along a probe, see `_rate_estimate`.
+    """Return the errors of an estimate along a probe, and its status.
 
-    Errors are relative to a size: that of the reference, but at least
-    `MIN_SIZE_FRACTION` of the largest of `others`, since a derivative that happens to
-    be near zero says nothing about the size of errors that matter. Doubt is
-    `N_STANDARD_ERRORS` standard errors of both values together.
+    Errors are relative to the size of the derivative. That is the reference, but at
+    least `MIN_SIZE_FRACTION` of the largest of `others`: a derivative may happen to be
+    near zero, and then its relative error does not matter. The doubt is the error that
+    may be due to noise: `N_STANDARD_ERRORS` standard errors of both values together.
 
     Args:
         estimate: estimate to rate.
@@ -178,9 +199,12 @@ def compare_with_reference(
     """
     min_sizes = [MIN_SIZE_FRACTION * abs(other.value) for other in others]
     size = max([abs(reference.value), *min_sizes])
+    is_zero = size <= 0.0  # all references of the control are 0
     difference = abs(estimate.value - reference.value)
-    estimate_error = estimate.noise / math.sqrt(max(1, estimate.repeats))
-    doubt = N_STANDARD_ERRORS * math.hypot(estimate_error, reference.noise)
+    standard_error = estimate.noise / math.sqrt(max(1, estimate.repeats))
+    doubt = N_STANDARD_ERRORS * math.hypot(standard_error, reference.noise)
+    # error of a single estimate: that of the mean, and its noise
+    single_error = math.hypot(difference, estimate.noise)
     return Measured(
         quantity="derivative",
         control=probe.group.control if probe else "",
@@ -191,11 +215,11 @@ def compare_with_reference(
         repeats=estimate.repeats,
         seconds=estimate.seconds,
         status=_rate_estimate(estimate, reference, size, doubt),
-        error=_divide_by_size(math.hypot(difference, estimate.noise), size),
+        error=_divide_by_size(single_error, size),
         bias=_divide_by_size(difference, size),
-        # with nothing to measure, all is noise and nothing is in doubt
-        doubt=_divide_by_size(doubt, size) if size > 0.0 else 0.0,
-        noise=_divide_by_size(estimate.noise, size) if size > 0.0 else math.inf,
+        # If the derivative is zero, all of it is noise, and there is no doubt.
+        doubt=0.0 if is_zero else _divide_by_size(doubt, size),
+        noise=math.inf if is_zero else _divide_by_size(estimate.noise, size),
         value=estimate.value,
         reference=reference.value,
         reference_error=_divide_by_size(reference.noise, size),
@@ -203,7 +227,7 @@ def compare_with_reference(
 
 
 def _divide_by_size(value: float, size: float) -> float:
-    """Return a value in units of a size; of size 0, any value but 0 is infinite."""
+    """Return a value divided by a size; if that is 0, infinity, or 0 for a value of 0."""
     if size > 0.0:
         return value / size
     return math.inf if value else 0.0
@@ -217,28 +241,31 @@ def list_planned(group: Group) -> list[tuple[str, float]]:
 def list_attempts(group: Group) -> list[tuple[str, float]]:
     """Return the estimators to measure on a group, each with a factor on its step.
 
-    First come all estimators with the planned step, or the only one if it is forced.
-    Then one that takes differences, if there is any, with wider steps, as long as these
-    differ. One is enough, since differences of the loss and of the image agree for a
-    linear loss.
+    First come the estimators that are worth comparing, with the planned step; if the
+    user has forced an estimator, only that one. Then an estimator that takes
+    differences is tried with the other `FACTORS` on the step. There are two of these:
+    differences of the loss ("differences") and of the image ("secant"). One is enough,
+    as the loss is linear here (`make_smooth_loss`), so that both agree.
     """
     if group.is_forced:
         attempts = list_planned(group)
     else:
         names = select_compared(group.valid, group.size)
         attempts = [(name, 1.0) for name in names]
-    # of those that are tried with the planned step
     difference_estimators = [
         name for name in ("differences", "secant") if (name, 1.0) in attempts
     ]
+    if not difference_estimators:
+        return attempts
+    difference_estimator = difference_estimators[0]
     steps = {group.step}
     _, max_step = STEP_RANGE
     for factor in FACTORS[1:]:  # the first factor is 1
+        # several factors may give the largest step, which is tried once
         step = min(factor * group.step, max_step)
-        # beyond the largest step, wider ones are all the same
         if step not in steps:
             steps.add(step)
-            attempts += [(name, factor) for name in difference_estimators[:1]]
+            attempts.append((difference_estimator, factor))
     return attempts
 
 
@@ -246,19 +273,22 @@ def find_probes(bench: Bench) -> list[Probe]:
     """Return the directions along which derivatives are measured, for all groups.
 
     A small group has one for each coordinate, with its planned step. A group of more
-    than `MAX_SINGLE_PROBES` coordinates has a single direction through all of them.
-    Groups that are not differentiated have none.
+    than `MAX_SINGLE_PROBES` coordinates has a single direction, in which all of them
+    change. Groups that are not differentiated have none.
     """
     probes = []
     for group in bench.renderer.plan.groups:
         is_differentiated = group.estimator != "none"
-        if is_differentiated and group.size > MAX_SINGLE_PROBES:
-            # the planned step of a larger group is for one coordinate, not all at once
-            step = group.step if group.size <= MAX_COMMON_STEP_SIZE else MIXED_STEP
-            direction = _make_mixed_direction(bench, group)
-            probes.append(Probe(group, group.name, direction, step))
-        elif is_differentiated:
+        if not is_differentiated:
+            continue
+        if group.size <= MAX_SINGLE_PROBES:
             probes += _make_single_probes(bench, group)
+            continue
+        # The planned step is for one coordinate. If very many change at once, it does
+        # not fit.
+        step = group.step if group.size <= MAX_COMMON_STEP_SIZE else MIXED_STEP
+        direction = _make_mixed_direction(bench, group)
+        probes.append(Probe(group, group.name, direction, step))
     return probes
 
 
@@ -274,11 +304,11 @@ def _make_single_probes(bench: Bench, group: Group) -> list[Probe]:
 
 
 def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
-    """Return a direction (d,) through all coordinates of a group, whose largest element
-    is 1.
+    """Return a direction (d,) in which all coordinates of a group change.
 
-    It is the signs of the estimator's own gradient, along which the derivative is
-    large, plus half of random signs, so that what the estimator leaves out counts too.
+    It is the sum of the signs of the estimator's gradient, along which the derivative
+    is large, and half of random signs, so that a part of the gradient that the
+    estimator misses counts too. Its largest element is 1.
     """
     # differentiates by this group alone
     plan = restrict_plan(bench.renderer.plan, [group.name])
@@ -304,16 +334,19 @@ def measure_reference(
     """Return the derivative along a probe by central differences, and its noise.
 
     Each seed gives two differences, at a step and at half of it, from which the value
-    at a step of 0 is extrapolated. Seeds are added until the standard error of the mean
-    is below `MAX_REFERENCE_ERROR` of its value.
+    at a step of 0 is extrapolated. The reference is accurate enough if the standard
+    error of the mean is at most `MAX_REFERENCE_ERROR` of its value.
+
+    1. Each factor is tried with the smallest number of seeds. The first one that is
+       accurate enough is taken.
+    2. If there is none, seeds are added for the factor with the least noise, until it
+       is accurate enough or has the largest number of seeds.
 
     Args:
         bench: bench of the renderer.
         probe: direction along which the derivative is taken.
         repeats: smallest and largest number of seeds.
-        factors: factors on the probe's step, tried in turn with the smallest number of
-            seeds, until the standard error of one is small enough. If none is, seeds
-            are added for the factor with the least noise.
+        factors: factors on the step of the probe.
     """
     min_repeats, max_repeats = repeats
     pairs_of_factor: dict[float, list[DifferencePair]] = {}
@@ -361,7 +394,7 @@ def _measure_pair(
 
     `number` is the index of the pair, from which its seed follows.
     """
-    # a wider step stays within the largest one; the planned step is taken as it is
+    # A wider step is limited to the largest one; the planned step is not changed.
     _, max_step = STEP_RANGE
     step = probe.step if factor == 1.0 else min(max_step, factor * probe.step)
     noise_seed = seeds.stream(bench.seed, "reference", number)
@@ -404,16 +437,16 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
 
     Both sides have the noise of the same seed.
     """
-    move = step * probe.direction
+    change = step * probe.direction
     width = 2.0 * step
     if probe.group.periodic:
-        above = (bench.u + move).remainder(1.0)
-        below = (bench.u - move).remainder(1.0)
+        above = (bench.u + change).remainder(1.0)
+        below = (bench.u - change).remainder(1.0)
     else:
-        above = (bench.u + move).clamp(0.0, 1.0)
-        below = (bench.u - move).clamp(0.0, 1.0)
-        is_single = probe.group.size <= MAX_SINGLE_PROBES
-        if is_single:
+        above = (bench.u + change).clamp(0.0, 1.0)
+        below = (bench.u - change).clamp(0.0, 1.0)
+        changes_single_coordinate = probe.group.size <= MAX_SINGLE_PROBES
+        if changes_single_coordinate:
             # less than two steps if a bound of the range has cut one off
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
@@ -427,28 +460,35 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
 def measure_estimates(
     bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
 ) -> list[GradientEstimate]:
-    """Measure one estimator of one control's groups along some probes of them.
+    """Measure the derivatives along probes by one estimator.
+
+    All of them come from the same gradients, which contain the groups of the probes.
 
     Args:
         bench: bench of the renderer.
         estimator: estimator of the groups.
-        probes: probes of these groups only.
+        probes: probes of groups of one control.
         repeats: number of gradients, each with its own seed.
         factor: factor on the planned step of differences.
     """
-    names = {probe.group.name for probe in probes}
-    plan = restrict_plan(bench.renderer.plan.scale_steps(factor), names, estimator)
+    group_names = {probe.group.name for probe in probes}
+    scaled_plan = bench.renderer.plan.scale_steps(factor)
+    plan = restrict_plan(scaled_plan, group_names, estimator)
+    # name of the stream of seeds
     stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
     gradients, seconds = bench.compute_gradients(plan, stream, repeats)
     estimates = []
     for probe in probes:
-        slopes = [float(gradient @ probe.direction) for gradient in gradients]
-        mean = statistics.fmean(slopes)
-        estimates.append(
-            GradientEstimate(
-                estimator, mean, statistics.stdev(slopes), repeats, seconds, factor
-            )
+        derivatives = [float(gradient @ probe.direction) for gradient in gradients]
+        estimate = GradientEstimate(
+            estimator,
+            value=statistics.fmean(derivatives),
+            noise=statistics.stdev(derivatives),
+            repeats=repeats,
+            seconds=seconds,
+            factor=factor,
         )
+        estimates.append(estimate)
     return estimates
 
 
@@ -470,15 +510,16 @@ def measure_derivatives(
 
     Args:
         bench: bench of the renderer.
-        reference_spp: samples per pixel of the references, if more than the bench's.
+        reference_spp: samples per pixel of the references; at least those of the bench
+            are used.
         reference_repeats: as `repeats` of `measure_reference`.
         reference_factors: as `factors` of `measure_reference`.
-        list_tries: returns the estimators to try on a group with factors on its step,
-            by default as planned; factors other than 1 are for probes that are not
-            `ok` yet.
+        list_tries: returns the estimators to try on a group, each with a factor on the
+            planned step (`list_planned` or `list_attempts`). Factors other than 1 are
+            only tried on probes whose status is not "ok" yet.
         repeats: number of gradients by an estimator with the planned step, and with
-            another one, which has to be surer.
-        stage: called with the name of what begins and its number of steps.
+            another factor; the latter has to be measured more accurately.
+        stage: called at the beginning of a stage, with its name and number of steps.
     """
     measure = partial(
         measure_reference, repeats=reference_repeats, factors=reference_factors
@@ -492,7 +533,8 @@ def measure_derivatives(
             probe.name: _load_reference(bench, probe, reference_spp, measure)
             for probe in probes
         }
-        # One gradient gives the derivatives along all probes with equal estimators.
+        # One gradient gives the derivatives along all probes with equal estimators. The
+        # key is (estimators that are valid, planned estimator).
         probe_sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
         for probe in probes:
             estimators = (probe.group.valid, probe.group.estimator)
@@ -502,7 +544,7 @@ def measure_derivatives(
         )
         stage(f"gradients for {control}", n_tries)
         for members in probe_sets.values():
-            # the groups of a set have the same estimators: any of them stands for all
+            # all groups of a set have the same estimators, so the first one suffices
             tries = list_tries(members[0].group)
             yield from _try_estimators(bench, members, references, tries, repeats)
 
@@ -515,11 +557,12 @@ def _load_reference(
     Args:
         bench: bench of the renderer.
         probe: direction along which the derivative is taken.
-        spp: samples per pixel, if more than the bench's.
+        spp: samples per pixel; at least those of the bench are used.
         measure: measures a reference.
     """
-    # What acts on the finished image clips values, so that the mean depends on the
-    # noise: estimate and reference need the same sample count there.
+    # The estimator "image" is for controls that change the finished image, such as a
+    # blur. They clip values, so that the mean image depends on the noise. So estimate
+    # and reference need the same sample count.
     acts_on_image = probe.group.estimator == "image"
     reference_spp = bench.spp if acts_on_image else max(bench.spp, spp)
     reference_bench = replace(bench, spp=reference_spp)
@@ -537,14 +580,14 @@ def _try_estimators(
     tries: Sequence[tuple[str, float]],
     repeats: tuple[int, int],
 ) -> Iterator[Measured]:
-    """Yield how estimators agree with references along probes.
+    """Yield the errors of estimators along probes, compared with references.
 
     Args:
         bench: bench of the renderer.
         probes: probes of one control, which share their estimators.
-        references: references by the names of all the control's probes.
+        references: references of all probes of the control, by name.
         tries: estimators, each with a factor on the planned step. Those with the factor
-            1 come first, for all probes; others are for probes that were not `ok`.
+            1 come first, for all probes; others are for probes that were not "ok".
         repeats: number of gradients with the factor 1, and with any other factor.
     """
     ok_names: set[str] = set()
@@ -560,6 +603,7 @@ def _try_estimators(
         if not tried_probes:  # all are ok, and only other factors follow
             break
         probe_names = ",".join(probe.name for probe in tried_probes)
+        # measured now, or by an earlier run; as JSON
         stored = bench.store(
             f"{estimator} x {factor:g} {probe_names}",
             partial(_estimates_as_json, bench, estimator, tried_probes, count, factor),
@@ -581,7 +625,10 @@ def _try_estimators(
 def _estimates_as_json(
     bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
 ) -> list[dict[str, Any]]:
-    """Return the estimates of `measure_estimates` as JSON objects."""
+    """Return the estimates of `measure_estimates` as JSON objects.
+
+    See `measure_estimates` for the arguments.
+    """
     return [
         estimate._asdict()
         for estimate in measure_estimates(bench, estimator, probes, repeats, factor)

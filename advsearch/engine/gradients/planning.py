@@ -35,38 +35,47 @@ from advsearch.scene.gradients import (
 )
 from advsearch.scene.renderer import Renderer
 
-# Cosine similarity with the converged gradient that a gradient with a search's sample
-# count ("working gradient") should have.
+# A *working* gradient has the sample count of a search. A *converged* one has many
+# samples, and serves as the reference.
+
+# cosine similarity with the converged gradient that a working gradient should have
 GOAL_COSINE = 0.9
 FACTORS = (1.0, 3.0, 9.0)
-"""Widths of the differences that are tried, as multiples of the plan's. The last is
-tried only if no other reaches the goal: it smooths away all but the coarse shape of the
-loss.
+"""Widths of differences that are tried, as multiples of the planned width. The last one
+is only tried if no other reaches the goal: it smooths away everything but the coarse
+shape of the loss.
 """
 SAMPLE_COUNTS = (8, 16, 32, 64, 128)
-ADJOINT_RENDERS = 3.0  # renders that take about as long as an adjoint
+ADJOINT_RENDERS = 3.0  # an adjoint takes about as long as this many renders
 CONVERGED_SPP = 128
 CONVERGED_SPP_FACTOR = 4
-"""Samples per pixel of a gradient that counts as converged; times the factor if such
-gradients do not agree, or a working gradient has more samples than they.
+"""Samples per pixel of a converged gradient. They are multiplied by the factor if such
+gradients do not agree, or if a working gradient has more samples.
 """
-# converged gradients that are taken. Two of a few numbers can agree by luck.
+# Number of converged gradients that are compared. Two can agree by chance if they have
+# few elements.
 N_CONVERGED = 3
 MIN_AGREEMENT = 0.5
-"""Converged gradients of which two have a smaller cosine than this tell nothing: the
-cosine of the mean of three with the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman
-and Brown), 0.87 and less. Above it the noise of the converged one, which is independent
-of the working one's, only makes the measured cosine smaller: what is called `ok` is so.
+"""Smallest cosine c of two converged gradients at which they are a usable reference.
+Below it the cosine of the mean of three with the true gradient is at most about
+sqrt(3 c / (1 + 2 c)) = 0.87 (Spearman and Brown). Above it the noise of the converged
+gradient, which is independent of that of the working one, can only reduce the measured
+cosine. So a status of "ok" is right.
 """
 
 
 def rate_cosine(cosine: float, agreement: float) -> GradientStatus:
     """Return whether a gradient agrees well enough with the converged one, as a status.
 
-    It is "ok" if the cosine reaches `GOAL_COSINE`, and otherwise "noisy". But it is
-    "reference unusable" where the fault may be the converged gradient's: if
-    `agreement`, the smallest cosine of two converged gradients, is below
-    `MIN_AGREEMENT`, or if both it and the cosine are below the goal.
+    - "reference unusable" if two converged gradients do not agree: their cosine is
+      below `MIN_AGREEMENT`;
+    - "ok" if the cosine reaches `GOAL_COSINE`;
+    - "noisy" if it does not, but the converged gradients reach it among each other;
+    - "reference unusable" if neither reaches it.
+
+    Args:
+        cosine: cosine of the gradient and the converged one.
+        agreement: smallest cosine of two converged gradients.
     """
     if not agreement >= MIN_AGREEMENT:  # also if it is NaN
         return "reference unusable"
@@ -80,15 +89,18 @@ def list_comparable_sets(
 ) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
     """Return sets of groups, each of one control and with the same valid estimators.
 
-    With each set come those of its estimators that are worth comparing.
+    With each set come those of its estimators that are worth comparing. This depends on
+    the number of coordinates of the set (`select_compared`).
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in groups:
         sets.setdefault((group.control, group.valid), []).append(group)
-    return [
-        (tuple(members), select_compared(valid, sum(group.size for group in members)))
-        for (_, valid), members in sets.items()
-    ]
+    sets_with_estimators = []
+    for (_, valid), members in sets.items():
+        n_coordinates = sum(group.size for group in members)
+        compared_estimators = select_compared(valid, n_coordinates)
+        sets_with_estimators.append((tuple(members), compared_estimators))
+    return sets_with_estimators
 
 
 def list_contested(
@@ -97,10 +109,14 @@ def list_contested(
     """Return sets of groups for which several estimators are to be compared.
 
     The groups of a set belong to one control. None of them has an estimator that the
-    user has forced. Without `with_all` only groups count whose preferred estimator is
-    the interior adjoint: of the others the winner is known, or there is none (over
-    poses no estimator has won, as the model's loss is too rough; over shapes the
-    material form is the quietest).
+    user has forced.
+
+    Args:
+        plan: plan with the groups.
+        with_all: whether all groups count. Otherwise only those count whose preferred
+            estimator is the interior adjoint. For the others a comparison is not worth
+            its time: for poses no estimator is best, as the loss of a model is too
+            rough; for shapes the material form always has the least noise.
 
     Returns:
         The sets, each with its estimators.
@@ -109,7 +125,7 @@ def list_contested(
     for group in plan.groups:
         if group.is_forced or not group.valid:
             continue
-        preferred = group.valid[0]
+        preferred, *_ = group.valid  # in the order of preference
         if with_all or preferred == "adjoint":
             open_groups.append(group)
     return [
@@ -139,19 +155,22 @@ def choose_estimators(
 ) -> GradientPlan:
     """Return the renderer's plan with every contested choice made by measurement.
 
-    A choice is contested where several estimators can give the derivatives of a
-    control. The one with the smallest squared error times seconds is taken: its error
-    after equal time is smallest. The plan of the renderer itself is not changed.
+    A choice is contested if several estimators can give the derivatives of a control.
+    The score of an estimator is its squared error times its seconds. The smallest score
+    is best: with it the error after equal time is smallest. The plan of the renderer
+    itself is not changed.
 
     Args:
         bench: computes the gradients.
-        repeats: gradients with each estimator.
-        with_all: as for `list_contested`.
-        count_renders: whether the renders that an estimator needs stand for its time
-            (`ADJOINT_RENDERS` for an adjoint), so that the choice is the same on a busy
-            machine.
+        repeats: number of gradients with each estimator.
+        with_all: whether estimators are compared for all groups, also for those for
+            which it is rarely worth its time (`list_contested`).
+        count_renders: whether the cost of an estimator is its number of renders, and
+            not its seconds (`ADJOINT_RENDERS` for an adjoint). So the choice is the
+            same on a busy machine.
     """
     plan = bench.renderer.plan
+    # each set of groups with the estimators that are compared for it
     for groups, estimators in list_contested(plan, with_all=with_all):
         scores = _score_estimators(
             bench, plan, groups, estimators, repeats, counts_renders=count_renders
@@ -180,63 +199,63 @@ def _score_estimators(
     *,
     counts_renders: bool,
 ) -> dict[str, float]:
-    """Return squared error times seconds of each estimator, on groups of one control.
+    """Return squared error times cost of each estimator, on groups of one control.
 
     Errors are differences from the mean gradient of the estimator that takes finite
-    differences, whose own noise is subtracted. If `counts_renders`, the number of
-    renders stands for the seconds.
+    differences; its noise is subtracted. The cost is the seconds of a gradient, or the
+    number of renders if `counts_renders` is set.
     """
     group_names = {group.name for group in groups}
-    # of each estimator
+    # by estimator
     gradients_of = dict[str, Tensor]()
-    seconds_of = dict[str, float]()
-    noise_of = dict[str, float]()
+    cost_of = dict[str, float]()
+    variance_of = dict[str, float]()
     for estimator in estimators:
         single_plan = restrict_plan(plan, group_names, estimator)
         gradients, seconds = bench.compute_gradients(
             single_plan, "plan", repeats, f"{groups[0].name} by {estimator}"
         )
+        cost = seconds
         if counts_renders:
-            adjoint_renders = (
-                ADJOINT_RENDERS if estimator in ADJOINT_ESTIMATORS else 0.0
-            )
-            # in place of seconds: the image itself, the renders of the differences, and
-            # the adjoint
-            seconds = 1.0 + single_plan.renders + adjoint_renders
+            is_adjoint = estimator in ADJOINT_ESTIMATORS
+            adjoint_renders = ADJOINT_RENDERS if is_adjoint else 0.0
+            # the image itself, the renders of the differences, and the adjoint
+            cost = 1.0 + single_plan.renders + adjoint_renders
         residual = gradients - gradients.mean(dim=0)  # (repeats, d)
         gradients_of[estimator] = gradients
-        seconds_of[estimator] = seconds
-        # variance, summed over the elements
-        noise_of[estimator] = float(residual.square().sum() / max(1, repeats - 1))
-    errors = _compute_squared_errors(gradients_of, noise_of, repeats)
-    return {name: error * seconds_of[name] for name, error in errors.items()}
+        cost_of[estimator] = cost
+        # sum of the variances of all elements
+        variance_of[estimator] = float(residual.square().sum() / max(1, repeats - 1))
+    errors = _compute_squared_errors(gradients_of, variance_of, repeats)
+    return {name: error * cost_of[name] for name, error in errors.items()}
 
 
 def _compute_squared_errors(
-    gradients_of: Mapping[str, Tensor], noise_of: Mapping[str, float], repeats: int
+    gradients_of: Mapping[str, Tensor], variance_of: Mapping[str, float], repeats: int
 ) -> dict[str, float]:
     """Return the mean squared error of the gradients of each estimator.
 
-    The mean gradient by finite differences is the reference, and counts as unbiased:
-    its own error is its noise. From the others' errors the noise of the reference's
-    mean is subtracted; what is left is at least their own noise.
+    The mean gradient by finite differences is the reference, and counts as unbiased. So
+    the error of finite differences is their variance. For any other estimator it is the
+    mean squared distance from the reference, minus the variance of the reference. It is
+    at least the variance of the estimator, which the subtraction may miss by chance.
 
     Args:
-        gradients_of: (repeats, d) of each estimator; one of them takes differences.
-        noise_of: variance of each, summed over the elements.
-        repeats: gradients of each.
+        gradients_of: (repeats, d) gradients by estimator; one takes differences.
+        variance_of: sum of the variances of all elements, by estimator.
+        repeats: number of gradients of each estimator.
     """
     reference = next(name for name in gradients_of if name in DIFFERENCE_ESTIMATORS)
     reference_gradient = gradients_of[reference].mean(dim=0)
-    reference_noise = noise_of[reference]
+    reference_variance = variance_of[reference] / repeats  # that of the mean
     errors = dict[str, float]()
     for estimator, gradients in gradients_of.items():
-        squared_distance = (gradients - reference_gradient).square().sum(dim=1).mean()
-        error = float(squared_distance) - reference_noise / repeats
         if estimator == reference:
-            errors[estimator] = reference_noise
-        else:
-            errors[estimator] = max(error, noise_of[estimator])
+            errors[estimator] = variance_of[reference]
+            continue
+        squared_distance = (gradients - reference_gradient).square().sum(dim=1).mean()
+        error = float(squared_distance) - reference_variance
+        errors[estimator] = max(error, variance_of[estimator])
     return errors
 
 
@@ -251,13 +270,14 @@ def _explain_scores(
         spp: samples per pixel of the gradients.
         counts_renders: whether the cost is a number of renders, and not seconds.
     """
-    # A loss may be flat here, as that of a detector that detects nothing.
+    # All are 0 if the loss is flat, as that of a detector that detects nothing.
     is_flat = not any(scores.values())
     if is_flat:
         return f"as preferred: none of them has an error, measured at {spp} samples"
     cost = "renders" if counts_renders else "time"
     reason = f"least squared error x {cost}, measured at {spp} samples"
-    if scores[best] > 0.0:
+    has_multiples = scores[best] > 0.0
+    if has_multiples:
         others = ", ".join(
             f"{name} {score / scores[best]:.3g}"
             for name, score in scores.items()
@@ -272,10 +292,12 @@ def count_cosine_samples(
 ) -> int:
     """Return how many samples per pixel `measure_cosines` takes at most."""
     working_samples = REPEATS * sum(counts)
-    # once, and once more with more samples
-    converged_samples = N_CONVERGED * (1 + CONVERGED_SPP_FACTOR) * CONVERGED_SPP
+    # converged gradients are computed twice at most, the second time with more samples
+    first_samples = N_CONVERGED * CONVERGED_SPP
+    second_samples = CONVERGED_SPP_FACTOR * first_samples
+    # the factors on the step of each control
     n_steps = sum(len(factors) for _, factors in _list_controls(plan))
-    return (working_samples + converged_samples) * n_steps
+    return (working_samples + first_samples + second_samples) * n_steps
 
 
 def _list_controls(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float]]]:
@@ -296,11 +318,11 @@ def measure_cosines(
 ) -> Iterator[Measured]:
     """Measure the cosine of working gradients with the converged one, for each control.
 
-    For each of `FACTORS` the differences are that many times as wide as planned, in the
-    working gradients and in the converged ones alike. At each width the sample counts
-    are tried in their order, until one reaches the goal; then the next width follows.
-    The last width is a fallback, tried only if no other has reached the goal. A control
-    without finite differences has only the factor 1.
+    The width of differences is multiplied by each of `FACTORS`, in the working
+    gradients and in the converged ones. At each width the sample counts are tried in
+    order, until one reaches the goal; then the next width follows. The last width is a
+    fallback: it is only tried if no other has reached the goal. A control without
+    finite differences has only the factor 1, and no fallback.
 
     Args:
         bench: computes the gradients; its renderer has the plan.
@@ -319,7 +341,8 @@ def measure_cosines(
             if is_fallback and is_reached:
                 break
             plan = restrict_plan(base_plan.scale_steps(factor), group_names)
-            # Widths are limited, so that a larger factor can give the same plan.
+            # Widths have an upper limit, so that a larger factor can give the same
+            # plan.
             if plan in tried_plans:
                 continue
             tried_plans.append(plan)
@@ -337,9 +360,9 @@ def _measure_cosines(
 ) -> Iterator[Measured]:
     """Measure the cosine of one control's gradients at one width of its differences.
 
-    Sample counts are tried in turn, until one reaches the goal. The converged gradient
-    is computed again, once, with more samples if its repeats do not agree well enough
-    or if a working gradient has more samples than it.
+    Sample counts are tried in turn, until the cosine reaches the goal. The converged
+    gradient is computed again with more samples, but only once, if its repeats do not
+    agree well enough or if a working gradient has more samples than it.
     """
     control = groups[0].control
     estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
@@ -381,7 +404,10 @@ def _converged_gradient(
 ) -> tuple[Tensor, float]:
     """Return the mean (d,) of converged gradients, and the smallest cosine of two."""
     gradients, _ = replace(bench, spp=spp).compute_gradients(
-        plan, "converged", N_CONVERGED, f"{label} converged {spp}"
+        plan,
+        stream="converged",
+        repeats=N_CONVERGED,
+        label=f"{label} converged {spp}",
     )
     agreements = torch.tensor(
         [
@@ -389,7 +415,8 @@ def _converged_gradient(
             for gradient_a, gradient_b in itertools.combinations(gradients, 2)
         ]
     )
-    # Unlike Python's, the minimum of a tensor is NaN if a value is.
+    # The cosine with a zero gradient is NaN. Then the minimum of a tensor is NaN, so
+    # that the reference is unusable. Python's `min` would depend on the order.
     return gradients.mean(dim=0), float(agreements.min())
 
 
@@ -402,20 +429,24 @@ def _cosine(gradient_a: Tensor, gradient_b: Tensor) -> float:
 def choose_steps(
     plan: GradientPlan, table: Sequence[Measured]
 ) -> tuple[GradientPlan, int | None]:
-    """Return the plan with each control's step of differences chosen from cosines with
-    the converged gradient, as `measure_cosines` measures them.
+    """Choose each control's step of differences from measured cosines.
 
-    Of the settings (step and sample count) that reach `GOAL_COSINE`, the one with the
-    fewest samples wins, since all take as many renders; of equal ones, that with the
-    greatest cosine. If none reaches it, the one with the greatest cosine wins, and the
-    reason of the group says so.
+    A setting is a step and a sample count. All settings need the same number of
+    renders, so that the cheapest has the fewest samples. For each control the cheapest
+    setting that reaches `GOAL_COSINE` is chosen; of equally cheap ones, that with the
+    largest cosine. If none reaches the goal, the one with the largest cosine is chosen,
+    and the reason of the group says so.
+
+    Args:
+        plan: plan with the steps.
+        table: rows of `measure_cosines`.
 
     Returns:
-        The plan, and the sample count that all controls then need; None where nothing
-        was measured.
+        The plan with the chosen steps, and the largest sample count that a control
+        needs; None if nothing was measured.
     """
     sample_counts = []
-    # each row with its cosine, where that is a number
+    # each row with its cosine, if that is a number
     measured = [
         (row, row.cosine)
         for row in table
@@ -469,10 +500,13 @@ def _choose_setting(
 
 
 def _describe_shortfall(row: Measured) -> str:
-    """Return why a setting does not reach the goal, for a reason; "" if it does."""
+    """Return a remark if a setting does not reach the goal, otherwise "".
+
+    It follows "cosine 0.80 with the converged gradient at 64 samples and 3 x the step".
+    """
     if row.status == "ok":
         return ""
-    agreement = row.reference_cosine
+    agreement = row.reference_cosine  # of two converged gradients
     if agreement is not None and agreement < MIN_AGREEMENT:
         return f": which says little, two converged ones have {agreement:.2f}"
     return f": below {GOAL_COSINE:g}, the best that was found"
@@ -588,11 +622,12 @@ def _compare_depths(
 def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
     """Return why light paths of `depth` segments were chosen, as a clause.
 
-    It has what they leave out, and what the next shorter ones would have.
+    It states the light that they leave out, and that of the next shorter paths.
     """
     texts = []
     for cut in cuts:
-        if cut.depth == depth:  # none, if all segments are needed
+        # If all segments are needed, there is no cut of that depth.
+        if cut.depth == depth:
             texts.append(
                 f"paths of {depth} segments leave out {cut.light:.2%} of the light, "
                 "which moves the picture by "
@@ -606,11 +641,12 @@ def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
     return "; ".join(texts) or f"all {full_depth} segments"
 
 
-# random configurations that are measured besides the clean one
+# number of random configurations that are measured besides the clean one
 N_RANDOM_CONFIGURATIONS = 2
-BOUNCE_SPP = 4  # samples per pixel: the same paths are compared, so that few suffice
-# renders of a search from which on the measurement pays; each path length costs a
-# compilation
+# Samples per pixel. Few suffice, since the same paths are compared.
+BOUNCE_SPP = 4
+# Smallest number of renders of a search for which the measurement pays, as each path
+# length takes a compilation.
 MIN_RENDERS_FOR_BOUNCES = 200
 
 
