@@ -24,7 +24,7 @@ from typing import Any, get_args
 
 from pydantic.fields import ComputedFieldInfo, FieldInfo
 
-from advsearch.cli.flags import SCENE, format_help
+from advsearch.cli.flags import SCENE_HELP, format_help
 from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS
 from advsearch.controls import CONTROLS
@@ -149,7 +149,7 @@ def flags(record: Record) -> str:
         key=lambda group: group == "run",
     ):
         rows = [_flag_row(one) for one in settings(AttackConfig) if one.group == group]
-        rows += [["`--scene`", SCENE, "", ""]] if group == "scene" else []
+        rows += [["`--scene`", SCENE_HELP, "", ""]] if group == "scene" else []
         parts.append(f"**{group.capitalize()}**\n\n" + table(FLAG_HEADS, rows))
     return "\n".join(parts)
 

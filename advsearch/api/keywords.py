@@ -399,11 +399,10 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
 
     scene = settings.get("object")
     model = settings.get("model")
-    is_model_object = isinstance(model, (Model, nn.Module))
     # Workers are other processes, to which these objects cannot be sent.
-    if isinstance(scene, loading.Scene) or is_model_object:
+    if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
         check_no_worker_settings(settings)
-    if is_model_object:
+    if isinstance(model, (Model, nn.Module)):
         settings["model"] = get_model_name(model)
         objects[MODEL, settings["model"]] = model
         if is_session_only(model):

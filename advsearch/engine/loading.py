@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence, ValuesView
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeGuard, final
 
 import numpy as np
 import numpy.typing as npt
@@ -917,7 +917,7 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
     return control_by_name
 
 
-def _is_settings_of_control(value: Any) -> bool:
+def _is_settings_of_control(value: object) -> TypeGuard[Mapping[str, Any]]:
     """Return whether a value is a mapping of settings, and not that of one parameter.
 
     The value of a parameter may be a mapping as well, such as {"range": [0, 30]}.

@@ -506,7 +506,7 @@ def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
         corners: (3, 2) shifts of the lower right, upper right and upper left corner.
     """
     # An affine map is its value at the center, and its slopes along rows and columns.
-    lower_right, upper_right, upper_left = corners
+    lower_right, upper_right, upper_left = corners.unbind()
     side = 2 * (REFERENCE_SIDE // 3)
     by_row = (lower_right - upper_right) / side
     # The diagonal from the upper left to the lower right has both slopes.

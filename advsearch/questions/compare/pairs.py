@@ -192,7 +192,6 @@ def find_pair_rules(
     parameters = table.attrs["units"]
     if len(table) < rules.MIN_ROWS or not parameters:
         return None
-        return None
     choosing, counting = rules.split_in_halves(table, seed)
     found_rules = rules.find_rules(choosing, counting, seeds.stream(seed, "compare"))
     pair_rules = []

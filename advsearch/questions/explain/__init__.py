@@ -138,7 +138,9 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         # the number of draws, if several rows share a draw; else None
         units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rule_rows,
-        rejected_rule=findings.make_rejected_rule(found_rules.best_rejected, len(table)),
+        rejected_rule=findings.make_rejected_rule(
+            found_rules.best_rejected, len(table)
+        ),
         importance=importance,
         envelope=envelope,
         pairs=pairs,

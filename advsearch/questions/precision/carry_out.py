@@ -366,7 +366,11 @@ class QuantityMeasurer:
         confirmations = self._measure_again(title, bench, recommended, budget)
         seconds = time.perf_counter() - start_time
         return sitting.model_copy(
-            update={"confirmations": confirmations, "warnings": warnings, "seconds": seconds}
+            update={
+                "confirmations": confirmations,
+                "warnings": warnings,
+                "seconds": seconds,
+            }
         )
 
     def _measure_again(

@@ -849,7 +849,7 @@ class Points:
         bins = np.minimum(bins, self._n_bins - 1)  # a draw of 1 is in the last
         # Usually a bin is a part. An option with a weight has several bins: there the
         # part of each bin is looked up.
-        parts = bins.copy()
+        parts: NDArray[np.int64] = bins.copy()
         for column, number in enumerate(self.sampled_numbers):
             if number.part_of_bin:
                 parts[:, column] = np.take(number.part_of_bin, bins[:, column])
