@@ -237,8 +237,8 @@ FAULTS = (
     Fault(
         "sweeps: a rate of another group",
         "advsearch/questions/sweep/result.py",
-        "answer=count_by_unit(adversarial, draws, adversarial_outcome),",
-        "answer=count_by_unit(clean, draws, clean_outcome),",
+        "adversarial=count_by_unit(adversarial, draws, adversarial_outcome),",
+        "adversarial=count_by_unit(clean, draws, clean_outcome),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(

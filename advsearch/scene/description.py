@@ -396,9 +396,9 @@ class SceneDescription(SceneData):
         preset = PRESETS[name]
         if self.object.size_in_metres is None:
             raise InputError(
-                f"`camera={name}` is {preset.height:g} m high, and how large "
-                f"{self.object.name} is is not known; give its longest side in metres, "
-                "such as `size=0.1`"
+                f"`camera={name}` is {preset.height:g} m high, and the "
+                f"size of {self.object.name} is not known; give its longest side in "
+                "metres, such as `size=0.1`"
             )
         preset_values = {
             setting: value

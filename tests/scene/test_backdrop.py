@@ -246,7 +246,7 @@ def test_a_coat_loses_what_fresnel_says_where_the_mirrored_object_is(tmp_path: P
 
 def test_a_coat_needs_a_plane_and_a_photograph(photograph: Path) -> None:
     gloss = {"ground.gloss": 0.04}
-    with pytest.raises(InputError, match=r"ground.gloss: is about a photograph"):
+    with pytest.raises(InputError, match=r"ground.gloss: only applies to a scene that is rendered into a photograph"):
         advsearch.load_scene("mug", settings=gloss)
     wrong = {
         "ground.size is 0": gloss | NO_SHADOW,
@@ -488,7 +488,7 @@ def test_what_is_said_of_a_photograph_needs_one_and_a_mask_has_its_size(tmp_path
     write_photograph(tmp_path / "a.png")
     write_photograph(tmp_path / "b.png", (12, 16))
     for settings, front in (({"backdrop.noise": 1.0}, None), ({"ground.level": 1.0}, None), ({}, "b.png")):
-        with pytest.raises(InputError, match="there is none; give a `backdrop`"):
+        with pytest.raises(InputError, match="set `backdrop`"):
             advsearch.load_scene("mug", settings=settings, occluder=front)
     with pytest.raises(InputError, match="expected a mask of 32 x 24 pixels"):
         load_description("mug").with_backdrop(tmp_path / "a.png", tmp_path / "b.png")
