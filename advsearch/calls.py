@@ -13,7 +13,7 @@ from functools import wraps
 from typing import Any, TypeVar
 
 from advsearch.errors import InputError, find_similar_names
-from advsearch.files import either
+from advsearch.files import join_alternatives
 from advsearch.options import describe_value
 
 OTHER_TERMS = {"eot": "over", "minimal_perturbation": "smallest"}
@@ -126,7 +126,7 @@ def check_types(
                 for kind in type_names
             ]
             raise InputError(
-                f"{name}: expected {either(words)}, got {describe_value(value)}"
+                f"{name}: expected {join_alternatives(words)}, got {describe_value(value)}"
             )
         if name == "run" and isinstance(value, str) and not value.strip():
             raise InputError(

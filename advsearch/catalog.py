@@ -23,13 +23,13 @@ class BuiltIn(NamedTuple):
             files to glTF.
         name: its name on the command line. For a reader or converter it is the suffix
             of its files, and for a recognizer the library of its networks.
-        target: "module:attribute" that is imported when the part is used.
+        import_path: "module:attribute" that is imported when the part is used.
         help: what it does, in a line that begins in lower case and has no full stop.
     """
 
     kind: str
     name: str
-    target: str
+    import_path: str
     help: str
 
 
@@ -532,7 +532,7 @@ BUILT_INS = (
 )
 
 
-def is_present(module: str) -> bool:
+def is_module_installed(module: str) -> bool:
     """Return whether a module is installed, without importing it or its packages.
 
     Args:
@@ -575,7 +575,7 @@ def list_built_ins(kind: str) -> dict[str, BuiltIn]:
     """
     built_ins = {}
     for part in BUILT_INS:
-        module, _, _ = part.target.partition(":")
-        if part.kind == kind and is_present(module):
+        module, _, _ = part.import_path.partition(":")
+        if part.kind == kind and is_module_installed(module):
             built_ins[part.name] = part
     return built_ins

@@ -19,7 +19,7 @@ from pydantic import Field, JsonValue, field_validator, model_validator
 
 from advsearch import registry
 from advsearch.errors import InputError
-from advsearch.files import MESHES, either
+from advsearch.files import MESHES, join_alternatives
 from advsearch.options import TASK_SEPARATOR, format_things, group_mitsuba_keys
 from advsearch.settings import Clash, Config, setting, setting_as_in
 from advsearch.settings import values as written
@@ -31,7 +31,7 @@ path is stored, so that a run may be resumed from any directory.
 """
 
 
-def read_named(value: Any, setting: str, default_name: str) -> Any:
+def parse_name_with_options(value: Any, setting: str, default_name: str) -> Any:
     """Read a setting that is a name, or a name with options.
 
     ``NAME={OPTION: VALUE}`` becomes ``{"name": NAME, OPTION: VALUE}``, and a mapping
@@ -61,12 +61,12 @@ def read_named(value: Any, setting: str, default_name: str) -> Any:
     return {"name": name, **options} if options else name
 
 
-def read_joined(value: Any, setting: str, default_name: str) -> Any:
+def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
     """Read a setting that is one name, or several names joined with + or in a list.
 
     Each name may have options, as in ``detection={iou: 0.7}+depth``. The result has the
     joined names, and under each name its options: ``{"name": "detection+depth",
-    "detection": {"iou": 0.7}}``. A single name is read by `read_named`.
+    "detection": {"iou": 0.7}}``. A single name is read by `parse_name_with_options`.
 
     Args:
         value: value of the setting; a value of another form is returned unchanged, to
@@ -77,12 +77,12 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
     # Split at each + that is not inside of braces.
     entries = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
     if not isinstance(entries, (list, tuple)) or len(entries) < 2:
-        return read_named(value, setting, default_name)
+        return parse_name_with_options(value, setting, default_name)
     names = []
     options: dict[str, dict[str, Any]] = {}
     for entry in entries:
         text = entry.strip() if isinstance(entry, str) else entry
-        named = read_named(text, setting, default_name)
+        named = parse_name_with_options(text, setting, default_name)
         mapping = dict(named) if isinstance(named, Mapping) else {"name": named}
         name = mapping.pop("name", None)
         if not isinstance(name, str) or not name:
@@ -100,20 +100,20 @@ def read_joined(value: Any, setting: str, default_name: str) -> Any:
         options[last_name] = {}
         options.update(last_options)
     options = {name: value for name, value in options.items() if value}
-    return read_named(
+    return parse_name_with_options(
         {**options, "name": TASK_SEPARATOR.join(names)}, setting, default_name
     )
 
 
-def has_address(model: str) -> bool:
+def has_model_url(model: str) -> bool:
     """Return whether the name of a model, or one of several names, is an address."""
     names = written.split_names(model)
     return any(re.match("https?:", name, re.IGNORECASE) for name in names)
 
 
-def get_name(named: str | Mapping[str, object]) -> str:
-    """Return the name in a setting in the form that `read_named` returns."""
-    return named if isinstance(named, str) else str(named["name"])
+def get_name_without_options(name_with_options: str | Mapping[str, object]) -> str:
+    """Return the name in a setting in the form that `parse_name_with_options` returns."""
+    return name_with_options if isinstance(name_with_options, str) else str(name_with_options["name"])
 
 
 DEFAULT_ENVIRONMENT = "studio"
@@ -181,7 +181,7 @@ class SceneConfig(Config):
         ...,
         "scene",
         "the object that the model should recognize",
-        f"the name of an object or a {either(MESHES)} file",
+        f"the name of an object or a {join_alternatives(MESHES)} file",
     )
     environment: str | None = setting(
         None,
@@ -456,16 +456,16 @@ class SceneConfig(Config):
         return self
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return self.object, *self.controls
 
     @property
     def task_name(self) -> str:
         """The name of the task."""
-        return get_name(self.task)
+        return get_name_without_options(self.task)
 
     @property
-    def used_threads(self) -> int | None:
+    def n_used_threads(self) -> int | None:
         """Number of processor threads to use; None for all."""
         return 1 if self.deterministic else self.threads
 
@@ -562,7 +562,7 @@ class SceneConfig(Config):
     @field_validator("task", mode="before")
     @classmethod
     def _task_with_options(cls, value: Any) -> Any:
-        return read_joined(value, "task", cls.model_fields["task"].default)
+        return parse_joined_names(value, "task", cls.model_fields["task"].default)
 
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod

@@ -69,28 +69,28 @@ def _copy_dataclass(original: Any) -> Any:
     return copied
 
 
-def is_ours(kind: type) -> bool:
+def is_package_class(kind: type) -> bool:
     """Return whether this package defines a class."""
     return kind.__module__.partition(".")[0] == __name__.partition(".")[0]
 
 
-def hand_copies(kind: type, **argument_slices: slice) -> None:
+def copy_method_arguments(user_class: type, **argument_slices: slice) -> None:
     """Make methods of a user's class get copies of their arguments.
 
     So code of users may change its arguments in place without harm to the search.
 
     Args:
-        kind: the class, whose methods are replaced. A class of this package is not
+        user_class: the class, whose methods are replaced. A class of this package is not
             changed.
         argument_slices: by name of the method, which positional arguments after `self`
             are copied. All keyword arguments are copied.
     """
-    if is_ours(kind):
+    if is_package_class(user_class):
         return
     for name, argument_slice in argument_slices.items():
-        method = vars(kind).get(name)
+        method = vars(user_class).get(name)
         if isinstance(method, FunctionType):
-            setattr(kind, name, _wrap_with_copies(method, argument_slice))
+            setattr(user_class, name, _wrap_with_copies(method, argument_slice))
 
 
 def _wrap_with_copies(method: Callable[..., Any], which: slice) -> Callable[..., Any]:

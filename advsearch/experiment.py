@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar, get_args, get_type_hints
 
 from advsearch import registry, threads
-from advsearch.interrupts import interruptible
+from advsearch.interrupts import reraise_lost_interrupt
 from advsearch.progress import NullProgress, Progress, Stages, as_progress
 from advsearch.report.views import Claim, ShownResult, get_view, render_result_figure
 from advsearch.runs.directory import (
@@ -76,7 +76,7 @@ class RunContext(ExitStack, Generic[Settings]):
     Attributes:
         config: settings of the experiment.
         progress: object that displays the progress.
-        resumed: folder of the run that is continued; None for a new run.
+        resumed_directory: folder of the run that is continued; None for a new run.
         ending: status with which the run will end, "done" or "interrupted".
     """
 
@@ -84,7 +84,7 @@ class RunContext(ExitStack, Generic[Settings]):
         self,
         config: Settings,
         progress: Progress | None = None,
-        resumed: Path | None = None,
+        resumed_directory: Path | None = None,
     ) -> None:
         """Start to measure the time of an experiment.
 
@@ -93,12 +93,12 @@ class RunContext(ExitStack, Generic[Settings]):
         Args:
             config: settings of the experiment.
             progress: object that displays the progress; None for no display.
-            resumed: folder of the run to continue; None for a new run.
+            resumed_directory: folder of the run to continue; None for a new run.
         """
         super().__init__()
         self.config = config
         self.progress = progress or NullProgress()
-        self.resumed = resumed
+        self.resumed_directory = resumed_directory
         self.ending = "done"
         self._start_time = time.perf_counter()
 
@@ -109,7 +109,7 @@ class RunContext(ExitStack, Generic[Settings]):
         The first access creates it. Check all settings before, so that a wrong one
         leaves no run behind.
         """
-        return self.enter_context(RunDirectory.open(self.config, self.resumed))
+        return self.enter_context(RunDirectory.open(self.config, self.resumed_directory))
 
     @cached_property
     def stages(self) -> Stages:
@@ -128,7 +128,7 @@ class RunContext(ExitStack, Generic[Settings]):
         The experiment continues after the block, with `ending` set to `INTERRUPTED`.
         """
         try:
-            with interruptible():
+            with reraise_lost_interrupt():
                 yield
         except KeyboardInterrupt:
             self.ending = INTERRUPTED
@@ -217,14 +217,14 @@ def run_and_save(
 
 
 def run_experiment(
-    config: Config, *, progress: Progress | None = None, resumed: Path | None = None
+    config: Config, *, progress: Progress | None = None, resumed_directory: Path | None = None
 ) -> Result:
     """Run the experiment to which settings belong, and return its result.
 
     Args:
         config: settings of any experiment; `config.command` names it.
         progress: object that displays the progress; None for no display.
-        resumed: folder of the run to continue; None for a new run.
+        resumed_directory: folder of the run to continue; None for a new run.
 
     Raises:
         InputError: a setting is wrong; nothing is written then.
@@ -235,13 +235,13 @@ def run_experiment(
     if not config.python_only_parts:
         check_names(dict(config))
     # An experiment with `out` writes a file or folder of its own, and no run.
-    creates_run = resumed is None and getattr(config, "out", None) is None
+    creates_run = resumed_directory is None and getattr(config, "out", None) is None
     # The folder of a new run is created before slow imports, so that a run that is
     # stopped early can be listed. Then the experiment continues in it as in a resumed
     # run.
-    with create_before_work(config) if creates_run else nullcontext(resumed) as folder:
+    with create_before_work(config) if creates_run else nullcontext(resumed_directory) as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
-        return experiment.run(config, progress=progress, resumed=folder)
+        return experiment.run(config, progress=progress, resumed_directory=folder)
 
 
 def find_stopped_run(config: Config) -> Path | None:
@@ -287,7 +287,7 @@ def run_part(
     return run(
         type(config).from_yaml(folder / CONFIG, config.session_settings),
         progress=progress,
-        resumed=folder,
+        resumed_directory=folder,
     )
 
 
@@ -375,7 +375,7 @@ class Experiment(Generic[AnyResult]):
         config: Any,
         *,
         progress: Progress | None = None,
-        resumed: Path | None = None,
+        resumed_directory: Path | None = None,
         **arguments: Any,
     ) -> AnyResult:
         """Run the experiment with settings, and save its result.
@@ -383,12 +383,12 @@ class Experiment(Generic[AnyResult]):
         Args:
             config: settings of the experiment.
             progress: object that displays the progress; None for no display.
-            resumed: folder of the run to continue; None for a new run.
+            resumed_directory: folder of the run to continue; None for a new run.
             arguments: objects that Python callers passed and that are no settings, such
                 as a scene in memory, for the function of the experiment.
         """
         return run_and_save(
-            partial(self.function, **arguments), RunContext(config, progress, resumed)
+            partial(self.function, **arguments), RunContext(config, progress, resumed_directory)
         )
 
     def __call__(self, *args: Any, **settings: Any) -> AnyResult:
@@ -433,7 +433,7 @@ class Experiment(Generic[AnyResult]):
             config = make_config(self.settings, **config_values)
             resumed = find_stopped_run(config) if resume else None
             return self.run(
-                config, progress=as_progress(progress), resumed=resumed, **arguments
+                config, progress=as_progress(progress), resumed_directory=resumed, **arguments
             )
 
         # `with_settings_signature` reads the signature, and adds the other settings.

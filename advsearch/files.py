@@ -19,10 +19,10 @@ other packages.
 """
 
 
-def either(names: Sequence[str], word: str = "or") -> str:
+def join_alternatives(names: Sequence[str], conjunction: str = "or") -> str:
     """Return names as a sentence lists them: ".a, .b or .c"."""
     *first, last = names
-    return f"{', '.join(first)} {word} {last}" if first else last
+    return f"{', '.join(first)} {conjunction} {last}" if first else last
 
 
 PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")

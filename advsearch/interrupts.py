@@ -28,14 +28,14 @@ class Interrupts:
     """A handler of Ctrl-C that raises KeyboardInterrupt, and counts the interrupts.
 
     Attributes:
-        count: number of interrupts so far.
-        handled: number of those that were handled, that is, that ended something.
-        ended: whether all work is done, so that nothing is left to interrupt.
+        n_received: number of interrupts so far.
+        n_handled: number of those that were handled, that is, that ended something.
+        is_work_done: whether all work is done, so that nothing is left to interrupt.
     """
 
     def __init__(self) -> None:
-        self.count = self.handled = 0
-        self.ended = False
+        self.n_received = self.n_handled = 0
+        self.is_work_done = False
         self._last = -DUPLICATE_SECONDS
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
@@ -52,20 +52,20 @@ class Interrupts:
         self._last = time.monotonic()
         if self._last - previous < DUPLICATE_SECONDS:
             return
-        self.count += 1
-        if not self.ended:
+        self.n_received += 1
+        if not self.is_work_done:
             raise KeyboardInterrupt
 
     @property
-    def waiting(self) -> bool:
+    def has_pending(self) -> bool:
         """Whether an interrupt has come that was not handled yet."""
-        return self.count > self.handled
+        return self.n_received > self.n_handled
 
     def mark_handled(self) -> None:
         """Count all interrupts so far as handled."""
-        self.handled = self.count
+        self.n_handled = self.n_received
 
-    def look(self) -> None:
+    def raise_pending(self) -> None:
         """Raise an earlier interrupt again if it was not handled.
 
         As for Python's own handler, only the main thread is interrupted.
@@ -73,7 +73,7 @@ class Interrupts:
         Raises:
             KeyboardInterrupt: there is such an interrupt, and this is the main thread.
         """
-        if self.waiting and threading.current_thread() is threading.main_thread():
+        if self.has_pending and threading.current_thread() is threading.main_thread():
             raise KeyboardInterrupt
 
 
@@ -81,7 +81,7 @@ INTERRUPTS = Interrupts()  # the interrupts of this process
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
+def reraise_lost_interrupt() -> Iterator[None]:
     """Make sure that an interrupt ends the block, even if some code has caught it.
 
     The caller handles the KeyboardInterrupt.
@@ -100,12 +100,12 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGINT, INTERRUPTS)
     try:
         yield
-        INTERRUPTS.look()  # raises an interrupt that was lost inside the block
+        INTERRUPTS.raise_pending()  # raises an interrupt that was lost inside the block
     except KeyboardInterrupt:
         INTERRUPTS.mark_handled()
         raise
     except Exception as error:
-        if INTERRUPTS.waiting:
+        if INTERRUPTS.has_pending:
             INTERRUPTS.mark_handled()
             raise KeyboardInterrupt from error
         raise
@@ -155,7 +155,7 @@ def _wait_for_second(reading_end: socket.socket, writing_end: socket.socket) -> 
             continue
         # one Ctrl-C may come as two signals in a short time
         is_duplicate = now - first_time < DUPLICATE_SECONDS
-        if not is_duplicate and not INTERRUPTS.ended:
+        if not is_duplicate and not INTERRUPTS.is_work_done:
             show_cursor = b"\x1b[?25h" if os.isatty(2) else b""  # bars hide it
             with suppress(OSError):
                 os.write(2, show_cursor + b"advsearch: interrupted\n")

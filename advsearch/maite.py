@@ -206,7 +206,7 @@ class Scenes:
         self.task = task
         self.spp = spp
         self.seed = seed
-        description, _filter = self.renderer.scene.definition
+        description, _filter = self.renderer.scene.description_and_filter
         # the classes that count as right for the object
         self.right = find_label_set(
             label or description.object.label or description.object_name, self.labels
@@ -259,7 +259,7 @@ class Scenes:
         if self.task == "classification":
             one_hot = nn.functional.one_hot(torch.tensor(right_class), len(self.labels))
             return one_hot.float()
-        description, _filter = self.renderer.scene.definition
+        description, _filter = self.renderer.scene.description_and_filter
         boxes = []
         classes = []
         for thing in find_visible_meshes(self.renderer, u):

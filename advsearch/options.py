@@ -245,7 +245,7 @@ def _to_json(value: object) -> JsonValue:
     return None
 
 
-def to_setting(entry: Any) -> str | dict[str, JsonValue]:
+def convert_to_setting(entry: Any) -> str | dict[str, JsonValue]:
     """Return a policy or a task as a setting that a file can hold.
 
     The setting is its name, or a mapping with its name and the options that differ from
@@ -270,11 +270,11 @@ def describe_value(value: object) -> str:
     return f"{value!r:.80}"
 
 
-def check_takes(what: str, function: Callable[..., object], *names: str) -> None:
+def check_takes_arguments(function_title: str, function: Callable[..., object], *names: str) -> None:
     """Check that a user's function takes arguments of these names by position.
 
     Args:
-        what: setting and name of the function, for messages ("metrics: f").
+        function_title: setting and name of the function, for messages ("metrics: f").
         function: function to check.
         *names: names of the arguments.
 
@@ -287,7 +287,7 @@ def check_takes(what: str, function: Callable[..., object], *names: str) -> None
         return
     except TypeError as error:
         raise InputError(
-            f"{what}: expected a function of ({', '.join(names)}): {error}"
+            f"{function_title}: expected a function of ({', '.join(names)}): {error}"
         ) from None
 
 

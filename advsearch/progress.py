@@ -108,7 +108,7 @@ class Stages:
             self._name = ""
 
     @property
-    def total(self) -> float:
+    def total_seconds(self) -> float:
         return time.perf_counter() - self._started
 
 
@@ -138,7 +138,7 @@ LINE_FRACTION = 0.1
 
 
 def open_progress(
-    requested: ProgressOption, written: Callable[[str], str] = str
+    requested: ProgressOption, format_names: Callable[[str], str] = str
 ) -> AbstractContextManager[Progress]:
     """Return an object that displays progress, to be used in a `with` block.
 
@@ -146,7 +146,7 @@ def open_progress(
         requested: True for a display in a notebook, a terminal or a stream of lines;
             None for bars in a terminal only; False for no display; or an object with
             the methods of `Progress`, which is returned.
-        written: function that replaces settings in a text, such as "`steps`", by the
+        format_names: function that replaces settings in a text, such as "`steps`", by the
             form in which the reader writes them, such as "--steps".
 
     Raises:
@@ -164,15 +164,15 @@ def open_progress(
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     is_notebook = getattr(shell, "kernel", None) is not None
     if requested and is_notebook:
-        return NotebookProgress(written)
+        return NotebookProgress(format_names)
     stream = sys.stderr  # None in a process without a terminal or a pipe
     if stream is not None and stream.isatty():
         # A `Screen` around the terminal would escape the control characters of bars, so
         # they are written to the stream inside of it.
         terminal = getattr(stream, "stream", stream)
-        return BarProgress(terminal, written)
+        return BarProgress(terminal, format_names)
     if requested and stream is not None:
-        return LineProgress(stream, written)
+        return LineProgress(stream, format_names)
     return nullcontext(NullProgress())
 
 
@@ -201,19 +201,19 @@ class LineProgress:
     def __init__(
         self,
         stream: IO[str],
-        written: Callable[[str], str] = str,
+        format_names: Callable[[str], str] = str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Display progress as lines of text.
 
         Args:
             stream: stream to which the lines are written.
-            written: function that replaces settings in a text, such as "`steps`", by
+            format_names: function that replaces settings in a text, such as "`steps`", by
                 the form in which the reader writes them, such as "--steps".
             clock: function that returns the time in seconds; tests pass another one.
         """
         self._stream = stream
-        self._format_names = written
+        self._format_names = format_names
         self._clock = clock
         self._lock = threading.RLock()
         self._ended = threading.Event()
@@ -249,13 +249,13 @@ class LineProgress:
         with self._lock:
             self._done += n
             self._info = format_info(info) if info else self._info
-        self.tick()
+        self.print_if_due()
 
     def message(self, text: str) -> None:
         with self._lock:
             self._print(self._format_names(text))
 
-    def tick(self) -> None:
+    def print_if_due(self) -> None:
         """Print a line if it is time for one.
 
         A stage is announced when it has lasted a while; the longer it lasts, the rarer
@@ -305,7 +305,7 @@ class LineProgress:
 
         def tick_every_second() -> None:
             while not self._ended.wait(1.0):
-                self.tick()
+                self.print_if_due()
 
         self._thread = threading.Thread(
             target=tick_every_second, name="progress", daemon=True
@@ -330,7 +330,7 @@ class NotebookProgress(LineProgress):
         display = sys.modules["IPython"].display.display
         self._handle = display({"text/plain": ""}, raw=True, display_id=True)
 
-    def tick(self) -> None:
+    def print_if_due(self) -> None:
         with self._lock:
             if self._clock() - self._updated >= MIN_UPDATE_SECONDS:
                 self._updated = self._clock()
@@ -352,12 +352,12 @@ class BarProgress:
     The bars disappear at the end of the `with` block.
     """
 
-    def __init__(self, terminal: IO[str], written: Callable[[str], str] = str) -> None:
+    def __init__(self, terminal: IO[str], format_names: Callable[[str], str] = str) -> None:
         """Display progress as bars in a terminal.
 
         Args:
             terminal: stream of the terminal.
-            written: function that replaces settings in a text, such as "`steps`", by
+            format_names: function that replaces settings in a text, such as "`steps`", by
                 the form in which the reader writes them, such as "--steps".
         """
         # imported late, so that --help answers at once
@@ -375,7 +375,7 @@ class BarProgress:
         self.bars = bars.Progress(
             *columns, console=Console(file=terminal), transient=True
         )
-        self._format_names = written
+        self._format_names = format_names
 
     def stage(
         self,

@@ -37,12 +37,12 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     built_ins: Mapping[str, Entry | BuiltIn]
     # Description of an entry for messages: "a subclass of Policy whose name is that of
     # the entry point".
-    expected: str
-    fits: Callable[[str, Any], bool]  # whether an object under a name is an entry
+    expected_entry: str
+    is_valid_entry: Callable[[str, Any], bool]  # whether an object under a name is an entry
     # Whether a class of the user is an entry, too, by the name "package.module:Class".
     # It is imported from the Python path or the current directory, and its name begins
     # with a capital letter.
-    imports: bool = False
+    imports_user_classes: bool = False
 
     def __getitem__(self, name: str) -> Entry:
         """Return the entry of a name, and import it if that was not done yet.
@@ -55,14 +55,14 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             InputError: the entry cannot be imported or has the wrong type, or only a
                 file names this code and the user has not allowed it (`check_import`).
         """
-        if self.names_class(name):
+        if self.is_class_path(name):
             return self._import_class(name)
         if name not in self.built_ins:
             return self._load_installed(name)
         built_in = self.built_ins[name]
         if not isinstance(built_in, BuiltIn):
             return built_in
-        target: Entry = load_attribute(built_in.target)
+        target: Entry = load_attribute(built_in.import_path)
         return target
 
     def _import_class(self, name: str) -> Entry:
@@ -81,8 +81,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 f"{name}: cannot be imported ({type(error).__name__}: {error}); "
                 f"a module is looked for on the Python path and in {os.getcwd()}"
             ) from error
-        if not self.fits(getattr(entry, "kind", ""), entry):
-            raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
+        if not self.is_valid_entry(getattr(entry, "kind", ""), entry):
+            raise InputError(f"{name}: expected {self.expected_entry}, got {entry!r}")
         return entry
 
     def __contains__(self, name: object) -> bool:
@@ -95,7 +95,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """
         if not isinstance(name, str):
             return False
-        if self.names_class(name):
+        if self.is_class_path(name):
             return self[name] is not None
         return name in self.built_ins or name in self._installed
 
@@ -126,7 +126,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 usable[name] = self[name]
         return usable
 
-    def names_class(self, name: str) -> bool:
+    def is_class_path(self, name: str) -> bool:
         """Return whether a name stands for a class to import.
 
         "package.module:Class" does, if this registry allows it (`imports`). "light:Key"
@@ -134,7 +134,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """
         module, _, attribute = name.partition(":")
         is_class_name = attribute[:1].isupper() and attribute.isidentifier()
-        if not self.imports or not is_class_name:
+        if not self.imports_user_classes or not is_class_name:
             return False
         packages = module.split(".")
         if packages[0] in self.built_ins or packages[0] in self._installed:
@@ -160,8 +160,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             raise InputError(
                 f"{where}: cannot be imported ({error}); {advice}"
             ) from None
-        if not self.fits(name, entry):
-            raise InputError(f"{where}: expected {self.expected}; {advice}")
+        if not self.is_valid_entry(name, entry):
+            raise InputError(f"{where}: expected {self.expected_entry}; {advice}")
         return entry
 
 
@@ -190,8 +190,8 @@ def get_class(kind: str, name: str) -> Any:
         AttributeError: there is none.
     """
     for part in list_built_ins(kind).values():
-        if part.target.endswith(f":{name}"):
-            return load_attribute(part.target)
+        if part.import_path.endswith(f":{name}"):
+            return load_attribute(part.import_path)
     raise AttributeError(f"there is no {kind} with a class {name}")
 
 

@@ -12,7 +12,7 @@ import zlib
 import numpy as np
 
 
-def stream(root: int, name: str, index: int = 0) -> int:
+def derive_seed(root: int, name: str, index: int = 0) -> int:
     """Return a seed of a named stream under a root seed, in [0, 2**32).
 
     It is the same for the same arguments on every machine.

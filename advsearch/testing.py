@@ -160,7 +160,7 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     from advsearch.extend import workbench
 
     experiment = workbench.get_experiment("test")
-    workbench.allow_named(settings)
+    workbench.allow_code_in_settings(settings)
     # no other thread of this process may render at the same time
     with workbench.hold_process_lock():
         result: SuiteResult = experiment.run(
@@ -213,9 +213,9 @@ def _assert_claim(
     experiment = workbench.get_experiment("test")
     title = f"assert_{claim['claim']}"
     with workbench.hold_process_lock():
-        workbench.allow_named(settings)
+        workbench.allow_code_in_settings(settings)
         for model in models.values():
-            workbench.allow_named({"model": model})
+            workbench.allow_code_in_settings({"model": model})
         # the settings with names in place of objects, and the objects by these names
         suite_settings, objects = _name_objects(object, settings)
         claim_settings = dict(claim)

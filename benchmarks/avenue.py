@@ -60,7 +60,7 @@ from advsearch.questions.attack.run import choose_policy
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.library import list_environments
 from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE_DEPTH
-from advsearch.scene.mitsuba_backend.variant import population
+from advsearch.scene.mitsuba_backend.variant import scene_registry
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import LinearRenderer
 
@@ -294,7 +294,7 @@ def _compare_roulette(args: argparse.Namespace) -> None:
     for depth in (NO_ROULETTE_DEPTH, 3, 2, 1):
         backend.roulette_depth = depth
         backend._integrators.clear()
-        population.changes += 1
+        scene_registry.n_changes += 1
         with torch.no_grad():
             if depth == NO_ROULETTE_DEPTH:
                 true_image = renderer(renderer.start, 0, 16 * args.spp)
@@ -431,7 +431,7 @@ def _run_search(
             policy, journal, progress, findings, specialise=True, clean=CleanMatrix()
         )
     searches = stages.Searches(journal, progress, findings)
-    result = searches.search(
+    result = searches.run_search(
         "search", policy, problem.steps, problem.seed, ranked=False
     )
     return findings, result

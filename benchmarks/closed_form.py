@@ -299,7 +299,7 @@ def linear(norm: str) -> Callable[[int, int], Problem]:
         best = (
             domain.project(start + 1e4 * w)
             if norm == "l2"
-            else torch.where(w > 0, domain.upper, domain.lower)
+            else torch.where(w > 0, domain.upper_bounds, domain.lower_bounds)
         )
 
         def value(u: Tensor) -> float:

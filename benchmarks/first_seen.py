@@ -38,7 +38,7 @@ from torch.nn.functional import max_pool2d
 
 import advsearch
 from advsearch.options import Outcome
-from advsearch.questions.sweep.display import distance_sentence, find_detection_distance
+from advsearch.questions.sweep.display import describe_detection_distance, find_detection_distance
 from advsearch.questions.sweep.summary import AxisRow
 from advsearch.statistics.monotone import find_dips
 
@@ -104,7 +104,7 @@ def levels(light: Light, distance: float, size: int) -> tuple[float, float, floa
     render = scene.renderer({"camera": {"roll": [-1.0, 1.0]}}, resolution=size)
     with torch.no_grad():
         grey = render(render.start, 0, 16).mean(-1).reshape(size, size) * 255.0
-        car = render.mask(render.start).reshape(size, size) > 0.5
+        car = render.compute_object_mask(render.start).reshape(size, size) > 0.5
     width = max(1, int(car.any(0).sum()) // 4)
     rim = (max_pool2d(car[None].float(), 2 * width + 1, 1, width)[0] > 0.5) & ~car
     return float(grey[car].mean()), float(grey[rim].mean()), float(grey[car].std())
@@ -254,7 +254,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             ).summary
             rows = [row for row in summary.axes if row.axis == "camera.distance"]
             seen = find_detection_distance(summary)
-            said = "-" if seen is None else distance_sentence(seen)
+            said = "-" if seen is None else describe_detection_distance(seen)
             look = ", ".join(
                 f"{one:.0f}" for one in levels(light, args.look, args.size)
             )

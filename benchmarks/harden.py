@@ -55,10 +55,10 @@ def main() -> int:
         config = HardenConfig(**{**first, **changes, "run": str(args.run)})
     with open_progress(True) as progress:
         result = harden.run(
-            config, progress=progress, resumed=args.run if there else None
+            config, progress=progress, resumed_directory=args.run if there else None
         )
     before_and_after = make_harden_view(result).sections[0]
-    print(" | ".join(before_and_after.heads))
+    print(" | ".join(before_and_after.column_heads))
     for row in before_and_after.rows:
         print(" | ".join(row))
     spent = ", ".join(

@@ -274,7 +274,7 @@ def measured(
     ways = [lean, full, lean.copy_with(lean.scene.copy_with(max_depth=depth))]
     truth = torch.stack(
         [
-            one.gradient(loss, u, seeds.stream(1, "truth", n), 8 * spp)[1]
+            one.gradient(loss, u, seeds.derive_seed(1, "truth", n), 8 * spp)[1]
             for n in range(REFERENCES)
             for one in (lean, full)
         ]
@@ -307,7 +307,7 @@ def _time_gradients(
     for number in range(repeats):
         for way, results in zip(ways, found, strict=True):
             begun = time.process_time()
-            estimate = way.gradient(loss, u, seeds.stream(2, "working", number), spp)[1]
+            estimate = way.gradient(loss, u, seeds.derive_seed(2, "working", number), spp)[1]
             seconds = time.process_time() - begun
             results.append((seconds, float((estimate - truth).square().sum())))
     times = [statistics.median(one[0] for one in results) for results in found]
@@ -374,7 +374,7 @@ def cropped(size: int, spp: int, repeats: int) -> str:
     loss = make_smooth_loss((size, size))
     truth = torch.stack(
         [
-            whole.gradient(loss, u, seeds.stream(1, "truth", n), 4 * spp)[1]
+            whole.gradient(loss, u, seeds.derive_seed(1, "truth", n), 4 * spp)[1]
             for n in range(REFERENCES)
         ]
     ).mean(dim=0)

@@ -90,7 +90,7 @@ def gap(
         def evaluate(query: Query) -> Evaluation:
             key = [
                 seed,
-                query.index,
+                query.row_index,
                 zlib.crc32(query.u.numpy().tobytes()),
                 zlib.crc32(by.name.encode()),
             ]
@@ -132,8 +132,8 @@ def box(rng: np.random.Generator, d: int, *blocks: Block) -> Domain:
     parts = blocks or (Block(d),)
     begin = 0
     for block in parts:
-        if block.options:
-            start[begin] = 0.5 / block.options
+        if block.n_options:
+            start[begin] = 0.5 / block.n_options
         begin += block.size
     return Domain(
         torch.tensor(start, dtype=torch.float32), tuple(parts), gradient_cost=10**6
@@ -224,7 +224,7 @@ def choices(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
         return np.asarray(value)
 
     rest = (Block(d - ways),) if d > ways else ()
-    return box(rng, d, *(Block(1, options=count) for count in counts), *rest), function
+    return box(rng, d, *(Block(1, n_options=count) for count in counts), *rest), function
 
 
 KINDS: dict[str, Callable[[np.random.Generator, int], tuple[Domain, Function]]] = {

@@ -223,7 +223,7 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
         samplers = dict.fromkeys(("multijitter", found.estimator.partition(" ")[0]))
         bench = PictureBench(
             renderer,
-            problem.add_conditions(problem.domain.start),
+            problem.make_full_configuration(problem.domain.start),
             lambda picture: 1.0,
             list(samplers),
         )
@@ -247,7 +247,7 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
         samples,
         reference_error=bench.get_reference_error(setting, found.quantity),
     )
-    return point.rms, point.is_known
+    return point.rms_error, point.has_known_error
 
 
 if __name__ == "__main__":

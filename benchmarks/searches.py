@@ -105,14 +105,14 @@ def _answer(problem: Problem, policy: str, renders: int, seed: int) -> float:
     """Verified margin of what a search finds: fresh seeds, 8 bits, a high sample
     count.
     """
-    problem.seed = seeds.stream(7, "searches", seed)
+    problem.seed = seeds.derive_seed(7, "searches", seed)
     steps = max(1, renders - 8)  # the ranking of candidates takes eight
     found = search(
         partial(map, problem.evaluate),
         problem.domain,
         make_policy(policy),
         steps=steps,
-        seed=seeds.stream(seed, policy),
+        seed=seeds.derive_seed(seed, policy),
         kind=policy,
         render_seed=problem.seed,
     )
@@ -121,7 +121,7 @@ def _answer(problem: Problem, policy: str, renders: int, seed: int) -> float:
 
 def _verified(problem: Problem, u: Tensor, trials: int = TRIALS) -> float:
     queries = [
-        Query(u, seeds.stream(99, "trial", number), spp=TRIAL_SPP)
+        Query(u, seeds.derive_seed(99, "trial", number), spp=TRIAL_SPP)
         for number in range(trials)
     ]
     return statistics.fmean(
@@ -202,7 +202,7 @@ def _transport(args: argparse.Namespace) -> None:
         margins = []
         seconds = []
         for seed in range(args.seeds + 1):
-            problem.seed = seeds.stream(7, "searches", seed)
+            problem.seed = seeds.derive_seed(7, "searches", seed)
             begun = time.process_time()
             predicted = name == "predicted"
             evaluate = partial(
@@ -212,10 +212,10 @@ def _transport(args: argparse.Namespace) -> None:
             )
             found = search(
                 partial(map, evaluate),
-                replace(problem.domain, exact=predicted),
+                replace(problem.domain, is_noise_free=predicted),
                 make_policy("auto"),
                 steps=args.renders,
-                seed=seeds.stream(seed, "auto"),
+                seed=seeds.derive_seed(seed, "auto"),
                 render_seed=problem.seed,
             )
             if seed:  # the first one compiles the renderer's code

@@ -169,7 +169,7 @@ def row(
     light(renderer.start)
     first = time.process_time() - begun
     wholes = views(renderer, args.views)
-    inputs = [renderer.scene.assembly(renderer.space.inputs(one)) for one in wholes]
+    inputs = [renderer.scene.input_assembler(renderer.space.inputs(one)) for one in wholes]
     others = [milliseconds(lambda one=one: light.compute_light(one)) for one in inputs]  # type: ignore[misc]
     taken: tuple[list[float], list[float]] = ([], [])
     for number in range(args.repeats + 1):
@@ -335,10 +335,10 @@ def compare(
     """One view, predicted and with each mistake planted; all beside the same traced
     pictures.
     """
-    inputs = renderer.scene.assembly(renderer.space.inputs(whole))
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(whole))
     lit = light.compute_light(inputs)
     brighter = [
-        replace(lit, on_object=lit.on_object * factor) for factor in (1.0, 1.1, 1.25)
+        replace(lit, object_irradiance=lit.object_irradiance * factor) for factor in (1.0, 1.1, 1.25)
     ]
     pictures = []
     for light.fixed_light in brighter:
@@ -359,8 +359,8 @@ class Once:
     """A renderer that traces a configuration once."""
 
     def __init__(self, renderer: Renderer) -> None:
-        self.mask = lru_cache(renderer.mask)
-        self.halves = lru_cache(renderer.render_halves)
+        self.mask = lru_cache(renderer.compute_object_mask)
+        self.halves = lru_cache(renderer.render_independent_images)
         self.__call = lru_cache(renderer.__call__)
 
     def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
@@ -424,7 +424,7 @@ def searched(thing: str, environment: str, size: int) -> None:
     (config,) = [
         one.config
         for one in plan_runs(read_recipe("viewpoints"), asked)
-        if one.part == "search"
+        if one.part_name == "search"
     ]
     assert isinstance(config, AttackConfig)
     camera = {

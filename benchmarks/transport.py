@@ -135,7 +135,7 @@ def errors(renderer: Renderer) -> None:
         ).mean(0)
 
     with torch.no_grad():
-        display = renderer.formation.display
+        display = renderer.formation.map_to_display
         start = renderer.start
         before = [traced(start, half) for half in range(HALVES)]
         for kind in ("signs", "lighter", "darker"):

@@ -318,7 +318,7 @@ def run_twins(options: argparse.Namespace, **model: Any) -> list[str]:
         overwrite=True,
     )
     part = make_agreement_part(result.table)
-    return [" | ".join(row) for row in (part.heads, *part.rows)]
+    return [" | ".join(row) for row in (part.column_heads, *part.rows)]
 
 
 def main() -> None:

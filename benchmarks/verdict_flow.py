@@ -44,7 +44,7 @@ from advsearch.attacks.verification import (
     OVER_LOOKS,
     TRIAL_LOOKS,
     WORST_CASE,
-    Rule,
+    VerificationRule,
 )
 from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.record import RunState
@@ -84,7 +84,7 @@ class Drawn:
     n_draws: int = 1
     steps: int = 100
     seed: int = field(init=False)
-    rule: Rule = field(init=False)
+    rule: VerificationRule = field(init=False)
     conditions: Any = field(init=False)
     domain: Domain = DOMAIN
     searched_space: ClassVar[Any] = SimpleNamespace(controls=())
@@ -148,17 +148,17 @@ def checked(
         Journal(None, ParallelEvaluator(problem)),
         LADDER,
         Stages(NullProgress()),
-        looks=looks,
+        look_sizes=looks,
     )
     listed = tuple(
         FoundFailure(torch.full((1,), FAILURE + 0.01 * k), 1.0, {})
         for k in range(failures)
     )
     known = Failures(listed, (0,), failures, failures, failures) if failures else None
-    verifier.state.search = claimed(OWN, known)
-    verifier.state.baseline = claimed(BASELINE) if beside else None
+    verifier.run_state.search_result = claimed(OWN, known)
+    verifier.run_state.random_search_result = claimed(BASELINE) if beside else None
     verify_searches(verifier, is_smallest=False)
-    return verifier.state
+    return verifier.run_state
 
 
 def flow(

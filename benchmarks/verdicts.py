@@ -58,7 +58,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.evaluation import Evaluate
-from advsearch.attacks.trials import LADDER, MarginsOf, Trials, make_margin_function
+from advsearch.attacks.trials import LADDER, MarginsOf, TrialCounts, make_margin_function
 from advsearch.attacks.verification import (
     OVER_CONDITIONS,
     OVER_CONFIDENCE,
@@ -68,7 +68,7 @@ from advsearch.attacks.verification import (
 )
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.seeds import stream
+from advsearch.seeds import derive_seed
 from advsearch.tasks import Judgement, Prediction
 
 Array = npt.NDArray[np.float64]
@@ -133,7 +133,7 @@ def paths() -> dict[tuple[int, int, bool], int]:
             scripts += [script + "0", script + "1"]
             continue
         rate = said.adversarial_counts
-        ways[rate.successes, rate.trials, said.ending is Ending.FOUND] += 1
+        ways[rate.n_successes, rate.n_trials, said.ending is Ending.FOUND] += 1
     return dict(ways)
 
 
@@ -154,12 +154,12 @@ def found(rate: float) -> float:
 
 def found_before(rate: float) -> float:
     """Return how often a rate was found by 19 of 20."""
-    return float(stats.binom.sf(WORST_CASE.count_needed(20) - 1, 20, rate))
+    return float(stats.binom.sf(WORST_CASE.count_needed_successes(20) - 1, 20, rate))
 
 
 def coverage(rate: float) -> float:
     """Return how often the interval that is printed covers the rate."""
-    intervals = {at: Trials(at[0], at[1], 1).interval for at in paths()}
+    intervals = {at: TrialCounts(at[0], at[1], 1).interval for at in paths()}
     return sum(
         chance
         for at, chance in outcomes(rate).items()
@@ -208,7 +208,7 @@ def over_outcomes(
             early = n in OVER_LOOKS and n < last
             found = (
                 early or n == last
-            ) and n - failures >= OVER_CONDITIONS.count_needed(n, early=early)
+            ) and n - failures >= OVER_CONDITIONS.count_needed_successes(n, early=early)
             if found or n == last or failures > lost:
                 ended[n - failures, n] = chance, found
             else:
@@ -222,7 +222,7 @@ def over_coverage(rates: Array, counting: int) -> Array:
     """Return how often the interval that is printed covers rates (n,)."""
     covered = np.zeros_like(rates)
     for (successes, trials), (chance, _) in over_outcomes(rates, counting).items():
-        low, high = Trials(successes, trials, 1, OVER_CONFIDENCE).interval
+        low, high = TrialCounts(successes, trials, 1, OVER_CONFIDENCE).interval
         covered += chance * ((low <= rates) & (rates <= high))
     return covered
 
@@ -244,7 +244,7 @@ def over_table() -> int:
         (chance * n for (_, n), (chance, _) in ends.items()), np.zeros_like(rates)
     )
     for rate, chance, count in zip(rates, chances, trials, strict=True):
-        before = stats.binom.sf(OVER_CONDITIONS.count_needed(200) - 1, 200, rate)
+        before = stats.binom.sf(OVER_CONDITIONS.count_needed_successes(200) - 1, 200, rate)
         print(
             f"| {rate:.2f} | {100 * before:.2f} | {100 * chance:.2f} | 200 | "
             f"{count:.0f} |"
@@ -312,7 +312,7 @@ def choose_before(margins: Sequence[MarginsOf], seed: int) -> int:
                 continue
             for one in (level - 1, level):
                 new = [
-                    stream(seed, "sample count", 8 * one + number)
+                    derive_seed(seed, "sample count", 8 * one + number)
                     for number in range(len(values[one]), count)
                 ]
                 values[one] += render(LADDER[one], new) if new else []
@@ -496,7 +496,7 @@ def rendered_table(config: AttackConfig, epsilons: Sequence[float]) -> None:
             evaluate = Counted(problem.evaluate)
             said = verdict(evaluate, problem.domain, answer.best_u, 0, before=before)
             rate = said.adversarial_counts
-            what = said.ending.value, f"{rate.successes}/{rate.trials} at {rate.spp}"
+            what = said.ending.value, f"{rate.n_successes}/{rate.n_trials} at {rate.spp}"
             for column, text in zip(
                 told,
                 (*what, str(evaluate.samples), f"{evaluate.seconds:.1f}"),

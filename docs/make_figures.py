@@ -403,7 +403,7 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
         once = EVERYWHERE if issubclass(kind, Result) else ()
         told = {
             one.alias or name: _field(one)
-            for name, one in kind.described().items()
+            for name, one in kind.get_described_fields().items()
             if name not in once
         }
         return table(
@@ -415,7 +415,7 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
 
 
 ASKED = "environment controls object objects model policy objective".split()
-EVERYWHERE = {**StudyResult.described(), **SceneResult.described(), "objective": None}
+EVERYWHERE = {**StudyResult.get_described_fields(), **SceneResult.get_described_fields(), "objective": None}
 """Fields that are told once for all results: ASKED, and those that say how the run
 went.
 """

@@ -182,7 +182,7 @@ def done(run: Path) -> RecipeResult | None:
 def gone_on(run: Path) -> RecipeResult | None:
     """Return the result of a run that was begun, once it is done."""
     return (
-        recipe.run(RecipeConfig.from_yaml(run / CONFIG), resumed=run)
+        recipe.run(RecipeConfig.from_yaml(run / CONFIG), resumed_directory=run)
         if (run / CONFIG).is_file()
         else None
     )

@@ -58,7 +58,7 @@ def object_files(family: ObjectFamily) -> dict[str, bytes]:
         "material": asdict(asset.material),
         # the family's file has moved to advsearch/questions/harden/objects; what is
         # shipped keeps its bytes
-        "source": f"scenes/objects/{family.make.__module__.rpartition('.')[2]}.py"
+        "source": f"scenes/objects/{family.make_instance.__module__.rpartition('.')[2]}.py"
         if asset.mesh.rig is None
         else "scenes/person.py, of MakeHuman's data (CC0 1.0)",
         "triangles": len(asset.mesh.faces),

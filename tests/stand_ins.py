@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy
-from advsearch.attacks.verification import WORST_CASE, Rule
+from advsearch.attacks.verification import WORST_CASE, VerificationRule
 from advsearch.cluster import BatchResult, InProcess, WorkerStats, WorkerTask
 from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.problem import Problem
@@ -57,7 +57,7 @@ class StandInProblem:
     domain: Domain = field(default_factory=lambda: Domain(torch.full((6,), 0.5), (Block(4, "linf", 0.2), Block(2))))
     conditions: None = None
     searched_space: Any = field(default_factory=lambda: SimpleNamespace(controls=()))
-    rule: Rule = WORST_CASE
+    rule: VerificationRule = WORST_CASE
     spp: int = 4
     search_depth: int | None = None
     seed: int = 3
@@ -82,7 +82,7 @@ class StandInProblem:
         logits = self._logits(at, query.seed)
         value = logits[1] - logits[0]
         slope = torch.autograd.grad(value, at)[0] if query.gradient else None
-        picture = torch.full((2, 2, 3), float(query.u.mean())) if query.with_image else None
+        picture = torch.full((2, 2, 3), float(query.u.mean())) if query.includes_image else None
         said = judged(logits.detach())
         return Evaluation(
             float(value.detach()), slope, bool(value > 0), cost=query.samples, judgement=said, picture=picture
@@ -211,7 +211,7 @@ def shared(
     ready = StandInWorkers(InProcess(call(settings)), **more)
 
     def open_workers(work: WorkerTask, **_: Any) -> nullcontext[StandInWorkers | None]:
-        return nullcontext(ready if work.function.endswith(f":{call.__name__}") else None)
+        return nullcontext(ready if work.function_path.endswith(f":{call.__name__}") else None)
 
     monkeypatch.setattr(attacking, "open_workers", open_workers)
     return ready

@@ -105,7 +105,7 @@ def test_every_wrong_value_names_its_flag(setting: Any) -> None:
 def test_every_command_is_repeated_by_its_yaml(config: Config, tmp_path: Path) -> None:
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
-    assert type(config).from_yaml(path, {one.name: one.value for one in config.powers}) == config
+    assert type(config).from_yaml(path, {one.name: one.value for one in config.settings_with_effects}) == config
     assert read_yaml(path)["command"] == config.command
     assert config.command_line(tmp_path) == f"advsearch run {path}" and config.command_line(None) is None
     assert config.command_line("my run") == "advsearch run 'my run/run.yaml'"
@@ -254,7 +254,7 @@ def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
     assert all(getattr(config, setting.field) == GIVEN[setting.name] for setting in settings(AttackConfig))
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
-    assert AttackConfig.from_yaml(path, {one.name: one.value for one in config.powers}) == config
+    assert AttackConfig.from_yaml(path, {one.name: one.value for one in config.settings_with_effects}) == config
     assert read_yaml(path)["schema"] == 2 and read_yaml(path)["command"] == "attack"
 
 

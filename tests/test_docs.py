@@ -41,7 +41,7 @@ from advsearch.questions.twins.result import TwinsConfig
 from advsearch.runs import export
 from advsearch.runs.exporters import EXPORTERS
 from advsearch.scene import library
-from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, split_node
+from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, split_node_argument
 from advsearch.scene.places.place_file import is_place_file, read_place_file
 from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import resolve_settings
@@ -93,7 +93,7 @@ def check_names(config: Config) -> None:
     lights = config.environments if isinstance(config, SweepConfig) else (config.environment_name,)
     for name in config.objects:
         suffixes = (*MESHES, MITSUBA_SUFFIX)
-        assert name in (*library.list_objects(), ALL_OBJECTS) or Path(split_node(name)[0]).suffix in suffixes
+        assert name in (*library.list_objects(), ALL_OBJECTS) or Path(split_node_argument(name)[0]).suffix in suffixes
         needs_label = not isinstance(config, (RenderConfig, HardenConfig)) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:

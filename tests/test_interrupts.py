@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from advsearch.cli.output import InterruptCheckingProgress
-from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, interruptible, report_unraisable_error
+from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, reraise_lost_interrupt, report_unraisable_error
 from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from conftest import ROOT
@@ -66,39 +66,39 @@ LOST = [in_a_destructor, in_a_callback, in_a_library]
 def test_one_that_is_lost_is_raised_at_the_next_look_and_answered_once(lost: Callable[[], None]) -> None:
     steps = 0
     with pytest.raises(KeyboardInterrupt):
-        with interruptible():
+        with reraise_lost_interrupt():
             for steps in range(10):
-                INTERRUPTS.look()
+                INTERRUPTS.raise_pending()
                 if steps == 4:
                     lost()
     assert steps == 5
-    INTERRUPTS.look()  # answered
+    INTERRUPTS.raise_pending()  # answered
     with pytest.raises(KeyboardInterrupt):
-        with interruptible():
+        with reraise_lost_interrupt():
             INTERRUPTS._last = -1.0  # another Ctrl-C, later
             lost()
-    with interruptible():
-        INTERRUPTS.look()
+    with reraise_lost_interrupt():
+        INTERRUPTS.raise_pending()
 
 
 def test_what_was_made_of_one_is_the_interrupt_that_it_is() -> None:
-    with pytest.raises(KeyboardInterrupt), interruptible():
+    with pytest.raises(KeyboardInterrupt), reraise_lost_interrupt():
         in_a_library()
         raise RuntimeError("what native code says")
-    with pytest.raises(ValueError, match="of its own"), interruptible():
+    with pytest.raises(ValueError, match="of its own"), reraise_lost_interrupt():
         raise ValueError("of its own")
 
 
 def test_nested_blocks_answer_it_together() -> None:
     reached = []
-    with interruptible():
+    with reraise_lost_interrupt():
         try:
-            with interruptible():
+            with reraise_lost_interrupt():
                 in_a_destructor()
-                INTERRUPTS.look()
+                INTERRUPTS.raise_pending()
         except KeyboardInterrupt:
             reached.append("inner")
-        INTERRUPTS.look()
+        INTERRUPTS.raise_pending()
         reached.append("what follows")
     assert reached == ["inner", "what follows"]
 
@@ -128,7 +128,7 @@ def progress_stages() -> None:
 @pytest.mark.parametrize("look", [scene_pictures, model_answers, workers_results, progress_advances, progress_stages])
 def test_whatever_takes_time_looks(look: Callable[[], Any]) -> None:
     with pytest.raises(KeyboardInterrupt):
-        with interruptible():
+        with reraise_lost_interrupt():
             in_a_destructor()
             with pytest.raises(KeyboardInterrupt):
                 look()
@@ -169,10 +169,10 @@ def test_one_that_is_passed_on_counts_once(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(KeyboardInterrupt):
         handler(2, None)
     handler(2, None)
-    assert handler.count == 1
+    assert handler.n_received == 1
     with pytest.raises(KeyboardInterrupt):
         handler(2, None)
-    assert handler.count == 2
+    assert handler.n_received == 2
 
 
 SWALLOWING = """

@@ -44,7 +44,7 @@ def island_of_module() -> dict[str, str]:
     islands = dict(OTHER_ISLANDS)
     for part in BUILT_INS:
         if part.name not in CORE[part.kind]:
-            module = part.target.partition(":")[0]
+            module = part.import_path.partition(":")[0]
             islands[module] = f"{islands[module]}, {part.name}" if module in islands else f"{part.kind} {part.name}"
     return islands
 
@@ -160,7 +160,7 @@ for kind, modules in by_kind.items():
 def test_without_any_island_the_other_parts_are_there_and_can_be_used() -> None:
     """Each island is hidden singly, and all of a kind together: then everything else is imported."""
     every = [[part.kind, part.name] for part in BUILT_INS]
-    module_of = {(part.kind, part.name): part.target.partition(":")[0] for part in BUILT_INS}
+    module_of = {(part.kind, part.name): part.import_path.partition(":")[0] for part in BUILT_INS}
     by_kind: dict[str, set[str]] = {}
     for part in BUILT_INS:
         if part.name not in CORE[part.kind]:

@@ -70,7 +70,7 @@ def test_scenes_are_a_dataset() -> None:
 def test_boxes_are_those_of_the_object() -> None:
     scenes = maite.Scenes("mug", "pose.yaw", 1, labels=("bowl", "mug"), task="detection", resolution=16, spp=2)
     _, target, _ = scenes[0]
-    rows, columns = np.nonzero(scenes.renderer.mask(scenes.configurations[0]).numpy())
+    rows, columns = np.nonzero(scenes.renderer.compute_object_mask(scenes.configurations[0]).numpy())
     assert isinstance(target, maite.Detections) and target.labels.tolist() == [1] and target.scores.tolist() == [1.0]
     assert target.boxes.tolist() == [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
 

@@ -14,13 +14,13 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Query
-from advsearch.controls import CONTROLS, compose, make_control, make_space
+from advsearch.controls import CONTROLS, compose_space, make_control, make_space
 from advsearch.engine.judging import make_domain
 from advsearch.engine.loading import fit_camera, make_renderer
 from advsearch.engine.problem import Problem
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.axes import Points, add_grid_axes, parse_axes
+from advsearch.questions.sweep.axes import SceneConfigurations, add_grid_axes, parse_axes
 from advsearch.runs.results import to_json_value
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import load_description
@@ -114,7 +114,7 @@ def model() -> advsearch.Model:
 def test_every_control_is_here_and_varies() -> None:
     assert set(FORMS) | APART == set(CONTROLS.built_ins), "FORMS names a control that there is not"
     for kind, form in FORMS.items():
-        varied = compose(
+        varied = compose_space(
             [make_control(kind, form)], load_description(suited([kind]), things=beside([kind]))
         ).start.numel()
         assert varied, f"{kind} has no range: give a parameter `search=(low, high)`, or {kind} a form in FORMS"
@@ -149,7 +149,7 @@ def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], mode
     for row in rows.values():
         assert row.seed is not None
         space = make_space(add_grid_axes(drawn, axes, description), description)
-        points = Points(space, make_domain(space.controls), axes, samples, "sobol", 3)
+        points = SceneConfigurations(space, make_domain(space.controls), axes, samples, "sobol", 3)
         u = points.make_configurations(row.step, 1)[0]
         said = {name: value for name, value in row.values.items() if "." in name}
         assert_close(said, points.describe_images(u[None], row.step)[0], 1e-6)  # threads add up a mean in another order
@@ -187,7 +187,7 @@ def assert_true_of_fixed_values(
         elif kind in PICTURES or ("." in parameter and parameter.partition(".")[0] in declared):
             return  # one number of many cannot be fixed alone, and neither can a picture
     description = fit_camera(scene.description, SIZE)
-    space = compose([make_control(kind, given) for kind, given in named.items()], description)
+    space = compose_space([make_control(kind, given) for kind, given in named.items()], description)
     renderer = make_renderer(description, space, SIZE, "none", 3)
     again = round_to_8_bit(renderer(space.start, seed=seed, spp=1))
     if "sky" not in named:  # the exposure is metered at the start, which a fixed sky moves
@@ -200,7 +200,7 @@ def assert_true_of_fixed_values(
 
 def searched_picture(problem: Problem, u: Tensor) -> Tensor:
     """The picture (H, W, 3) that a search's evaluation of a configuration looks at."""
-    picture = problem.evaluate(Query(u, 5, phase="search", with_image=True)).picture
+    picture = problem.evaluate(Query(u, 5, phase="search", includes_image=True)).picture
     assert picture is not None
     return picture
 

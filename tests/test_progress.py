@@ -102,7 +102,7 @@ def test_the_smallest_change_counts_what_it_says() -> None:
     blocks = tuple(block for block in problem.domain.blocks if block.epsilon is not None)
     problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
     progress, findings = attacked(configuration(smallest=True), problem)
-    assert findings.bracket is not None and findings.bracket.searches > 1
+    assert findings.smallest_change_bracket is not None and findings.smallest_change_bracket.searches > 1
     progress.check()
     assert progress.named("search 1 of at most 12")[0].total == 33
     assert progress.named("trying smaller changes")[0].done > 6

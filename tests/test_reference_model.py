@@ -28,7 +28,7 @@ def _coloured(count: int, size: int = 32) -> tuple[Tensor, Tensor]:
 @pytest.mark.medium
 def test_training_learns_and_repeats_bit_for_bit() -> None:
     data, labels = _coloured(64)
-    plain = Augmentation(colour=0.02, brightness=0.05, contrast=0.1, cutout=0.1)
+    plain = Augmentation(max_channel_change=0.02, brightness=0.05, contrast=0.1, cutout_probability=0.1)
     told: list[training.TrainingState] = []
     state = torch.random.get_rng_state()
 

@@ -295,7 +295,7 @@ def results() -> Iterator[str]:
     for kind in kinds:
         silent = {
             name
-            for name, field in kind.described().items()
+            for name, field in kind.get_described_fields().items()
             if not script("make_figures")._field(field)
         }
         if not (kind.__doc__ and kind.command) or silent - PLAIN:
@@ -377,7 +377,7 @@ def made() -> Iterator[str]:
 def _looks() -> tuple[int, int, int]:
     """Trials that all have to succeed, and what is needed of how many else."""
     first, last = verification.TRIAL_LOOKS
-    return WORST_CASE.count_needed(first), WORST_CASE.count_needed(last), last
+    return WORST_CASE.count_needed_successes(first), WORST_CASE.count_needed_successes(last), last
 
 
 def _exceptions(samples: int) -> float:

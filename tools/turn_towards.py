@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
-from advsearch.controls import compose
+from advsearch.controls import compose_space
 from advsearch.engine.loading import (
     fit_camera,
     load_scene,
@@ -75,7 +75,7 @@ def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
     radians to the left.
     """
     description = fit_camera(load_scene("mug").description, SIDE)
-    space = compose(make_controls(ANYWHERE), description)
+    space = compose_space(make_controls(ANYWHERE), description)
     renderer = make_renderer(
         description, space, SIDE, "none", seed, differentiated=False
     )
@@ -84,17 +84,17 @@ def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
     bearings: list[float] = []
     while len(seen) < count:
         u = torch.rand(space.start.shape, generator=draw)
-        columns = renderer.mask(u).sum(dim=0).double()
+        columns = renderer.compute_object_mask(u).sum(dim=0).double()
         if columns.sum() < 8:
             continue
         middle = (
             float((columns * (torch.arange(SIDE) + 0.5)).sum() / columns.sum()) / SIDE
             - 0.5
         )
-        radiance = renderer.radiance(u, seeds.stream(seed, f"picture {len(seen)}"), SPP)
+        radiance = renderer.radiance(u, seeds.derive_seed(seed, f"picture {len(seen)}"), SPP)
         seen.append(
             round_to_8_bit(
-                space.apply_to_image(u, renderer.formation.display(radiance))
+                space.apply_to_image(u, renderer.formation.map_to_display(radiance))
             )
             .permute(2, 0, 1)
             .clone()

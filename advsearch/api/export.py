@@ -83,9 +83,9 @@ class AdversarialRun:
         trial = summary.adversarial.trial
         conditions_seed = None
         if trial is not None:
-            conditions_seed = seeds.stream(problem.seed, "verification", trial)
+            conditions_seed = seeds.derive_seed(problem.seed, "verification", trial)
         u = read_stored_configuration(folder, problem)
-        return cls(folder, problem, problem.add_conditions(u, conditions_seed))
+        return cls(folder, problem, problem.make_full_configuration(u, conditions_seed))
 
     def split_inputs(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return the inputs of the scene inside Mitsuba, and those applied to its
@@ -146,7 +146,7 @@ class AdversarialRun:
         """The inputs of the scene inside Mitsuba, and those applied to its image."""
         renderer = self.problem.renderer
         with torch.no_grad():
-            return renderer.scene.assembly(renderer.space.inputs(self.u))
+            return renderer.scene.input_assembler(renderer.space.inputs(self.u))
 
 
 BLEED = 3.0  # width of the color beyond the line to cut, in millimetres
@@ -311,7 +311,7 @@ def _find_charts(
     positions = raster.compute_positions().astype(np.float64)
     is_printed = raster.is_covered
     if faces is not None:
-        is_printed = is_printed & np.isin(raster.face, faces)
+        is_printed = is_printed & np.isin(raster.face_index, faces)
     charts = _label_charts(is_printed)
     for number, (box, inside) in enumerate(charts, 1):
         measured = _measure_texel_size(positions[box] * scale, inside)
@@ -320,7 +320,7 @@ def _find_charts(
         texel_size, distortion = measured
         image = _extend_inside(texture[box], inside)
         # A chart whose texture coordinates are mirrored has a negative signed area.
-        is_mirrored = uv_areas[np.unique(raster.face[box][inside])].sum() < 0.0
+        is_mirrored = uv_areas[np.unique(raster.face_index[box][inside])].sum() < 0.0
         if is_mirrored:  # mirror it back; the size of its texels stays the same
             image = image[:, ::-1]
             inside = inside[:, ::-1]
@@ -416,9 +416,9 @@ def _make_piece(
     return Piece(
         name=name,
         picture=levels,
-        pixel=fine_size,
+        pixel_size_mm=fine_size,
         bleed=(bleed_columns, bleed_rows),
-        inside=mask,
+        cut_mask=mask,
     )
 
 

@@ -39,7 +39,7 @@ from advsearch.models import Model
 from advsearch.options import describe_value
 from advsearch.progress import open_progress
 from advsearch.settings import Config, PythonOnly, Setting, settings, to_python
-from advsearch.trust.code import allow_named
+from advsearch.trust.code import allow_code_in_settings
 from advsearch.trust.stored_files import is_shallow
 
 Names = str | Sequence[str]  # a list of names, or a string of names with commas
@@ -254,7 +254,7 @@ def _check_call(
         bound = signature.bind(*args, **keywords)
     except TypeError as error:
         raise TypeError(f"{name}() {error}") from None
-    allow_named({**bound.arguments, **keywords})
+    allow_code_in_settings({**bound.arguments, **keywords})
 
 
 def _check_is_name(function_name: str, key: str, value: object) -> None:

@@ -45,7 +45,7 @@ from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.formation import parse_aovs
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.tasks import AnyTask, make_task
-from advsearch.trust.code import allow_code_of_call, allow_named
+from advsearch.trust.code import allow_code_of_call, allow_code_in_settings
 from advsearch.trust.stored_files import LARGEST_FILE, read_bytes
 
 if TYPE_CHECKING:
@@ -146,7 +146,7 @@ def load_model(
         task: task for which the model is loaded; None for classification.
         options: other options of `advsearch.models.load_model`.
     """
-    allow_named({"model": spec})
+    allow_code_in_settings({"model": spec})
     return models.load_model(
         spec, task=None if task is None else make_task(task), **options
     )

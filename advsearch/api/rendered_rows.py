@@ -74,7 +74,7 @@ class RenderedRow:
 
     def get_label(self, thing: VisibleMesh) -> str:
         """Return the label of a thing's mesh, or else its name."""
-        description, _filter = self.renderer.scene.definition
+        description, _filter = self.renderer.scene.description_and_filter
         return description.meshes[thing.name].label or thing.name
 
 
@@ -201,7 +201,7 @@ def _render_sweep_image(
         name=f"{image:06d}",
         picture=picture,
         task=job.tasks[0],
-        facts=make_object_facts(scene.scene, scene.object, job.config),
+        facts=make_object_facts(scene.scene, scene.object_name, job.config),
         renderer=loaded_scene.renderer_of_size[job.image_sizes[0]],
         u=query.u,
         rows=rows,
@@ -253,9 +253,9 @@ def _render_attack(
     for row in rows:
         u = configuration_of_kind[row.kind]
         seed = max(0, row.seed or 0)  # a row may lack its seed
-        picture = problem.picture(u, seed, row.spp or problem.spp)
+        picture = problem.picture(u, seed, row.spp or problem.search_spp)
         # `u` followed by the conditions that the seed samples
-        full_u = problem.add_conditions(u, seed)
+        full_u = problem.make_full_configuration(u, seed)
         is_right = problem.judge(picture, full_u).right
         yield RenderedRow(
             name=f"{row.kind.replace(' ', '-')}-{row.step:02d}",

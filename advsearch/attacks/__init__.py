@@ -27,7 +27,7 @@ from advsearch.attacks.search import (
     count_planned_renders,
     search,
 )
-from advsearch.attacks.trials import SampleCount, Trials, choose_spp
+from advsearch.attacks.trials import SampleCount, TrialCounts, choose_spp
 from advsearch.attacks.verification import (
     Ending,
     Verification,
@@ -64,7 +64,7 @@ __all__ = [
     "SearchResult",
     "Sobol",
     "StepRecord",
-    "Trials",
+    "TrialCounts",
     "Verification",
     "choose_spp",
     "clopper_pearson",

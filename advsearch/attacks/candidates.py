@@ -336,7 +336,7 @@ class Failures:
 
     Attributes:
         examples: at most `MAX_FAILURES` failures.
-        over: indices in u of the parameters that span the cells.
+        cell_parameter_indices: indices in u of the parameters that span the cells.
         n_failures: number of cells, or samples, with a failure.
         n_visited: number of cells, or samples, that were evaluated.
         n_cells: number of cells of the domain; None without cells.
@@ -345,7 +345,7 @@ class Failures:
     """
 
     examples: tuple[FoundFailure, ...]
-    over: tuple[int, ...]
+    cell_parameter_indices: tuple[int, ...]
     n_failures: int
     n_visited: int
     n_cells: int | None
@@ -433,27 +433,27 @@ class Bracket:
     """The bounds of the smallest scale.
 
     Attributes:
-        low: largest scale at which a search found nothing; 0 if none has failed.
-        high: smallest scale at which a configuration passed; infinity if none did.
-        u: (d,) the configuration at `high`; None if there is none.
+        largest_failing_scale: largest scale at which a search found nothing; 0 if none has failed.
+        smallest_passing_scale: smallest scale at which a configuration passed; infinity if none did.
+        u: (d,) the configuration at `smallest_passing_scale`; None if there is none.
         searches: number of searches so far.
-        checks: number of configurations that went through the trials so far.
+        n_checks: number of configurations that went through the trials so far.
         found_by: index of the search that found `u`, before it was shortened.
         confirmed: whether `u` has passed again with new seeds (`confirm_bracket`).
     """
 
-    low: float
-    high: float
+    largest_failing_scale: float
+    smallest_passing_scale: float
     u: Tensor | None
     searches: int
-    checks: int
+    n_checks: int
     found_by: int = 0
     confirmed: bool = False
 
     @property
     def is_closed(self) -> bool:
         """Whether high is within `RATIO` of low."""
-        return self.u is not None and self.high <= RATIO * (1.0 + 1e-9) * self.low
+        return self.u is not None and self.smallest_passing_scale <= RATIO * (1.0 + 1e-9) * self.largest_failing_scale
 
 
 def scale_domain(domain: Domain, scale: float) -> Domain:
@@ -527,28 +527,28 @@ def find_smallest_change(
     """
     full_u = search(domain, 0)  # the best configuration in the full budgets
     # Nothing is known to pass yet, so `high` is infinite.
-    bracket = Bracket(low=0.0, high=math.inf, u=None, searches=1, checks=1)
+    bracket = Bracket(largest_failing_scale=0.0, smallest_passing_scale=math.inf, u=None, searches=1, n_checks=1)
     if not passes(full_u, 0):
-        return replace(bracket, low=1.0)
+        return replace(bracket, largest_failing_scale=1.0)
     bracket = _shorten(bracket, full_u, 1.0, passes, domain, likely)
     while (
         bracket.searches < MAX_SEARCHES
-        and bracket.high > RATIO * bracket.low  # not closed
-        and bracket.high > SMALLEST_SCALE
+        and bracket.smallest_passing_scale > RATIO * bracket.largest_failing_scale  # not closed
+        and bracket.smallest_passing_scale > SMALLEST_SCALE
     ):
         scale = _choose_next_scale(bracket)
         # The counts so far are the indices of the next search and the next check.
         search_index = bracket.searches
-        check_index = bracket.checks
+        check_index = bracket.n_checks
         u = search(scale_domain(domain, scale), search_index)
         has_passed = passes(u, check_index)
-        bracket = replace(bracket, searches=search_index + 1, checks=check_index + 1)
+        bracket = replace(bracket, searches=search_index + 1, n_checks=check_index + 1)
         if has_passed:
             bracket = replace(bracket, found_by=search_index)
             bracket = _shorten(bracket, u, scale, passes, domain, likely)
         else:
             # This search found nothing at `scale`, so nothing smaller is expected.
-            bracket = replace(bracket, low=scale)
+            bracket = replace(bracket, largest_failing_scale=scale)
     return bracket
 
 
@@ -559,14 +559,14 @@ def _choose_next_scale(bracket: Bracket) -> float:
     failed yet. If the bounds are close, it is high / `RATIO` instead. If the search
     finds nothing there, this becomes the lower bound, and the bracket is closed.
     """
-    has_failed_search = bracket.low > 0.0
+    has_failed_search = bracket.largest_failing_scale > 0.0
     if not has_failed_search:
-        return bracket.high / 2.0
-    scale = math.sqrt(bracket.low * bracket.high)
+        return bracket.smallest_passing_scale / 2.0
+    scale = math.sqrt(bracket.largest_failing_scale * bracket.smallest_passing_scale)
     # high / `RATIO` is at or below the mean of the bounds only if they are this close
-    can_close = bracket.high <= RATIO**2 * bracket.low
+    can_close = bracket.smallest_passing_scale <= RATIO**2 * bracket.largest_failing_scale
     if can_close:
-        scale = max(scale, bracket.high / RATIO)
+        scale = max(scale, bracket.smallest_passing_scale / RATIO)
     return scale
 
 
@@ -591,19 +591,19 @@ def confirm_bracket(
     if bracket.u is None:
         return bracket
     shortest_u = bracket.u
-    shortest_scale = bracket.high
+    shortest_scale = bracket.smallest_passing_scale
     growth = 1.0  # factor of the change since the shortest that passed
     for _ in range(MAX_CONFIRMATIONS):
         # The seeds of a check's trials follow from its index. Every attempt takes
         # `times` new indices, even if it ends at the first failure.
-        check_indices = range(bracket.checks, bracket.checks + times)
+        check_indices = range(bracket.n_checks, bracket.n_checks + times)
         if all(passes(bracket.u, check_index) for check_index in check_indices):
-            return replace(bracket, checks=bracket.checks + times, confirmed=True)
+            return replace(bracket, n_checks=bracket.n_checks + times, confirmed=True)
         growth *= math.sqrt(RATIO)
         scale = min(1.0, shortest_scale * growth)
         change = shortest_u - domain.start
         grown_u = scale_domain(domain, scale).project(domain.start + growth * change)
-        bracket = replace(bracket, high=scale, u=grown_u, checks=bracket.checks + times)
+        bracket = replace(bracket, smallest_passing_scale=scale, u=grown_u, n_checks=bracket.n_checks + times)
     return bracket
 
 
@@ -638,10 +638,10 @@ def _shorten(
     Returns:
         The bracket with the shortest configuration that passed at its upper bound.
     """
-    low = max(bracket.low, SMALLEST_SCALE * length)
+    low = max(bracket.largest_failing_scale, SMALLEST_SCALE * length)
     high = length
     shortest_u = u
-    checks = bracket.checks
+    checks = bracket.n_checks
 
     def shrink_to(scale: float) -> Tensor:
         # u has the scale `length`, so that its change is multiplied by this ratio
@@ -666,7 +666,7 @@ def _shorten(
             trial_length = min(geometric_mean, low * max_step_factor)
         max_step_factor = max_step_factor * max_step_factor
         checks = checks + 1
-    return replace(bracket, high=high, u=shortest_u, checks=checks)
+    return replace(bracket, smallest_passing_scale=high, u=shortest_u, n_checks=checks)
 
 
 def _guess_shortest(

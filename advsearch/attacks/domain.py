@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.seeds import stream
+from advsearch.seeds import derive_seed
 
 Norm = Literal["linf", "l2", "box"]
 NORMS: tuple[str, ...] = get_args(Norm)
@@ -44,10 +44,10 @@ class Block:
         periodic: whether `low` and `high` mean the same value, as for an angle. Then
             projecting wraps around. Only for "box".
         name: name of the parameter, e.g. "pose.yaw".
-        options: number of options of a discrete choice; 0 for numbers. An element u
+        n_options: number of options of a discrete choice; 0 for numbers. An element u
             means option floor(u * options). A choice has size 1, norm "box" and the
             bounds [0, 1], and no gradient.
-        reach: length of one unit step in a "box", over 0; None for half the diagonal of
+        unit_step_length: length of one unit step in a "box", over 0; None for half the diagonal of
             the bounds.
 
     Raises:
@@ -61,8 +61,8 @@ class Block:
     high: float = 1.0
     periodic: bool = False
     name: str = ""
-    options: int = 0
-    reach: float | None = None
+    n_options: int = 0
+    unit_step_length: float | None = None
 
     def __post_init__(self) -> None:
         """Check that every attribute is within its limits."""
@@ -83,8 +83,8 @@ class Block:
         self._check_budget(where)
         has_full_range = self.low == 0.0 and self.high == 1.0 and not self.periodic
         is_plain_number = self.size == 1 and self.norm == "box" and has_full_range
-        is_choice = self.options != 0  # 0 options mean numbers
-        if is_choice and (self.options < 0 or not is_plain_number):
+        is_choice = self.n_options != 0  # 0 options mean numbers
+        if is_choice and (self.n_options < 0 or not is_plain_number):
             raise InputError(
                 f"block{where}: expected a discrete choice to have at least one "
                 f"option, size 1, norm 'box' and bounds [0, 1], got {self}"
@@ -116,10 +116,10 @@ class Block:
                 f"block{where}: a periodic block cannot have a norm "
                 "budget; use norm 'box'"
             )
-        if self.reach is not None and (not is_box or not self.reach > 0.0):
+        if self.unit_step_length is not None and (not is_box or not self.unit_step_length > 0.0):
             raise InputError(
                 f"block{where}: expected a reach over 0 and norm 'box', got "
-                f"{self.reach} and {self.norm!r}"
+                f"{self.unit_step_length} and {self.norm!r}"
             )
 
     @property
@@ -132,7 +132,7 @@ class Block:
         width = self.high - self.low
         diagonal = width * math.sqrt(self.size)
         if self.norm == "box":
-            return 0.5 * diagonal if self.reach is None else self.reach
+            return 0.5 * diagonal if self.unit_step_length is None else self.unit_step_length
         diameter = width if self.norm == "linf" else diagonal
         assert self.epsilon is not None  # every ball has one
         return min(float(self.epsilon), diameter)
@@ -162,16 +162,16 @@ class Domain:
             central differences.
         partial_gradients: whether a search can request a "free" gradient: only those
             elements that cost no render.
-        exact: whether evaluations have no noise, so that equal configurations have
+        is_noise_free: whether evaluations have no noise, so that equal configurations have
             equal objectives and gradients. This is so if a matrix predicts the images
             (docs/transport.md).
         draws_conditions: whether evaluations have no noise of their own, but each one
             draws new conditions from a bank (docs/transport.md).
         restart_point: (d,) where a policy should begin instead of at the start, for
             policies that begin several times. Norm balls stay around the start.
-        lower: (d,) float32 lower bounds, of the intersection of the block's bounds and
+        lower_bounds: (d,) float32 lower bounds, of the intersection of the block's bounds and
             its l-infinity ball.
-        upper: (d,) float32 upper bounds of the same.
+        upper_bounds: (d,) float32 upper bounds of the same.
 
     Raises:
         InputError: sizes do not add up, a cost is under 0, the start is not finite or
@@ -182,11 +182,11 @@ class Domain:
     blocks: tuple[Block, ...]
     gradient_cost: int = 0
     partial_gradients: bool = False
-    exact: bool = False
+    is_noise_free: bool = False
     draws_conditions: bool = False
     restart_point: Tensor | None = None
-    lower: Tensor = field(init=False, repr=False)
-    upper: Tensor = field(init=False, repr=False)
+    lower_bounds: Tensor = field(init=False, repr=False)
+    upper_bounds: Tensor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Copy the start, compute the bounds of each element, and check all of them."""
@@ -266,7 +266,7 @@ class Domain:
         return self.start.numel()
 
     @property
-    def names(self) -> list[str]:
+    def element_names(self) -> list[str]:
         """The name of each element of u.
 
         It is that of the block ("pose.yaw"). If the block has several elements, their
@@ -275,17 +275,17 @@ class Domain:
         names = []
         for block in self.blocks:
             if block.size == 1:
-                names.append(block.name)
+                element_names.append(block.name)
             else:
                 names += [f"{block.name}.{number}" for number in range(block.size)]
         return names
 
     @property
-    def options(self) -> Tensor:
+    def option_counts(self) -> Tensor:
         """(d,) int64, number of options of each element of u; 0 if it is a number."""
         sizes = torch.tensor([block.size for block in self.blocks], dtype=torch.long)
         return torch.tensor(
-            [block.options for block in self.blocks], dtype=torch.long
+            [block.n_options for block in self.blocks], dtype=torch.long
         ).repeat_interleave(sizes)
 
     def find_block(self, index: int) -> Block:
@@ -315,7 +315,7 @@ class Domain:
         ball cut by bounds needs more (`project_l2_box`).
         """
         u = u.detach()
-        projected = torch.clamp(u, self.lower, self.upper)
+        projected = torch.clamp(u, self.lower_bounds, self.upper_bounds)
         for block, part in self.list_block_slices():
             if block.norm == "l2" and block.epsilon is not None:
                 projected[part] = project_l2_box(
@@ -343,7 +343,7 @@ class Domain:
         """
         # It is infinite for an infinite element. `torch.maximum` and `amax` return NaN
         # if an element is NaN; so does `max` below, if its first argument is NaN.
-        excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
+        excess = float(torch.maximum(self.lower_bounds - u, u - self.upper_bounds).amax())
         for block, part in self.list_block_slices():
             if block.norm == "l2" and block.epsilon is not None:
                 squares = (u[part] - self.start[part]).square_()
@@ -398,11 +398,11 @@ class Domain:
         if not is_l2_ball:
             # fraction of the way from the lower to the upper bound
             fraction = uniform
-            if block.options:
-                fraction = option_center(uniform, block.options)
+            if block.n_options:
+                fraction = option_center(uniform, block.n_options)
             elif extreme and block.norm != "box":
                 fraction = uniform.round()  # 0 or 1: a corner
-            return torch.lerp(self.lower[part], self.upper[part], fraction)
+            return torch.lerp(self.lower_bounds[part], self.upper_bounds[part], fraction)
         assert block.epsilon is not None
         if extreme:
             # A point in a direction of random signs, outside of the ball: it is farther
@@ -416,7 +416,7 @@ class Domain:
             block.size, block.epsilon, float(uniform[0]), generator
         )
 
-    def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
+    def compute_steepest_step(self, u: Tensor, gradient: Tensor) -> Tensor:
         """Return the unit step (d,) from u that increases a linear objective most.
 
         In each block, its length is the radius of the block, in the block's norm. To
@@ -436,7 +436,7 @@ class Domain:
         step = torch.empty_like(gradient)
         for block, part in self.list_block_slices():
             slope = gradient[part]
-            if block.options:
+            if block.n_options:
                 step[part] = 0.0
                 continue
             if block.norm == "linf":
@@ -640,9 +640,9 @@ def compute_half_widths(domain: Domain) -> Tensor:
     Returns:
         (d,) float32, over 0.
     """
-    half_widths = (domain.upper - domain.lower) / 2.0
+    half_widths = (domain.upper_bounds - domain.lower_bounds) / 2.0
     for block, part in domain.list_block_slices():
-        if block.norm == "l2" or block.reach is not None:
+        if block.norm == "l2" or block.unit_step_length is not None:
             # The norm of (x, x, ..., x) is x sqrt(size). The radius is the epsilon of a
             # ball, or the reach of a box.
             largest_change = block.radius / math.sqrt(block.size)
@@ -770,7 +770,7 @@ class SampleSequence:
         if self._sampler == "sobol":
             self._block = self._sample_sobol(block_index)
         else:
-            seed = stream(self._seed, self._name, block_index)
+            seed = derive_seed(self._seed, self._name, block_index)
             rng = np.random.default_rng(seed)
             self._block = rng.random((self._rows, self.dimensions))
         self._block_index = block_index
@@ -790,7 +790,7 @@ class SampleSequence:
         net_index, first_row = divmod(first_point, POINTS_PER_NET)
         is_behind = first_row < self._n_sampled  # the engine only goes forward
         if net_index != self._net or self._engine is None or is_behind:
-            seed = stream(self._seed, self._name, net_index)
+            seed = derive_seed(self._seed, self._name, net_index)
             self._engine = qmc.Sobol(self.dimensions, scramble=True, seed=seed)
             self._net = net_index
             self._n_sampled = 0
@@ -804,7 +804,7 @@ class SeedSequence:
     """The seeds of a stream, by number.
 
     Seeds are generated in blocks of `SEEDS_PER_BLOCK`, which is much faster than to
-    call `advsearch.seeds.stream` for each of them. The latest block is cached.
+    call `advsearch.seeds.derive_seed` for each of them. The latest block is cached.
     """
 
     def __init__(self, root: int, name: str) -> None:
@@ -818,7 +818,7 @@ class SeedSequence:
         block_index, position = divmod(index, SEEDS_PER_BLOCK)
         if block_index != self._block_index:
             sequence = np.random.SeedSequence(
-                stream(self._root, self._name, block_index)
+                derive_seed(self._root, self._name, block_index)
             )
             self._block_index = block_index
             self._block = sequence.generate_state(SEEDS_PER_BLOCK, dtype=np.uint32)

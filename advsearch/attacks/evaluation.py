@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Distribution, Domain
-from advsearch.copies import hand_copies
+from advsearch.copies import copy_method_arguments
 from advsearch.errors import InputError
 from advsearch.options import Value
-from advsearch.seeds import stream
+from advsearch.seeds import derive_seed
 from advsearch.tasks import Judgement
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Query:
             equal noise.
         kind: kind of the rows that the evaluation is stored in, such as "search" or
             "verification".
-        index: index of the row among those of its kind.
+        row_index: index of the row among those of its kind.
         phase: phase of a search; None for a trial.
         gradient: which gradient is requested; "free" only if the domain has
             `partial_gradients`.
@@ -76,17 +76,17 @@ class Query:
             one kind may share them.
         has_success: for a trial, whether a search seeks a certain prediction, so that
             the evaluation can be a success.
-        product: what is computed: a judgement; only an image ("picture"); or "light",
+        requested_output: what is computed: a judgement; only an image ("picture"); or "light",
             from which images can be predicted (`advsearch.scene.transport`), for a u of
             the full space.
-        with_image: whether the evaluation contains the image, too. For a row of a sweep
+        includes_image: whether the evaluation contains the image, too. For a row of a sweep
             it is the bytes of a small JPEG file.
     """
 
     u: Tensor
     seed: int
     kind: str = "search"
-    index: int = 0
+    row_index: int = 0
     phase: Phase | None = None
     gradient: WhichGradient = False
     samples: int = 1
@@ -94,8 +94,8 @@ class Query:
     draws_conditions: bool = True
     values: Mapping[str, Value] = field(default_factory=dict)
     has_success: bool = True
-    product: Literal["judgement", "picture", "light"] = "judgement"
-    with_image: bool = False
+    requested_output: Literal["judgement", "picture", "light"] = "judgement"
+    includes_image: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class Evaluation:
             requested.
         success: whether the model predicts what is sought. The task decides this, not
             the objective.
-        non_finite: number of gradient elements that were NaN or infinite and were set
+        n_non_finite: number of gradient elements that were NaN or infinite and were set
             to zero.
         cost: number of images that were rendered for it: one, and those that finite
             differences took, each times `samples`. An adjoint is not an image and
@@ -117,7 +117,7 @@ class Evaluation:
         judgement: the full result of the task, for the log; None without a task. No
             policy reads it.
         picture: (H, W, 3) image of 8-bit values in [0, 1]; None if not requested.
-        light: result of a query for "light"; in the last row of a batch of a sweep, the
+        collected_light: result of a query for "light"; in the last row of a batch of a sweep, the
             predictions so far.
         predicted: 0 if the image was rendered; otherwise the samples per pixel of the
             renders that it was predicted from, 1 for a matrix.
@@ -132,11 +132,11 @@ class Evaluation:
     objective: float
     gradient: Tensor | None
     success: bool
-    non_finite: int = 0
+    n_non_finite: int = 0
     cost: int = 1
     judgement: Judgement | None = None
     picture: Tensor | None = None
-    light: Any = None
+    collected_light: Any = None
     predicted: int = 0
     jpeg: bytes | None = None
     layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None
@@ -200,7 +200,7 @@ class Evaluation:
         return replace(
             self,
             gradient=torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0),
-            non_finite=self.non_finite + n_non_finite,
+            n_non_finite=self.n_non_finite + n_non_finite,
         )
 
 
@@ -259,7 +259,7 @@ class Proposal:
 
 
 @dataclass(frozen=True)
-class Counts:
+class CorrectionCounts:
     """How often a policy corrected gradients and steps, for the summary of a run.
 
     Attributes:
@@ -273,15 +273,15 @@ class Counts:
     shortened: int = 0
     rejected: int = 0
 
-    def __add__(self, other: Counts) -> Counts:
-        return Counts(
+    def __add__(self, other: CorrectionCounts) -> CorrectionCounts:
+        return CorrectionCounts(
             self.cut + other.cut,
             self.shortened + other.shortened,
             self.rejected + other.rejected,
         )
 
 
-NO_COUNTS = Counts()
+NO_COUNTS = CorrectionCounts()
 
 
 Evaluated = Sequence[tuple[Tensor, Evaluation]]
@@ -323,7 +323,7 @@ class Policy(ABC, Generic[State]):
         # The methods get copies of the arguments in these slices, which begin to count
         # after `self`: of `start(domain, generator, steps)` only the domain, as the
         # generator has to advance; of `update(state, evaluated)` all after the state.
-        hand_copies(cls, start=slice(0, 1), update=slice(1, None))
+        copy_method_arguments(cls, start=slice(0, 1), update=slice(1, None))
 
     @property
     @abstractmethod
@@ -380,7 +380,7 @@ class Policy(ABC, Generic[State]):
         """
         return self.uses_gradient and domain.gradient_cost > 0
 
-    def counts(self, state: State) -> Counts:
+    def counts(self, state: State) -> CorrectionCounts:
         """Return how often the policy corrected gradients and steps so far."""
         return NO_COUNTS
 
@@ -409,7 +409,7 @@ def seeded(seed: int, number: int) -> torch.Generator:
 
     It depends on the seed and the number only.
     """
-    return torch.Generator().manual_seed(stream(seed, "policy", number))
+    return torch.Generator().manual_seed(derive_seed(seed, "policy", number))
 
 
 @contextmanager

@@ -751,7 +751,7 @@ def _has_other_outputs(task: Task) -> bool:
     those of each label, or may have classes that mean "nothing here".
     """
     compares_features = isinstance(task, Classification) and not task.reads_logits
-    has_nothing_classes = isinstance(task, ClassTask) and bool(task.nothing_classes)
+    has_nothing_classes = isinstance(task, ClassTask) and bool(task.background_classes)
     return compares_features or has_nothing_classes
 
 

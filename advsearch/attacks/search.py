@@ -25,7 +25,7 @@ from advsearch.attacks.candidates import (
 )
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
 from advsearch.attacks.evaluation import (
-    Counts,
+    CorrectionCounts,
     Evaluate,
     Evaluation,
     Phase,
@@ -38,8 +38,8 @@ from advsearch.attacks.policies.choices import wrap_choices
 from advsearch.attacks.verification import Ending
 from advsearch.copies import copy_value
 from advsearch.errors import InputError
-from advsearch.interrupts import interruptible
-from advsearch.seeds import stream
+from advsearch.interrupts import reraise_lost_interrupt
+from advsearch.seeds import derive_seed
 
 # A search ends after this many objectives in a row that are not finite.
 NON_FINITE_LIMIT = 3
@@ -141,7 +141,7 @@ class SearchResult:
     non_finite_elements: int
     seconds: float
     agreement: tuple[float, ...] = ()
-    counts: Counts = field(default_factory=Counts)
+    counts: CorrectionCounts = field(default_factory=CorrectionCounts)
     distribution: Distribution | None = None
     failures: Failures | None = None
 
@@ -236,7 +236,7 @@ def search(
         deadline = math.inf if seconds is None else started + seconds
         is_out_of_time = _make_deadline_check(deadline)
     try:
-        with interruptible():
+        with reraise_lost_interrupt():
             stopped = _explore(log, policy, steps, seed, is_out_of_time)
             if domain.draws_conditions:
                 log.pool = replace_worst(log.pool, log.last, log.size)
@@ -356,7 +356,7 @@ class _Log:
         pool: the best candidates so far, the best first.
         last: the latest configuration with a finite objective; it need not be in
             `pool`.
-        best: largest objective so far; NaN before there is one.
+        best_objective: largest objective so far; NaN before there is one.
         records: records of all evaluations so far.
         gradients: number of gradients that were requested.
         non_finite: number of objectives that were not finite.
@@ -377,7 +377,7 @@ class _Log:
     render_seed: int
     pool: tuple[Candidate, ...] = ()
     last: Candidate | None = None
-    best: float = math.nan
+    best_objective: float = math.nan
     records: list[StepRecord] = field(default_factory=list)
     gradients: int = 0
     non_finite: int = 0
@@ -436,9 +436,9 @@ class _Log:
         ):
             query = Query(
                 proposal.u.clone(),
-                seed=stream(self.render_seed, self.kind, seed_index),
+                seed=derive_seed(self.render_seed, self.kind, seed_index),
                 kind=self.kind,
-                index=record_index,
+                row_index=record_index,
                 phase=phase,
                 gradient=proposal.gradient,
                 samples=proposal.samples,
@@ -461,9 +461,9 @@ class _Log:
         if not evaluation.is_finite:
             self.non_finite += 1
         elif phase == "search":
-            has_no_best = math.isnan(self.best)
-            if has_no_best or evaluation.objective >= self.best:
-                self.best = evaluation.objective
+            has_no_best = math.isnan(self.best_objective)
+            if has_no_best or evaluation.objective >= self.best_objective:
+                self.best_objective = evaluation.objective
             candidate = Candidate(proposal.u, evaluation.objective, evaluation.success)
             self.pool = add_candidate(self.pool, candidate, self.size)
             # stored even if it is not good enough for the pool
@@ -491,15 +491,15 @@ class _Log:
             gradient_norm = float(evaluation.gradient.norm())
         assert query.phase is not None
         return StepRecord(
-            step=query.index,
+            step=query.row_index,
             seed=query.seed,
             phase=query.phase,
             objective=objective,
-            best=self.best,
+            best=self.best_objective,
             success=evaluation.success,
             step_size=proposal.step_size,
             gradient_norm=gradient_norm,
-            non_finite=evaluation.non_finite,
+            non_finite=evaluation.n_non_finite,
             seconds=seconds,
             renders=self.renders,
             samples=proposal.samples,
@@ -544,7 +544,7 @@ def _explore(
         seed: root seed of the policy's randomness.
         is_out_of_time: returns whether the time is over, by the number of evaluations.
     """
-    generator = torch.Generator().manual_seed(stream(seed, "search"))
+    generator = torch.Generator().manual_seed(derive_seed(seed, "search"))
     name = policy.name  # for messages: that of the policy that a user chose
     policy = wrap_choices(policy, log.domain)
     log.policy = policy

@@ -22,35 +22,35 @@ from torch import Tensor
 
 from advsearch.attacks.evaluation import Evaluate, Query
 from advsearch.errors import InputError
-from advsearch.seeds import stream
+from advsearch.seeds import derive_seed
 from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 
 
 @dataclass(frozen=True)
-class Trials:
+class TrialCounts:
     """The number of successes in independent trials.
 
     Attributes:
-        successes: number of successes, from 0 to `trials`.
-        trials: number of trials, at least 1.
+        n_successes: number of successes, from 0 to `n_trials`.
+        n_trials: number of trials, at least 1.
         spp: samples per pixel of every trial.
         confidence: confidence of the interval. It is larger than 95 % if the trials
             might have ended at several looks.
     """
 
-    successes: int
-    trials: int
+    n_successes: int
+    n_trials: int
     spp: int
     confidence: float = CONFIDENCE
 
     @property
     def rate(self) -> float:
-        return self.successes / self.trials
+        return self.n_successes / self.n_trials
 
     @property
     def interval(self) -> tuple[float, float]:
         """Clopper and Pearson's interval of the success rate, with `confidence`."""
-        return clopper_pearson(self.successes, self.trials, self.confidence)
+        return clopper_pearson(self.n_successes, self.n_trials, self.confidence)
 
 
 def derive_trial_seed(seed: int, number: int) -> int:
@@ -58,7 +58,7 @@ def derive_trial_seed(seed: int, number: int) -> int:
 
     Groups of trials with the same root seed have the same seeds.
     """
-    return stream(seed, "verification", number)
+    return derive_seed(seed, "verification", number)
 
 
 # A sample count is chosen by trying the rungs of a ladder, from the lowest on. At each
@@ -114,10 +114,10 @@ def make_margin_function(
                 u,
                 seed,
                 kind,
-                index=first_query + offset,
+                row_index=first_query + offset,
                 spp=spp,
                 draws_conditions=draws_conditions,
-                with_image=first_render + offset < n_images,
+                includes_image=first_render + offset < n_images,
             )
             for offset, seed in enumerate(seeds)
         ]
@@ -318,7 +318,7 @@ def _climb_ladder(
             break
         if not may_settle(rung, count):
             continue
-        seeds = [stream(seed, "sample count", number) for number in range(count)]
+        seeds = [derive_seed(seed, "sample count", number) for number in range(count)]
         below = rung - 1
         for rendered_rung in (below, rung):
             n_rendered = len(margins_of_rungs[rendered_rung])
@@ -546,7 +546,7 @@ def choose_rate_spp(
     # Nothing settles at the rung with index 0, which has none below.
     highest_rung = 1
     have_settled = True
-    seeds = [stream(seed, "sample count", number) for number in range(N_CONDITIONS)]
+    seeds = [derive_seed(seed, "sample count", number) for number in range(N_CONDITIONS)]
     for name, render in margins.items():
         rungs = _climb_until_settled(name, render, seeds, ladder)
         table += rungs

@@ -2,7 +2,7 @@
 
 The configuration is rendered again in *trials*: with new seeds, enough samples, and 8
 bits per channel. The task evaluates the predictions. The clean configuration is
-rendered with the same seeds, as a control group. `Rule` decides on the verdict.
+rendered with the same seeds, as a control group. `VerificationRule` decides on the verdict.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluate, Query
-from advsearch.attacks.trials import Trials, derive_trial_seed
+from advsearch.attacks.trials import TrialCounts, derive_trial_seed
 from advsearch.errors import InputError
 from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 from advsearch.tasks import Judgement
@@ -105,25 +105,25 @@ anything: the interval of 6 of 6 is 54 to 100 %, that of 5 of 5 begins at 48 %.
 
 
 @dataclass(frozen=True)
-class Rule:
+class VerificationRule:
     """When a claim counts as verified.
 
     Attributes:
-        percent: percentage of the trials that have to succeed.
+        required_percent: percentage of the trials that have to succeed.
         has_control: whether the clean configuration is a control group. Then a trial
             only succeeds if the clean prediction with the same seed is right, and the
-            clean configuration has to be right in `percent` of its trials as well.
-        is_conditional: whether conditions vary from trial to trial, some of which may
+            clean configuration has to be right in `required_percent` of its trials as well.
+        has_varying_conditions: whether conditions vary from trial to trial, some of which may
             be difficult by themselves. Then only trials with a right clean prediction
             count, and the percentage is of these. The clean configuration has to be
             right in half of all trials.
     """
 
-    percent: int = PASS_PERCENT
+    required_percent: int = PASS_PERCENT
     has_control: bool = True
-    is_conditional: bool = False
+    has_varying_conditions: bool = False
 
-    def count_needed(self, trials: int, *, early: bool = False) -> int:
+    def count_needed_successes(self, trials: int, *, early: bool = False) -> int:
         """Return how many of `trials` must succeed.
 
         It is the rule's percentage of them, rounded up, and at least `min_trials`.
@@ -135,7 +135,7 @@ class Rule:
                 chance of a lucky one.
         """
         n_required = self.count_percent(trials)
-        if early and self.is_conditional:
+        if early and self.has_varying_conditions:
             # an early look is always after exactly this many trials that count
             n_required = OVER_EARLY[trials]
         # with fewer trials than `min_trials`, even all successes are not enough
@@ -143,7 +143,7 @@ class Rule:
 
     def count_allowed_failures(self, trials: int) -> int:
         """Return how many of `trials` may fail; below 0 for too few trials."""
-        return trials - self.count_needed(trials)
+        return trials - self.count_needed_successes(trials)
 
     @property
     def min_trials(self) -> int:
@@ -160,7 +160,7 @@ class Rule:
 
     def count_percent(self, trials: int) -> int:
         """Return the percentage of a number of trials, rounded up."""
-        return -(-self.percent * trials // 100)  # `//` rounds down
+        return -(-self.required_percent * trials // 100)  # `//` rounds down
 
     def is_success(self, trial: Judgement, clean: Judgement) -> bool:
         """Return whether a trial is a success, given the clean trial of the same seed.
@@ -179,15 +179,15 @@ class Rule:
 
         Over conditions, only those count in which the clean configuration is right.
         """
-        if not self.is_conditional:
+        if not self.has_varying_conditions:
             return len(clean)
         return sum(trial.right for trial in clean)
 
-    def is_already_wrong(self, clean: Trials) -> bool:
+    def is_already_wrong(self, clean: TrialCounts) -> bool:
         """Return whether the clean configuration is right in less than half of its
         trials, so that there is nothing to attack; False without a control group.
         """
-        return self.has_control and 2 * clean.successes < clean.trials
+        return self.has_control and 2 * clean.n_successes < clean.n_trials
 
     def decide(self, successes: int, trials: int) -> bool | None:
         """Return whether a configuration is a success by its trials.
@@ -200,10 +200,10 @@ class Rule:
         n_exceptions = min(successes, failures)
         if n_exceptions > self.count_allowed_failures(trials):
             return None
-        return successes >= self.count_needed(trials)
+        return successes >= self.count_needed_successes(trials)
 
     def decide_ending(
-        self, search: Ending, clean: Trials, adversarial: Trials
+        self, search: Ending, clean: TrialCounts, adversarial: TrialCounts
     ) -> Ending:
         """Return the ending of a run, by its search and by the trials of both groups.
 
@@ -225,11 +225,11 @@ class Rule:
             return search
         if self.is_already_wrong(clean):
             return Ending.ALREADY_WRONG
-        is_verified = adversarial.successes >= self.count_needed(adversarial.trials)
+        is_verified = adversarial.n_successes >= self.count_needed_successes(adversarial.n_trials)
         is_control_right = (
             not self.has_control
-            or self.is_conditional
-            or clean.successes >= self.count_needed(clean.trials)
+            or self.has_varying_conditions
+            or clean.n_successes >= self.count_needed_successes(clean.n_trials)
         )
         if is_control_right and is_verified:
             return Ending.FOUND
@@ -237,9 +237,9 @@ class Rule:
         return Ending.NOT_VERIFIED if was_claimed else search
 
 
-WORST_CASE = Rule()
-OVER_CONDITIONS = Rule(PASS_PERCENT_OVER, is_conditional=True)
-EASIER = Rule(has_control=False)
+WORST_CASE = VerificationRule()
+OVER_CONDITIONS = VerificationRule(PASS_PERCENT_OVER, has_varying_conditions=True)
+EASIER = VerificationRule(has_control=False)
 """For `--minimise`: the clean configuration may be wrong, so there is no control group.
 But a success has to have a larger score than the clean trial with the same seed.
 """
@@ -250,33 +250,33 @@ class Verification:
     """The result of the trials.
 
     Attributes:
-        ending: ending of the run, by `Rule.decide_ending`.
-        reason: one sentence with the counts behind it.
+        ending: ending of the run, by `VerificationRule.decide_ending`.
+        counts_sentence: one sentence with the counts behind it.
         u: (d,) the configuration that was verified, projected into its budget again.
         clean_counts: counts of right predictions in the control group.
-        adversarial_counts: counts of successes, by `Rule.is_success`.
+        adversarial_counts: counts of successes, by `VerificationRule.is_success`.
         clean_trials: all trials of the clean configuration, in the order of their
             seeds.
         adversarial_trials: all trials of the adversarial configuration, in the same
             order. If trials are curtailed, there are fewer of these.
         renders: number of renders of the trials.
-        stopped: why there are no more trials: "asked for" (the number that was
+        stop_reason: why there are no more trials: "asked for" (the number that was
             requested) or "decided" (further ones could not change the verdict).
-        outcomes: for each adversarial trial, whether it is a success. None if it does
+        trial_successes: for each adversarial trial, whether it is a success. None if it does
             not count, because the clean prediction is wrong under its conditions.
         first_index: index of the first trial.
     """
 
     ending: Ending
-    reason: str
+    counts_sentence: str
     u: Tensor
-    clean_counts: Trials
-    adversarial_counts: Trials
+    clean_counts: TrialCounts
+    adversarial_counts: TrialCounts
     clean_trials: tuple[Judgement, ...]
     adversarial_trials: tuple[Judgement, ...]
     renders: int
-    stopped: str
-    outcomes: tuple[bool | None, ...]
+    stop_reason: str
+    trial_successes: tuple[bool | None, ...]
     first_index: int = 0
 
     @property
@@ -285,7 +285,7 @@ class Verification:
         valid_trials = tuple(
             trial
             for trial, outcome in zip(
-                self.adversarial_trials, self.outcomes, strict=True
+                self.adversarial_trials, self.trial_successes, strict=True
             )
             if outcome is not None
         )
@@ -294,7 +294,7 @@ class Verification:
     @property
     def successful_trials(self) -> tuple[Judgement, ...]:
         """The adversarial trials that are a success."""
-        return tuple(itertools.compress(self.adversarial_trials, self.outcomes))
+        return tuple(itertools.compress(self.adversarial_trials, self.trial_successes))
 
 
 def run_trials(
@@ -344,7 +344,7 @@ def run_trials(
             kind,
             number,
             spp=spp,
-            with_image=number < first_index + n_images,
+            includes_image=number < first_index + n_images,
         )
         for number in range(first_index + n_done, first_index + trials)
     ]
@@ -358,9 +358,9 @@ def run_trials(
     return tuple(done)
 
 
-def count_right(trials: Sequence[Judgement], spp: int) -> Trials:
+def count_right(trials: Sequence[Judgement], spp: int) -> TrialCounts:
     """Count the right predictions of a control group."""
-    return Trials(sum(trial.right for trial in trials), len(trials), spp)
+    return TrialCounts(sum(trial.right for trial in trials), len(trials), spp)
 
 
 def verify(
@@ -373,7 +373,7 @@ def verify(
     seed: int,
     trials: int | Sequence[int] = 20,
     clean: Sequence[Judgement] = (),
-    rule: Rule = WORST_CASE,
+    rule: VerificationRule = WORST_CASE,
     kind: str = "verification",
     control_kind: str = "control",
     n_images: int = 0,
@@ -393,7 +393,7 @@ def verify(
     rate in 95 % of all cases, because it contains the exact interval of this stopping
     rule (Jennison and Turnbull 1983).
 
-    Trials with several looks are always curtailed, but at least `Rule.min_trials` are
+    Trials with several looks are always curtailed, but at least `VerificationRule.min_trials` are
     made, as fewer say nothing about the rate. `benchmarks/verdicts.py` checks that
     their intervals cover the rate, from the probability of every outcome.
 
@@ -475,7 +475,7 @@ def verify(
 
 
 def _fails_too_often(
-    rule: Rule,
+    rule: VerificationRule,
     trials: Sequence[Judgement],
     clean_trials: Sequence[Judgement],
     n_total: int,
@@ -492,19 +492,19 @@ def _fails_too_often(
     return n_failures > rule.count_allowed_failures(n_total)
 
 
-def _choose_confidence(rule: Rule, *, has_several_looks: bool) -> float:
+def _choose_confidence(rule: VerificationRule, *, has_several_looks: bool) -> float:
     """Return the confidence of the Clopper-Pearson interval of the success rate.
 
     If conditions vary and there are several looks, it is larger than 95 %, so that the
     interval still covers the rate in 95 % of all cases.
     """
-    return OVER_CONFIDENCE if rule.is_conditional and has_several_looks else CONFIDENCE
+    return OVER_CONFIDENCE if rule.has_varying_conditions and has_several_looks else CONFIDENCE
 
 
 def _extend_clean_trials(
     clean_trials: list[Judgement],
     run_clean: Callable[..., Iterable[Judgement]],
-    rule: Rule,
+    rule: VerificationRule,
     look: int,
     max_trials: int,
 ) -> int:
@@ -537,7 +537,7 @@ def _extend_clean_trials(
 
 
 def _is_found(
-    rule: Rule,
+    rule: VerificationRule,
     trials: Sequence[Judgement],
     clean_trials: Sequence[Judgement],
     count: int,
@@ -560,7 +560,7 @@ def _is_found(
     """
     clean_trials_of_look = clean_trials[:count]
     n_valid = rule.count_valid(clean_trials_of_look)
-    n_needed = rule.count_needed(n_valid, early=is_early)
+    n_needed = rule.count_needed_successes(n_valid, early=is_early)
     outcomes = _list_outcomes(rule, trials, clean_trials_of_look)
     n_successes = outcomes.count(True)
     is_clean_wrong = rule.is_already_wrong(count_right(clean_trials_of_look, spp))
@@ -568,11 +568,11 @@ def _is_found(
 
 
 def _list_outcomes(
-    rule: Rule, trials: Sequence[Judgement], clean_trials: Sequence[Judgement]
+    rule: VerificationRule, trials: Sequence[Judgement], clean_trials: Sequence[Judgement]
 ) -> tuple[bool | None, ...]:
     """Return whether each trial is a success, or None if it does not count.
 
-    If conditions vary (`Rule.is_conditional`), a trial does not count if the clean
+    If conditions vary (`VerificationRule.is_conditional`), a trial does not count if the clean
     prediction under the same conditions is wrong.
 
     Args:
@@ -582,7 +582,7 @@ def _list_outcomes(
     """
     outcomes: list[bool | None] = []
     for trial, clean in zip(trials, clean_trials, strict=False):
-        if rule.is_conditional and not clean.right:
+        if rule.has_varying_conditions and not clean.right:
             outcomes.append(None)
         else:
             outcomes.append(rule.is_success(trial, clean))
@@ -590,7 +590,7 @@ def _list_outcomes(
 
 
 def _summarize_trials(
-    rule: Rule,
+    rule: VerificationRule,
     claim: Ending,
     u: Tensor,
     clean_trials: Sequence[Judgement],
@@ -622,16 +622,16 @@ def _summarize_trials(
         begin: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
-    # None marks a trial that does not count. `Trials` needs at least 1, as the rate of
+    # None marks a trial that does not count. `TrialCounts` needs at least 1, as the rate of
     # none would be 0 / 0.
     n_counted = max(1, len(outcomes) - outcomes.count(None))
     clean_counts = count_right(clean_trials, spp)
-    counts = Trials(outcomes.count(True), n_counted, spp, confidence)
+    counts = TrialCounts(outcomes.count(True), n_counted, spp, confidence)
     ending = rule.decide_ending(claim, clean_counts, counts)
     reason = (
-        f"{ending.explanation} A success in {counts.successes} of {n_counted} trials, "
-        f"{rule.count_needed(n_counted, early=is_early)} are needed; clean right in "
-        f"{clean_counts.successes} of {clean_counts.trials}."
+        f"{ending.explanation} A success in {counts.n_successes} of {n_counted} trials, "
+        f"{rule.count_needed_successes(n_counted, early=is_early)} are needed; clean right in "
+        f"{clean_counts.n_successes} of {clean_counts.n_trials}."
     )
     return Verification(
         ending,
@@ -642,7 +642,7 @@ def _summarize_trials(
         clean_trials=tuple(clean_trials),
         adversarial_trials=tuple(trials),
         renders=renders,
-        stopped=stopped,
-        outcomes=outcomes,
+        stop_reason=stopped,
+        trial_successes=outcomes,
         first_index=begin,
     )

@@ -41,7 +41,7 @@ NAME_OR_FILE_FLAGS = ("--object", "--environment", "--model")
         choices=["bash", "zsh", "tcsh"],
         help="the shell that the script is for",
     ),
-    output.add_flags,
+    output.add_json_flag,
     more=". It needs the package shtab (pip install shtab)",
     examples=(
         "completion bash > ~/.local/share/bash-completion/completions/advsearch",

@@ -8,7 +8,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from advsearch.catalog import is_present
+from advsearch.catalog import is_module_installed
 from advsearch.cli import output
 from advsearch.cli.main import argument, command
 from advsearch.errors import InputError
@@ -79,7 +79,7 @@ def dashboard(args: argparse.Namespace) -> int:
     # corrupt runs are allowed: the page with the list has an error for each
     runs = [find_run(name, checked=False) for name in args.runs]
     # PHOTOGRAPH_PAGES is "module:function"; an installation may lack the module
-    has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
+    has_photographs = is_module_installed(PHOTOGRAPH_PAGES.partition(":")[0])
     photographs = load_attribute(PHOTOGRAPH_PAGES)() if has_photographs else None
     server = Dashboard(
         runs, args.host, args.port, https=args.https, photographs=photographs
@@ -126,7 +126,7 @@ def dashboard(args: argparse.Namespace) -> int:
         metavar="DIR",
         help="write a folder with a page, the rows and the small pictures",
     ),
-    output.add_flags,
+    output.add_json_flag,
     examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),
 )
 def view(args: argparse.Namespace) -> int:

@@ -75,7 +75,7 @@ class Component:
     fix: str = ""
 
 
-@command(output.add_flags)
+@command(output.add_json_flag)
 def doctor(args: argparse.Namespace) -> int:
     """Check every component of the installation, and print the results.
 

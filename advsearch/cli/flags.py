@@ -17,7 +17,7 @@ from advsearch.config import CONFIGS
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.settings import Config, Setting, read_yaml, settings, split_names
-from advsearch.trust.code import allow_named
+from advsearch.trust.code import allow_code_in_settings
 
 # Flags that messages name too, although they belong to no setting.
 _OTHER_FLAGS = {
@@ -108,7 +108,7 @@ def make_config(
     # Python code that these settings name may run, since the user typed them. Those in
     # `defaults` come from the file of a run; code in them needs --code. The
     # configuration is made first, since it parses the strings of the flags.
-    allow_named({name: getattr(config, name) for name in typed})
+    allow_code_in_settings({name: getattr(config, name) for name in typed})
     return config
 
 

@@ -14,11 +14,11 @@ from advsearch.cli import output
 from advsearch.cli.main import argument, command
 from advsearch.cli.output import open_answer_progress
 from advsearch.errors import InputError
-from advsearch.files import MESHES, either
+from advsearch.files import MESHES, join_alternatives
 from advsearch.runs.summary import read_result
 
 if TYPE_CHECKING:
-    from advsearch.scene.importing.scenes import Contents
+    from advsearch.scene.importing.scenes import FileContents
 
 VIEWS = 4  # number of views in the picture of an object
 SIDE = 192  # width and height of each view in pixels
@@ -30,14 +30,14 @@ Understood = tuple[dict[str, Any], list[str]]
     argument(
         "file",
         metavar="FILE",
-        help=f"a {either(MESHES)} file, or an .xml file of Mitsuba",
+        help=f"a {join_alternatives(MESHES)} file, or an .xml file of Mitsuba",
     ),
     argument(
         "--out",
         metavar="FILE",
         help="picture to write of the contents, from four sides (.png)",
     ),
-    output.add_flags,
+    output.add_json_flag,
     more=". Nothing is written but the picture",
     examples=(
         "import mug.obj",
@@ -59,12 +59,12 @@ def file(args: argparse.Namespace) -> int:
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with open_answer_progress():
         # late, so that --help answers at once
-        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, list_contents
+        from advsearch.scene.importing.scenes import MITSUBA_SUFFIX, read_file_contents
 
         if Path(args.file).suffix.lower() == MITSUBA_SUFFIX:
             facts, lines = _describe_mitsuba_file(args.file, out)
         else:
-            contents = list_contents(Path(args.file))
+            contents = read_file_contents(Path(args.file))
             facts, lines = _describe_mesh_file(args.file, contents)
             if out is not None:
                 scene = advsearch.load_scene(contents.object)
@@ -73,7 +73,7 @@ def file(args: argparse.Namespace) -> int:
     return output.print_answer(args.json, facts, "\n".join(lines))
 
 
-def _describe_mesh_file(file: str, contents: Contents) -> Understood:
+def _describe_mesh_file(file: str, contents: FileContents) -> Understood:
     """Return what the file of a mesh contains: facts for JSON, and lines of text.
 
     Args:
@@ -176,7 +176,7 @@ def _explain_slow_features(mesh_object: Any) -> list[str]:
     if not names:
         return []
     return [
-        f"slow: for {either(names, 'and')}, controls that move outlines (pose, camera, "
+        f"slow: for {join_alternatives(names, 'and')}, controls that move outlines (pose, camera, "
         "geometry) are differentiated by "
         "differences, which takes several renders a step; textures and light are not "
         "slower"
@@ -279,7 +279,7 @@ def _describe(parser: argparse.ArgumentParser) -> None:
     argument(
         "--overwrite", action="store_true", help="replace a run that exists already"
     ),
-    output.add_flags,
+    output.add_json_flag,
 )
 def threedb(args: argparse.Namespace) -> int:
     """Make a run of a folder that 3DB wrote, and return the exit status."""
@@ -289,5 +289,5 @@ def threedb(args: argparse.Namespace) -> int:
     if args.json:
         output.print_json(read_result(path).to_dict())
     else:
-        print(f"{path}: {read_result(path).brief}; {path / 'report.html'} shows it")
+        print(f"{path}: {read_result(path).outcome_summary}; {path / 'report.html'} shows it")
     return 0

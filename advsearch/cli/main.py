@@ -18,7 +18,7 @@ from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
-from advsearch.catalog import is_present
+from advsearch.catalog import is_module_installed
 from advsearch.cli import output
 from advsearch.cli.output import (
     BAD_INPUT,
@@ -224,7 +224,7 @@ class ExperimentCommand:
         return make_config(args, config_type)
 
     def run_config(
-        self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None
+        self, config: Config, *, as_json: bool, quiet: bool, resumed_directory: Path | None = None
     ) -> int:
         """Run the experiment, print the result and return the exit status.
 
@@ -232,13 +232,13 @@ class ExperimentCommand:
             config: its settings.
             as_json: print the result as JSON.
             quiet: print no progress.
-            resumed: folder of the run to go on with; None for a new run.
+            resumed_directory: folder of the run to go on with; None for a new run.
         """
         with open_command_progress(as_json=as_json, quiet=quiet) as progress:
             from advsearch import experiment  # late, so that --help answers at once
 
             result = experiment.run_experiment(
-                config, progress=progress, resumed=resumed
+                config, progress=progress, resumed_directory=resumed_directory
             )
         status = output.print_result(result, as_json=as_json)
         if status != OK:  # the run was interrupted
@@ -336,7 +336,7 @@ def _is_available(name: str, target: str) -> bool:
         return name in EXPERIMENTS
     # an installation may lack the module of an optional command
     module = target.partition(":")[0]
-    return is_present(f"advsearch.cli.{module}")
+    return is_module_installed(f"advsearch.cli.{module}")
 
 
 def get_command(name: str) -> ExperimentCommand | PlainCommand:
@@ -413,10 +413,10 @@ def _run_interruptibly(words: list[str]) -> int:
         signal.signal(signal.SIGINT, INTERRUPTS)
         end_process_at_second_interrupt()
         status = _status(words)
-        INTERRUPTS.ended = True
+        INTERRUPTS.is_work_done = True
         return status
     except KeyboardInterrupt:  # another one, while `_status` handled the first
-        INTERRUPTS.ended = True
+        INTERRUPTS.is_work_done = True
         return INTERRUPTED
 
 
@@ -430,13 +430,13 @@ def _status(words: list[str]) -> int:
         status = _run_and_report_errors(words)
         # There was an interrupt, but some code has swallowed it. Raise it again, so
         # that the branch below handles it.
-        if status != INTERRUPTED and INTERRUPTS.count:
+        if status != INTERRUPTED and INTERRUPTS.n_received:
             raise KeyboardInterrupt
         return status
     except BaseException as error:
         # Modules that are being imported, and native code, turn an interrupt into other
         # errors. So any error after an interrupt is taken for one.
-        is_interrupt = isinstance(error, KeyboardInterrupt) or INTERRUPTS.count > 0
+        is_interrupt = isinstance(error, KeyboardInterrupt) or INTERRUPTS.n_received > 0
         if not is_interrupt:
             raise
         print("advsearch: interrupted", file=sys.stderr)

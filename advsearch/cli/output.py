@@ -161,7 +161,7 @@ def _screen(stream: Any, *, raises_errors: bool) -> TextIO:
     return cast(TextIO, Screen(stream, raises_errors=raises_errors))
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
+def add_json_flag(parser: argparse.ArgumentParser) -> None:
     """Add ``--json``."""
     parser.add_argument(
         "--json", action="store_true", help="print one JSON value on standard output"
@@ -181,7 +181,7 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
 
 def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
     """Add ``--json`` and ``--quiet``, for commands that take long."""
-    add_flags(parser)  # --json
+    add_json_flag(parser)  # --json
     parser.add_argument(
         "--quiet",
         action="store_true",
@@ -190,18 +190,18 @@ def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def print_answer(
-    as_json: bool, facts: Mapping[str, object], text: str, stream: IO[str] | None = None
+    as_json: bool, json_fields: Mapping[str, object], text: str, stream: IO[str] | None = None
 ) -> int:
     """Print the answer of a command, and return the exit status of success.
 
     Args:
         as_json: print the facts as JSON on standard output, else the text.
-        facts: the answer for programs.
+        json_fields: the answer for programs.
         text: the answer for people.
         stream: stream for the text; None is standard output.
     """
     if as_json:
-        print_json({"schema": 1, **facts})
+        print_json({"schema": 1, **json_fields})
     else:
         print(text, file=stream)
     return OK
@@ -340,7 +340,7 @@ def _format_part(part: ResultPart) -> str:
     # late, so that --help answers at once
     from advsearch.cli.flags import format_as_flags
 
-    table = align_columns([part.heads, *part.rows] if part.heads else part.rows)
+    table = align_columns([part.column_heads, *part.rows] if part.column_heads else part.rows)
     picture_rows = [
         [picture.file, picture.caption] for group in part.pictures for picture in group
     ]
@@ -392,7 +392,7 @@ def open_command_progress(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
         progress.stage("starting: loading PyTorch and Mitsuba")
         yield progress
         # raises KeyboardInterrupt if some code has swallowed one
-        INTERRUPTS.look()
+        INTERRUPTS.raise_pending()
 
 
 def open_answer_progress() -> AbstractContextManager[Progress]:
@@ -427,13 +427,13 @@ class InterruptCheckingProgress:
         Raises:
             KeyboardInterrupt: there was an interrupt that was not handled.
         """
-        INTERRUPTS.look()
+        INTERRUPTS.raise_pending()
         self._progress.stage(name, total, hint=hint, at_most=at_most)
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         """See `Progress.advance`; raises as `stage` does."""
         self._progress.advance(n, **info)
-        INTERRUPTS.look()
+        INTERRUPTS.raise_pending()
 
     def message(self, text: str) -> None:
         self._progress.message(text)

@@ -73,7 +73,7 @@ LARGEST_POSES = 1 << 20
     ),
     argument("--overwrite", action="store_true", help="replace existing files"),
     output.add_code_flag,
-    output.add_flags,
+    output.add_json_flag,
     more=": a page, Markdown and JSON",
     examples=(
         "report mug-texture-001 mug-sweep-001 --evidence",

@@ -20,7 +20,7 @@ from advsearch.runs.directory import CONFIG, HOME, REPORT, find_run, read_python
 from advsearch.runs.listing import is_finished, list_runs
 from advsearch.settings import parse_assignment
 from advsearch.settings.values import set_dotted
-from advsearch.trust.code import allow_named
+from advsearch.trust.code import allow_code_in_settings
 from advsearch.viewer.pages import write_page
 
 
@@ -68,11 +68,11 @@ def parse_changes(words: Sequence[str]) -> dict[str, object]:
         InputError: a word is no such assignment.
     """
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
-    # `allow_named` expects settings in nested form: {"controls": {"pose": {"yaw": 3}}}
+    # `allow_code_in_settings` expects settings in nested form: {"controls": {"pose": {"yaw": 3}}}
     nested_changes = dict[str, object]()
     for name, value in changes.items():
         set_dotted(nested_changes, name, value)
-    allow_named(nested_changes)
+    allow_code_in_settings(nested_changes)
     return changes
 
 
@@ -80,7 +80,7 @@ def run_file(
     file: str | Path,
     changes: Mapping[str, object],
     args: argparse.Namespace,
-    resumed: Path | None = None,
+    resumed_directory: Path | None = None,
 ) -> int:
     """Run the experiment that a YAML file describes, and return the exit status.
 
@@ -88,7 +88,7 @@ def run_file(
         file: file with settings.
         changes: values by name that replace those of the file.
         args: has `json` and `quiet`.
-        resumed: folder of the run to go on with, if the file is its own; None for a new
+        resumed_directory: folder of the run to go on with, if the file is its own; None for a new
             run.
 
     Raises:
@@ -101,22 +101,22 @@ def run_file(
     # such as an address to connect to. The configuration lacks them. A new run would
     # silently differ from the file, so it is an error. A run that is resumed was
     # started with them; it goes on if they do not change its numbers.
-    for setting in config.left_out:
+    for setting in config.omitted_settings:
         decides_numbers = setting.name not in config.changeable_settings
-        if resumed is None or decides_numbers:
+        if resumed_directory is None or decides_numbers:
             raise InputError(
                 f"{file}: {setting.name}: {setting.effect}, which a file "
-                f"can't ask for; type {setting.how_to_set}"
+                f"can't ask for; type {setting.advice}"
             )
         if not args.quiet:
             print(
                 f"advsearch: {setting.name} is left out: it {setting.effect}; type "
-                f"{setting.how_to_set}",
+                f"{setting.advice}",
                 file=sys.stderr,
             )
     command = main.ExperimentCommand(get_experiment(config.command))
     return command.run_config(
-        config, as_json=args.json, quiet=args.quiet, resumed=resumed
+        config, as_json=args.json, quiet=args.quiet, resumed_directory=resumed_directory
     )
 
 
@@ -175,7 +175,7 @@ def resume(args: argparse.Namespace) -> int:
             "Python session of the run; call the same function with the same arguments "
             "again, an attack with `resume=True`"
         )
-    return run_file(path / CONFIG, changes, args, resumed=path)
+    return run_file(path / CONFIG, changes, args, resumed_directory=path)
 
 
 MOST_NAMES = 4  # maximum number of controls of a run that the table names
@@ -185,7 +185,7 @@ MOST_NAMES = 4  # maximum number of controls of a run that the table names
     argument(
         "folder", nargs="?", metavar="FOLDER", help="folder of runs (default: runs)"
     ),
-    output.add_flags,
+    output.add_json_flag,
 )
 def runs(args: argparse.Namespace) -> int:
     """Print a table of the runs in a folder, and return the exit status.

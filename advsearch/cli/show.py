@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.catalog import is_present
+from advsearch.catalog import is_module_installed
 from advsearch.cli import output
 from advsearch.cli.flags import add_settings
 from advsearch.cli.main import argument, command
@@ -33,7 +33,7 @@ from advsearch.runs.directory import IMAGES, PHOTOGRAPHS, find_run
 from advsearch.runs.listing import ListedRun, read_listed_run
 from advsearch.runs.results import to_json_value
 from advsearch.runs.summary import NAME, read_result
-from advsearch.trust.code import allow_named
+from advsearch.trust.code import allow_code_in_settings
 
 if TYPE_CHECKING:
     from advsearch.controls import Choice, Parameter
@@ -60,7 +60,7 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="draw the pictures of the run in the terminal, if it supports images",
     ),
-    output.add_flags,
+    output.add_json_flag,
 )
 def show(args: argparse.Namespace) -> int:
     """Print a run, or a control, policy, task or recipe, which is given by its kind and
@@ -226,7 +226,7 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
     with open_answer_progress():
         registry = _registry(PLURALS[kind])  # takes seconds
     # a control may be named as "module:name", code that a person typed and that may run
-    allow_named({"controls": name} if kind == "control" else {})
+    allow_code_in_settings({"controls": name} if kind == "control" else {})
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
     entry = registry[name]
@@ -447,7 +447,7 @@ _EVERY = {
 REGISTRIES = {
     kind: target
     for kind, target in _EVERY.items()
-    if is_present(target.partition(":")[0])
+    if is_module_installed(target.partition(":")[0])
 }
 """The "module:attribute" with the names of each kind: a mapping with the names as keys,
 or a function that returns one.
@@ -484,7 +484,7 @@ def _registry(kind: str) -> Any:
         choices=[*REGISTRIES, "all"],
         help="default: all",
     ),
-    output.add_flags,
+    output.add_json_flag,
 )
 def list_all(args: argparse.Namespace) -> int:
     """Print the names of one kind, such as objects, or of all kinds.
@@ -518,7 +518,7 @@ def list_all(args: argparse.Namespace) -> int:
         help="word that the names should resemble; without it, all names",
     ),
     partial(add_settings, only=("model", "labels")),
-    output.add_flags,
+    output.add_json_flag,
     more=". With --labels the model itself is not loaded. What stands for no thing, "
     "such as background, is left out",
     examples=(
@@ -562,7 +562,7 @@ def _load_labels(args: argparse.Namespace) -> Sequence[str]:
     if "labels" in args and args.labels is not None:
         return read_labels(args.labels)
     model = getattr(args, "model", "reference")
-    allow_named({"model": model})
+    allow_code_in_settings({"model": model})
     loaded = load_model(model)
     if not loaded.named:
         problem = f"model {loaded.name} has {loaded.classes} classes without names"

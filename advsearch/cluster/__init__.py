@@ -30,17 +30,17 @@ class WorkerTask:
     """How workers compute batches, in a form that can be sent to them."""
 
     # "package.module:function", which takes the settings and returns a `BatchFunction`
-    function: str
+    function_path: str
     settings: JsonObject
     # names of settings that may hold paths, separated by commas; these files are sent
     # to workers that lack them
-    files: tuple[str, ...] = ()
+    path_setting_names: tuple[str, ...] = ()
     threads: int = 1  # number of threads with which a worker renders
     # Seconds that a batch may take at least before its worker is stopped. None if the
     # limit depends only on the median of earlier batches.
-    seconds: float | None = None
+    min_timeout_seconds: float | None = None
     # modules of the user that this process may import, and workers, too
-    code: tuple[str, ...] = field(default_factory=allowed_code)
+    allowed_modules: tuple[str, ...] = field(default_factory=allowed_code)
     # SHA-256 of the files by path, for workers elsewhere
     digests: Mapping[str, str] = field(default_factory=dict)
 
@@ -55,7 +55,7 @@ class BatchResult:
     # name in `WorkerStats.machines`; None if it is like this machine
     machine: str | None = None
     # Why there is no value; empty if there is one. Only a single item has no value.
-    lost: str = ""
+    failure_reason: str = ""
 
     def require_value(self, title: str) -> Any:
         """Return the value of the batch, which must have been computed.
@@ -66,8 +66,8 @@ class BatchResult:
         Raises:
             ClusterError: if there is no value.
         """
-        if self.lost:
-            raise ClusterError(f"{title}: {self.lost}")
+        if self.failure_reason:
+            raise ClusterError(f"{title}: {self.failure_reason}")
         return self.value
 
 

@@ -162,9 +162,9 @@ class DaskExecutor(WorkerExecutor):
         self._sending: asyncio.Future[Any] | None = None
         self._calls: set[Future[Any]] = set()
         # addresses of workers that get calls
-        self._fit: frozenset[str] = frozenset()
+        self._usable_addresses: frozenset[str] = frozenset()
         # why other workers get none, by their addresses
-        self._refused: dict[str, str] = {}
+        self._refusal_by_address: dict[str, str] = {}
         # When the workers were last looked up. -inf stands for never, so that the first
         # count looks them up.
         self._looked_at = float("-inf")
@@ -275,18 +275,18 @@ class DaskExecutor(WorkerExecutor):
             # A scheduler that does not answer is slow or about to end. The next look
             # will show which, so the old count is used until then.
             with suppress(OSError, TimeoutError, asyncio.TimeoutError):
-                self._look()
+                self._update_workers()
             self._looked_at = time.monotonic()
         # The time without fit workers begins now if there is one now, or if this method
         # was not called for so long that workers may have come and gone.
         was_long_ago = now - self._counted_at > LESS_PATIENCE
-        if self._fit or was_long_ago:
+        if self._usable_addresses or was_long_ago:
             self._alone_since = now
         self._check_hope(now)
         self._counted_at = time.monotonic()
-        return len(self._fit)
+        return len(self._usable_addresses)
 
-    def _look(self) -> None:
+    def _update_workers(self) -> None:
         """Ask the scheduler which workers are connected, and sort them.
 
         Workers that have disconnected are counted as lost. New workers get calls if
@@ -297,14 +297,14 @@ class DaskExecutor(WorkerExecutor):
         connected = frozenset(
             client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
         )
-        self.stats.lost += len(self._fit - connected)
-        self._refused = {
+        self.stats.lost += len(self._usable_addresses - connected)
+        self._refusal_by_address = {
             address: reason
-            for address, reason in self._refused.items()
+            for address, reason in self._refusal_by_address.items()
             if address in connected
         }
-        fit = self._fit & connected
-        new = connected - fit - set(self._refused)
+        fit = self._usable_addresses & connected
+        new = connected - fit - set(self._refusal_by_address)
         versions = {}
         if new:
             versions = client.sync(
@@ -316,7 +316,7 @@ class DaskExecutor(WorkerExecutor):
             else:
                 self._refuse_version(address, its_version)
         # A call that ran during these queries may have refused a worker that was fit.
-        self._fit = fit - set(self._refused)
+        self._usable_addresses = fit - set(self._refusal_by_address)
 
     def _refuse_version(self, address: str, version: Any) -> None:
         """Refuse a worker that has another version of advsearch, or none.
@@ -351,9 +351,9 @@ class DaskExecutor(WorkerExecutor):
 
     def _refuse(self, address: str, reason: str) -> None:
         """Give a worker no more calls, and report why, once."""
-        self._fit -= {address}
-        if address not in self._refused:
-            self._refused[address] = reason
+        self._usable_addresses -= {address}
+        if address not in self._refusal_by_address:
+            self._refusal_by_address[address] = reason
             self.stats.refused += 1
             self._tell(f"{address} is given nothing: {reason}")
 
@@ -366,9 +366,9 @@ class DaskExecutor(WorkerExecutor):
         Args:
             now: time (`time.monotonic`) of this check.
         """
-        patience = LESS_PATIENCE if self._refused else PATIENCE
+        patience = LESS_PATIENCE if self._refusal_by_address else PATIENCE
         if now - self._alone_since > patience:
-            reasons = "; ".join(dict.fromkeys(self._refused.values()))
+            reasons = "; ".join(dict.fromkeys(self._refusal_by_address.values()))
             remark = f" ({reasons})" if reasons else ""
             raise ClusterError(
                 f"{self.description}: there was no worker that can do it for "
@@ -387,8 +387,8 @@ class DaskExecutor(WorkerExecutor):
             "done again"
         )
         self.shutdown()
-        self._fit = frozenset()
-        self._refused = {}
+        self._usable_addresses = frozenset()
+        self._refusal_by_address = {}
         self._sending = None
         self._open(RECONNECT_SECONDS)
         self._alone_since = time.monotonic()
@@ -429,7 +429,7 @@ class DaskExecutor(WorkerExecutor):
 
         failed_starts = 0
         while client.status == "running":
-            workers = sorted(self._fit)
+            workers = sorted(self._usable_addresses)
             future = client.submit(
                 call_on_worker,
                 function,
@@ -498,7 +498,7 @@ class DaskExecutor(WorkerExecutor):
                 done, _ = await asyncio.wait([fetching], timeout=LOOK_SECONDS)
                 if done:
                     return fetching.result()
-                if not self._fit.intersection(workers):
+                if not self._usable_addresses.intersection(workers):
                     return None
         finally:
             fetching.cancel()

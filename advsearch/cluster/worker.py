@@ -135,7 +135,7 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
         InputError: the files together are too large to be sent.
     """
     contents: dict[str, bytes] = {}
-    for name in task.files:
+    for name in task.path_setting_names:
         value = task.settings.get(name)
         parts = _split_paths(value) if isinstance(value, str) else ()
         for part in parts:
@@ -232,7 +232,7 @@ def resolve_files(task: WorkerTask, folder: Path) -> WorkerTask:
         if not _has_digest(local_paths[path], digest):
             raise MissingFilesError(path)
     settings = dict(task.settings)
-    for name in task.files:
+    for name in task.path_setting_names:
         value = settings.get(name)
         if isinstance(value, str):
             # A part that is no path, such as a comma, is not changed.
@@ -294,7 +294,7 @@ class Reply:
 
     value: Any = None
     seconds: float = 0.0  # seconds that computing the batch took
-    loading: float = 0.0  # seconds that loading the task took before
+    loading_seconds: float = 0.0  # seconds that loading the task took before
     machine: MachineInfo = field(default_factory=dict)
     worker: str = ""
     failure: Failure | None = None
@@ -381,10 +381,10 @@ def load_task(task: WorkerTask) -> BatchFunction:
     # Only called for its error on a machine without libLLVM, before anything is loaded.
     describe_machine()
     # The user allowed this code to run in the main process.
-    allow_code(*task.code)
+    allow_code(*task.allowed_modules)
     task = resolve_files(task, folder / INPUTS)
     threads.configure(task.threads)
-    make_function: Callable[[Any], BatchFunction] = load_attribute(task.function)
+    make_function: Callable[[Any], BatchFunction] = load_attribute(task.function_path)
     # The least recently used function is dropped before another is loaded, so that both
     # do not need memory at the same time.
     while len(_loaded) >= MAX_LOADED:
@@ -396,10 +396,10 @@ def load_task(task: WorkerTask) -> BatchFunction:
 def _make_task_key(task: WorkerTask) -> str:
     """Return a digest of everything on which the results of a loaded task depend."""
     described = [
-        task.function,
+        task.function_path,
         task.settings,
         task.threads,
-        task.code,
+        task.allowed_modules,
         sorted(task.digests.items()),
     ]
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()

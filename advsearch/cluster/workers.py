@@ -95,7 +95,7 @@ class PoolWorkers:
         counted_at = self._clock()
         try:
             while True:
-                INTERRUPTS.look()
+                INTERRUPTS.raise_pending()
                 n_workers = self._executor.count_workers()
                 now = self._clock()
                 self.stats.workers = n_workers
@@ -156,7 +156,7 @@ class PoolWorkers:
         if len(items) > 1:
             queued.put_back_singly(items)
         else:
-            yield BatchResult(items, None, lost=str(error))
+            yield BatchResult(items, None, failure_reason=str(error))
 
     def _wait(self, ended: queue.SimpleQueue[Future[Reply]]) -> Future[Reply] | None:
         """Return a future that has ended, None if none ends for a moment."""
@@ -193,7 +193,7 @@ class PoolWorkers:
                 MIN_DEADLINE,
                 DEADLINE_FACTOR * n_items * statistics.median(item_seconds),
             )
-        return max(deadline, self._task.seconds or 0.0)
+        return max(deadline, self._task.min_timeout_seconds or 0.0)
 
     def _read_reply(self, items: Sequence[Any], reply: Reply) -> BatchResult:
         """Return the result in a worker's reply, and count its times and its machine.
@@ -212,10 +212,10 @@ class PoolWorkers:
             raise ClusterError(reply.error)
         self.stats.batches += 1
         self.stats.busy += reply.seconds
-        self.stats.loading += reply.loading
+        self.stats.loading += reply.loading_seconds
         # `compute` counts all seconds that workers are connected. The seconds of
         # loading are subtracted, since they do not belong to `alive`.
-        self.stats.alive -= reply.loading
+        self.stats.alive -= reply.loading_seconds
         machine: str | None = digest_machine(reply.machine)
         if machine == self._this_machine:  # then it needs no name
             machine = None
@@ -304,7 +304,7 @@ def open_workers(
     *,
     workers: int | None,
     cluster: str | None,
-    tell: Callable[[str], None],
+    report_message: Callable[[str], None],
 ) -> Iterator[Workers | None]:
     """Open workers for a task, and end them after the block.
 
@@ -314,7 +314,7 @@ def open_workers(
             on this machine.
         cluster: address of a scheduler, or path of a YAML file that describes a
             cluster; "local" or None for this machine.
-        tell: function that is called with messages for the user.
+        report_message: function that is called with messages for the user.
 
     Yields:
         The workers; None if neither `workers` nor `cluster` is set: then this process
@@ -328,8 +328,8 @@ def open_workers(
         executor = LocalExecutor(workers or threads.count_cores())
     else:
         open_dask = load_attribute("advsearch.cluster.dask_executor:open_dask")
-        executor, task = open_dask(task, workers, cluster, tell)
+        executor, task = open_dask(task, workers, cluster, report_message)
     try:
-        yield PoolWorkers(executor, task, tell)
+        yield PoolWorkers(executor, task, report_message)
     finally:
         executor.shutdown(cancel_futures=True)

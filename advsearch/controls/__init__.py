@@ -19,7 +19,7 @@ from advsearch.controls.base import (
     Group,
     NumberControl,
     Parameter,
-    list_replaced_settings,
+    find_replaced_defaults,
 )
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
@@ -36,7 +36,7 @@ CONTROLS: Registry[type[Control]] = Registry(
         and issubclass(entry, Control)
         and entry.kind == name != ""
     ),
-    imports=True,
+    imports_user_classes=True,
 )
 """Classes of controls by their name on the command line, such as "pose".
 
@@ -139,7 +139,7 @@ def _parse_name(
     kind_setting = settings.pop("kind", None)
     if kind_setting is not None:
         return str(kind_setting), control_name, None
-    if CONTROLS.names_class(control_name):
+    if CONTROLS.is_class_path(control_name):
         return control_name, CONTROLS[control_name].kind, None
     head, colon, name = control_name.partition(":")
     kind, dot, parameter = head.partition(".")
@@ -285,7 +285,7 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
     """
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
-    space = compose(controls, scene)
+    space = compose_space(controls, scene)
     if not len(space.start):
         names = ", ".join(control.name for control in controls)
         raise InputError(
@@ -338,7 +338,7 @@ def _check_names_no_mesh(controls: Sequence[Control], scene: SceneDescription) -
             )
 
 
-def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
+def compose_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
     """Let controls prepare a scene, bind them to it and compose them into a space.
 
     There may be no controls, or only fixed ones. All prepare the scene, e.g. add a
@@ -356,25 +356,25 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     adjusted = list[AdjustedDefault]()
     for control in controls:
         prepared = control.prepare(scene)
-        adjusted += list_replaced_settings(control.name, scene, prepared)
+        adjusted += find_replaced_defaults(control.name, scene, prepared)
         scene = prepared
     for control in controls:
-        if control.mesh != OBJECT:
+        if control.mesh_name != OBJECT:
             control.get_mesh(scene)  # raises if the scene has no such mesh
     bound = tuple(control.bind(scene) for control in controls)
     for control in bound:
         adjusted += control.adjusted_defaults
     # Two lists were joined: adjustments by `prepare`, and those by `bind`.
     names = [control.name for control in controls]
-    adjusted.sort(key=lambda default: names.index(default.control))
+    adjusted.sort(key=lambda default: names.index(default.control_name))
     # A new environment is an adjusted default, or a control has recorded it in the
     # scene.
     environment = None
     if scene.environment_spec != described_scene.environment_spec:
         environment = scene.environment_spec
     for default in reversed(adjusted):  # the first one takes precedence
-        if default.parameter == ENVIRONMENT:
-            environment = str(default.used)
+        if default.parameter_name == ENVIRONMENT:
+            environment = str(default.used_value)
     return Space(bound, scene, tuple(adjusted), environment)
 
 
@@ -438,7 +438,7 @@ __all__ = [
     "Parameter",
     "Space",
     "check_control_settings",
-    "compose",
+    "compose_space",
     "make_control",
     "make_space",
     "merge_control_settings",

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Control, Values
-from advsearch.controls.ranges import ParameterValue, list_set_names
+from advsearch.controls.ranges import ParameterValue, list_allowed_names
 from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene.assembly import PHOTOGRAPH_INPUT
@@ -30,7 +30,7 @@ from advsearch.scene.assets import Float64Array
 from advsearch.scene.backdrop import has_plane
 from advsearch.scene.camera_model import CameraModel, make_pinhole
 from advsearch.scene.description import SCENE_ENVIRONMENT, SceneDescription
-from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.geometry import camera_to_world, compute_object_to_world
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import Parameter
 
@@ -57,10 +57,10 @@ class BackdropControl(Control):
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameter `which`, with the photographs in the settings as options.
 
-        See `list_set_names` for the forms of the setting.
+        See `list_allowed_names` for the forms of the setting.
         """
         which = cls.parameters[0]
-        options = tuple(dict.fromkeys(list_set_names(settings, "which")))
+        options = tuple(dict.fromkeys(list_allowed_names(settings, "which")))
         if not options:
             return (which,)
         # The value of a choice among names is the index of an option.
@@ -185,7 +185,7 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
         "camera.exposure": torch.tensor(math.log2(view.gain / scene.gain)),
     }
     if scene.camera_model is not None:
-        inputs["camera.lens"] = torch.tensor(_get_lens(view).numbers)
+        inputs["camera.lens"] = torch.tensor(_get_lens(view).intrinsics)
     else:
         inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
     if has_plane(scene):
@@ -211,8 +211,8 @@ def _compute_view_to_first(
         view: scene in one photograph.
         first: scene in the first photograph.
     """
-    view_to_first: Float64Array = object_to_world(first) @ np.linalg.inv(
-        object_to_world(view)
+    view_to_first: Float64Array = compute_object_to_world(first) @ np.linalg.inv(
+        compute_object_to_world(view)
     )
     return view_to_first
 

@@ -101,7 +101,7 @@ class BackgroundControl(Control):
             for parameter_name in COLOR_PARAMETERS
             if parameter_name in self.specs
         ]
-        self.has_requested_search = any(
+        self.has_requested_range = any(
             not isinstance(spec, Fixed) for spec in color_specs
         )
         if self.specs.get("what") == Fixed("environment"):
@@ -119,12 +119,12 @@ class BackgroundControl(Control):
             return replace(parameter, default="environment")
         return parameter
 
-    def get_scene_value(self, parameter: Parameter) -> float | str:
+    def get_value_without_control(self, parameter: Parameter) -> float | str:
         return "environment" if parameter.name == "what" else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         scene = replace(scene, backdrop=True)
-        return scene.without_ground() if self.chosen["ground"] == "hide" else scene
+        return scene.without_ground() if self.choice_values["ground"] == "hide" else scene
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

@@ -46,7 +46,7 @@ from advsearch.controls.ranges import (
     parse_spec,
     to_plain_value,
 )
-from advsearch.copies import copy_value, hand_copies, is_ours
+from advsearch.copies import copy_value, copy_method_arguments, is_package_class
 from advsearch.distributions import distribution_to_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import Value as Value
@@ -81,19 +81,19 @@ class AdjustedDefault:
     """A default value of the clean scene that a control had to adjust.
 
     Attributes:
-        control: name of the control.
-        parameter: parameter that was adjusted (``pose.yaw``, ``ground.size``,
+        control_name: name of the control.
+        parameter_name: parameter that was adjusted (``pose.yaw``, ``ground.size``,
             ``environment``).
         unit: unit of the values; "name" for names.
-        scene: value in the scene as it was described.
-        used: the value that is used instead.
+        scene_value: value in the scene as it was described.
+        used_value: the value that is used instead.
     """
 
-    control: str
-    parameter: str
+    control_name: str
+    parameter_name: str
     unit: str
-    scene: ParameterValue
-    used: ParameterValue
+    scene_value: ParameterValue
+    used_value: ParameterValue
 
 
 def describe_adjusted_defaults(adjusted: Sequence[AdjustedDefault]) -> list[str]:
@@ -106,7 +106,7 @@ def describe_adjusted_defaults(adjusted: Sequence[AdjustedDefault]) -> list[str]
         adjusted: adjusted values; those of the same control follow each other.
     """
     sentences = []
-    for control, values in groupby(adjusted, key=lambda value: value.control):
+    for control, values in groupby(adjusted, key=lambda value: value.control_name):
         adjustments = " and ".join(map(_describe_adjustment, values))
         sentences.append(
             f"The clean scene has {adjustments}, which the control {control} leaves "
@@ -118,17 +118,17 @@ def describe_adjusted_defaults(adjusted: Sequence[AdjustedDefault]) -> list[str]
 def _describe_adjustment(value: AdjustedDefault) -> str:
     """Return a clause such as "pose.yaw 10 degrees instead of 0"."""
     unit = f" {value.unit}"
-    if value.unit in ("1", "name") or isinstance(value.used, str):
+    if value.unit in ("1", "name") or isinstance(value.used_value, str):
         unit = ""
-    used = value.used if isinstance(value.used, str) else format_rounded(value.used)
-    scene = value.scene if isinstance(value.scene, str) else format_rounded(value.scene)
+    used = value.used_value if isinstance(value.used_value, str) else format_rounded(value.used_value)
+    scene = value.scene_value if isinstance(value.scene_value, str) else format_rounded(value.scene_value)
     if used == scene:  # the values differ by less than the rounding: show more digits
-        used = format_value(value.used)
-        scene = format_value(value.scene)
-    return f"{value.parameter} {used}{unit} instead of {scene}"
+        used = format_value(value.used_value)
+        scene = format_value(value.scene_value)
+    return f"{value.parameter_name} {used}{unit} instead of {scene}"
 
 
-def list_replaced_settings(
+def find_replaced_defaults(
     control: str, before: SceneDescription, after: SceneDescription
 ) -> Iterator[AdjustedDefault]:
     """Yield the default values of a scene that a control has replaced.
@@ -324,17 +324,17 @@ class Control:
             parameters have no effect. None if there is no such parameter.
         instance_parameters: parameters of this instance, as `declare_parameters`
             returns them for its settings.
-        chosen: value of each choice, by name.
+        choice_values: value of each choice, by name.
         specs: fixed value, range or list of values of each parameter that the user
             set, by name.
-        has_requested_search: whether the user set a range or a list of values for any
+        has_requested_range: whether the user set a range or a list of values for any
             parameter.
         scene: scene after all controls have prepared it. Set by `bind`.
         start: (d,) float32 in [0, 1], the configuration that leaves the scene
             unchanged. Set by `bind`.
         groups: groups of coordinates that are differentiated alike, in the order of
             the coordinates. Their sizes add up to d. Set by `bind`.
-        slots: each parameter with its spec and the offset of its coordinates, in the
+        parameter_slots: each parameter with its spec and the offset of its coordinates, in the
             order of the coordinates. Empty if coordinates are not single parameters,
             such as pixels. Set by `bind`.
         adjusted_defaults: default values of the clean scene that the ranges exclude.
@@ -354,7 +354,7 @@ class Control:
         PATH_PARAMETER: name of the parameter that selects one of several paths, if the
             control travels.
         competes_with_ambient: whether the control adds light that is less visible in
-            brighter ambient light. See `ambient`.
+            brighter ambient light. See `ambient_lux`.
         photograph_refusal: reason why the control can't be used if the scene is
             rendered into a photograph. Empty if it can.
     """
@@ -374,7 +374,7 @@ class Control:
     scene: SceneDescription
     start: Tensor
     groups: tuple[Group, ...]
-    slots: tuple[Slot, ...] = ()
+    parameter_slots: tuple[Slot, ...] = ()
     adjusted_defaults: tuple[AdjustedDefault, ...] = ()
     exposure: tuple[float, float] = (0.0, 0.0)
     flashes: float = 0.0
@@ -383,7 +383,7 @@ class Control:
         super().__init_subclass__(**more)
         names = [method.__name__ for method in METHODS_WITH_COPIES]
         all_arguments = slice(None)
-        hand_copies(cls, **dict.fromkeys(names, all_arguments))
+        copy_method_arguments(cls, **dict.fromkeys(names, all_arguments))
         if "summary" not in vars(cls) and cls.__doc__:
             first_paragraph = cls.__doc__.partition("\n\n")[0]
             cls.summary = " ".join(first_paragraph.split())
@@ -413,15 +413,15 @@ class Control:
             for setting, value in settings.items()
             if value is not None
         }
-        self.chosen: dict[str, Any] = {
+        self.choice_values: dict[str, Any] = {
             choice.name: self._settings.get(choice.name, choice.default)
             for choice in self.choices
         }
         for choice in self.choices:
-            choice.check(self.name, self.chosen[choice.name])
+            choice.check(self.name, self.choice_values[choice.name])
         self.check_choices()
         self.specs = self._parse_specs()
-        self.has_requested_search = any(
+        self.has_requested_range = any(
             not isinstance(spec, Fixed) for spec in self.specs.values()
         )
 
@@ -476,7 +476,7 @@ class Control:
         return {"kind": self.kind, **self._settings}
 
     @property
-    def mesh(self) -> str:
+    def mesh_name(self) -> str:
         """Name of the mesh that the control acts on.
 
         It is "chair" for the control "pose:chair", and the object for "pose".
@@ -487,7 +487,7 @@ class Control:
         return mesh_name or OBJECT
 
     @property
-    def file_name(self) -> str:
+    def name_in_files(self) -> str:
         """Name of the control in file names, which have no colon."""
         return to_file_name(self.name)
 
@@ -499,7 +499,7 @@ class Control:
             InputError: the mesh belongs to the surroundings of a Mitsuba scene, which
                 this control can't change.
         """
-        mesh = self.mesh
+        mesh = self.mesh_name
         if mesh in scene.meshes:
             return scene.meshes[mesh]
         if any(
@@ -518,12 +518,12 @@ class Control:
             f"It stands in `controls` {self.name}.",
         )
 
-    def setting_name(self, parameter: Parameter) -> str:
+    def get_setting_name(self, parameter: Parameter) -> str:
         """Return the name that a parameter would have among the scene's settings.
 
         For example "pose.yaw". There need not be such a setting.
         """
-        prefix = self.kind if self.mesh == OBJECT else self.name
+        prefix = self.kind if self.mesh_name == OBJECT else self.name
         return f"{prefix}.{parameter.name}"
 
     def select_form(self, forms: Sequence[str]) -> str:
@@ -588,7 +588,7 @@ class Control:
         """Return whether a parameter is searched, if it has a default search range."""
         if parameter in self.specs:
             return not isinstance(self.specs[parameter], Fixed)
-        return not self.has_requested_search
+        return not self.has_requested_range
 
     # ---- in a scene
 
@@ -605,7 +605,7 @@ class Control:
     def with_scene(self, scene: SceneDescription) -> Self:
         """Return a copy with a scene, which is not bound to it yet (see `bind`)."""
         in_scene = copy.copy(self)
-        in_scene.scene = scene if is_ours(type(self)) else copy_value(scene)
+        in_scene.scene = scene if is_package_class(type(self)) else copy_value(scene)
         return in_scene
 
     def bind(self, scene: SceneDescription) -> Self:
@@ -615,10 +615,10 @@ class Control:
             InputError: a setting of the control is impossible in this scene.
         """
         bound = self.with_scene(scene)
-        bound.fit()
+        bound.bind_parameters()
         return bound
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Set `slots`, `start`, `groups` and `adjusted_defaults` for `self.scene`.
 
         A slot is a parameter with the position of its coordinates in the control's
@@ -634,19 +634,19 @@ class Control:
             slot = Slot(parameter, spec, begin)
             slots.append(slot)
             begin += slot.n_coordinates
-        self.slots = tuple(slots)
+        self.parameter_slots = tuple(slots)
         self.adjusted_defaults = tuple(self._list_adjusted_defaults())
         self.start = torch.tensor(
-            [coordinate for slot in slots for coordinate in slot.start_coordinates()],
+            [coordinate for slot in slots for coordinate in slot.get_start_coordinates()],
             dtype=torch.float32,
         )
-        self.groups = tuple(self._group(slot) for slot in slots if slot.n_coordinates)
+        self.groups = tuple(self._make_group(slot) for slot in slots if slot.n_coordinates)
         # For `values`: the lower bound and the width of the range of each coordinate,
         # (d,) each. All coordinates of a slot have the same range. A slot that is fixed
         # or has a list of values has no range; its placeholder is never read.
         placeholder = Range(0.0, 1.0)
         ranges = [
-            slot.spec if isinstance(slot.spec, Range) else placeholder for slot in slots
+            slot.parameter_spec if isinstance(slot.parameter_spec, Range) else placeholder for slot in slots
         ]
         low_and_span_of_slot = torch.tensor(
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
@@ -662,7 +662,7 @@ class Control:
         Subclasses can also adapt its search range, unit, shape and estimators to the
         scene.
         """
-        value = self.scene.values.get(self.setting_name(parameter))
+        value = self.scene.values.get(self.get_setting_name(parameter))
         return parameter if value is None else replace(parameter, default=value)
 
     def get_clean_value(self, name: str) -> ParameterValue:
@@ -673,7 +673,7 @@ class Control:
             if parameter.name == name
         )
 
-    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
+    def get_value_without_control(self, parameter: Parameter) -> ParameterValue:
         """Return the value of a parameter in the scene as it was described.
 
         By default it is the parameter's default. Subclasses override this if that
@@ -685,7 +685,7 @@ class Control:
         """
         return parameter.default
 
-    def get_spec(self, parameter: Parameter) -> Spec:
+    def get_parameter_spec(self, parameter: Parameter) -> Spec:
         """Return the spec of a parameter: a fixed value, a range or a list of values.
 
         A parameter that the user did not set is searched over its default range. But it
@@ -697,7 +697,7 @@ class Control:
         """
         if parameter.name in self.specs:
             return self.specs[parameter.name]
-        if self.has_requested_search or parameter.search is None:
+        if self.has_requested_range or parameter.search is None:
             return Fixed(parameter.default)
         if parameter.options:
             return OneOf(parameter.options)
@@ -710,9 +710,9 @@ class Control:
     def list_parameter_specs(self) -> Iterator[tuple[Parameter, Spec]]:
         """Yield the parameters in the order of their coordinates, with their specs."""
         for parameter in map(self.resolve_parameter, self.instance_parameters):
-            yield parameter, self.get_spec(parameter)
+            yield parameter, self.get_parameter_spec(parameter)
 
-    def must_match_scene(self, parameter: Parameter, spec: Spec) -> bool:
+    def must_start_at_clean_value(self, parameter: Parameter, spec: Spec) -> bool:
         """Return whether the start should have the clean scene's value of a parameter.
 
         True by default. If it is false, a start with another value is not reported as
@@ -754,23 +754,23 @@ class Control:
         Raises:
             InputError: the user set the scene's value, and the control excludes it.
         """
-        for slot in self.slots:
+        for slot in self.parameter_slots:
             parameter = slot.parameter
-            if not self.must_match_scene(parameter, slot.spec):
+            if not self.must_start_at_clean_value(parameter, slot.parameter_spec):
                 continue
-            scene_value = self.get_scene_value(parameter)
-            used = slot.start_value()
+            scene_value = self.get_value_without_control(parameter)
+            used = slot.get_start_value()
             is_hidden = self.strength_parameter not in (None, parameter.name)
             if is_hidden or is_same_value(used, scene_value, is_angle=slot.is_angle):
                 continue
             # the scene's setting for the same value, such as "pose.yaw"
-            setting = self.setting_name(parameter)
+            setting = self.get_setting_name(parameter)
             label = f"{self.name}.{parameter.name}"
             if setting in self.scene.requested:
                 raise InputError(
                     f"{self._quote_setting(setting)} and `controls` {self.name} "
                     "contradict "
-                    f"each other: {label} is {slot.spec}, "
+                    f"each other: {label} is {slot.parameter_spec}, "
                     f"which leaves {format_value(scene_value)} out; change one of the "
                     "two, or "
                     "leave one out"
@@ -793,7 +793,7 @@ class Control:
             return f"`environment={self.scene.environment_spec}`"
         return f"`set` {setting}={format_value(self.scene.get_number(setting))}"
 
-    def _group(self, slot: Slot) -> Group:
+    def _make_group(self, slot: Slot) -> Group:
         """Return the group of coordinates of a searched parameter.
 
         A list of values gets no gradient estimators, since it has no derivative.
@@ -807,8 +807,8 @@ class Control:
         """
         parameter = slot.parameter
         name = parameter.name
-        spec = slot.spec
-        setting = self.setting_name(parameter)
+        spec = slot.parameter_spec
+        setting = self.get_setting_name(parameter)
         if isinstance(spec, OneOf):
             return Group(
                 name, slot.n_coordinates, (), options=len(spec.values), setting=setting
@@ -830,7 +830,7 @@ class Control:
         )
 
     @property
-    def ambient(self) -> float | None:
+    def ambient_lux(self) -> float | None:
         """Ambient light in lux, in addition to the light of this control.
 
         None if there is none, or if it is searched.
@@ -846,7 +846,7 @@ class Control:
         return self
 
     @property
-    def budget(self) -> Budget:
+    def largest_group_budget(self) -> Budget:
         """Budget of the largest group of coordinates, which stands for all of them."""
         if not self.groups:
             return FULL_RANGE
@@ -862,7 +862,7 @@ class Control:
 
     # ---- at a configuration
 
-    def values(self, u: Tensor) -> dict[str, Tensor]:
+    def compute_values(self, u: Tensor) -> dict[str, Tensor]:
         """Return the value of every parameter, fixed ones too.
 
         Args:
@@ -873,16 +873,16 @@ class Control:
             with named options it is the index of the option.
         """
         values: dict[str, Tensor] = {}
-        if not self.slots:
+        if not self.parameter_slots:
             return values
         # All coordinates are interpolated linearly at once, which is fast. Those with a
         # logarithmic scale or a distribution are interpolated again below.
         linear = self._low.to(u) + self._span.to(u) * u
-        for slot in self.slots:
+        for slot in self.parameter_slots:
             parameter = slot.parameter
-            spec = slot.spec
+            spec = slot.parameter_spec
             if isinstance(spec, Range):
-                coordinates = slice(slot.offset, slot.offset + slot.n_values)
+                coordinates = slice(slot.coordinate_offset, slot.coordinate_offset + slot.n_values)
                 is_distribution = type(spec) is not Range  # a subclass of it
                 if parameter.log or is_distribution:
                     value = spec.interpolate(u[coordinates], log=parameter.log)
@@ -893,7 +893,7 @@ class Control:
             if isinstance(spec, Fixed):
                 constant = spec.value
             else:
-                constant = spec.select(u[slot.offset])
+                constant = spec.select_value(u[slot.coordinate_offset])
             values[parameter.name] = _to_tensor(constant, slot, u.device)
         return values
 
@@ -925,7 +925,7 @@ class Control:
             earlier_inputs: inputs of the controls before this one. Only names in
                 `refines` may be returned again.
         """
-        return self.scene_inputs(self.values(u), earlier_inputs)
+        return self.scene_inputs(self.compute_values(u), earlier_inputs)
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
         """Return the finished image as the values change it.
@@ -951,7 +951,7 @@ class Control:
         # Most controls leave the image unchanged, so that their values are not needed.
         if type(self).on_picture is Control.on_picture:
             return image
-        return self.on_picture(self.values(u), image)
+        return self.on_picture(self.compute_values(u), image)
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -963,7 +963,7 @@ class Control:
             earlier_inputs: inputs of the controls before this one.
 
         Returns:
-            Values with their units (see `make_value`), by name without that of the
+            Values with their units (see `make_value_with_unit`), by name without that of the
             control.
         """
         return {}
@@ -981,12 +981,12 @@ class Control:
             u: (d,) the control's slice of a configuration, in [0, 1].
             earlier_inputs: inputs of the controls that are evaluated before this one.
         """
-        values = self.values(u.detach())
+        values = self.compute_values(u.detach())
         described: dict[str, Value] = {}
-        for slot in self.slots:
+        for slot in self.parameter_slots:
             parameter = slot.parameter
             is_image = len(parameter.shape) > 1
-            if isinstance(slot.spec, Fixed) or is_image:
+            if isinstance(slot.parameter_spec, Fixed) or is_image:
                 continue
             value = values[parameter.name]
             name = f"{self.name}.{parameter.name}"
@@ -994,10 +994,10 @@ class Control:
                 option = parameter.options[int(value)]
                 described[name] = {"value": option, "unit": "name"}
             elif value.ndim == 0:
-                described[name] = make_value(value, parameter.unit)
+                described[name] = make_value_with_unit(value, parameter.unit)
             else:
                 for index, number in enumerate(value):
-                    described[f"{name}.{index}"] = make_value(number, parameter.unit)
+                    described[f"{name}.{index}"] = make_value_with_unit(number, parameter.unit)
         for name, measurement in self.compute_measurements(
             values, earlier_inputs
         ).items():
@@ -1010,9 +1010,9 @@ class Control:
         Parameters with named options, and images, are left out. Each value is (k,) or
         (), in the parameter's unit, and differentiable in u (d,).
         """
-        values = self.values(u)
+        values = self.compute_values(u)
         numbers = {}
-        for slot in self.slots:
+        for slot in self.parameter_slots:
             parameter = slot.parameter
             if not parameter.options and len(parameter.shape) < 2:
                 numbers[parameter.name] = values[parameter.name]
@@ -1058,7 +1058,7 @@ class Control:
             Images (h, w, 3), display-referred sRGB in [0, 1], by file name without
             suffix.
         """
-        return self.make_artifact_images(self.values(u.detach()), earlier_inputs)
+        return self.make_artifact_images(self.compute_values(u.detach()), earlier_inputs)
 
     def make_artifact_files(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -1088,7 +1088,7 @@ class Control:
         Returns:
             Content of each file, by file name with suffix.
         """
-        return self.make_artifact_files(self.values(u.detach()), earlier_inputs)
+        return self.make_artifact_files(self.compute_values(u.detach()), earlier_inputs)
 
 
 NumberControl = Control  # alias for packages that add controls
@@ -1138,7 +1138,7 @@ So such a control can't change the tensors of the caller in place.
 """
 
 
-def make_value(value: Tensor | float, unit: str) -> Value:
+def make_value_with_unit(value: Tensor | float, unit: str) -> Value:
     """Return a number and its unit, as configurations are described."""
     return {"value": float(value), "unit": unit}
 
@@ -1152,8 +1152,8 @@ def describe_color_change(name: str, change: Tensor) -> dict[str, Value]:
     """
     root_mean_square = change.square().mean().sqrt()
     return {
-        f"{name}.linf": make_value(change.abs().max(), "sRGB"),
-        f"{name}.rms": make_value(root_mean_square, "sRGB"),
+        f"{name}.linf": make_value_with_unit(change.abs().max(), "sRGB"),
+        f"{name}.rms": make_value_with_unit(root_mean_square, "sRGB"),
     }
 
 

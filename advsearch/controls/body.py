@@ -77,7 +77,7 @@ class BodyControl(Control):
             UnknownNameError: the mesh has no animation of that name or number.
         """
         clips = self.rig.clips
-        requested = self.chosen["clip"]
+        requested = self.choice_values["clip"]
         if requested is None:
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
@@ -90,11 +90,11 @@ class BodyControl(Control):
                 f"{self.name}.clip",
                 str(requested),
                 clips,
-                f"Animations of {self.mesh}.",
+                f"Animations of {self.mesh_name}.",
             )
         return str(requested) if requested in clips else clips[index]
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Check the parameters and the clip against the rig of the mesh.
 
         Raises:
@@ -106,7 +106,7 @@ class BodyControl(Control):
             if name not in known:
                 hint = f"It stands in `controls` {self.name}."
                 raise errors.UnknownNameError(
-                    f"parameter of {self.mesh}", name, known, hint
+                    f"parameter of {self.mesh_name}", name, known, hint
                 )
         # With settings, `make_space` reports if nothing is searched.
         has_default_search = any(
@@ -115,7 +115,7 @@ class BodyControl(Control):
         if not self._settings and not has_default_search:
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(
-                f"`controls` {self.name}: {self.mesh} has no animation to play; set "
+                f"`controls` {self.name}: {self.mesh_name} has no animation to play; set "
                 "ranges, as in "
                 f"{self.name}={{{example}: [-20, 20]}}"
             )
@@ -126,7 +126,7 @@ class BodyControl(Control):
             if parameter.name in known
         )
         self.clip  # noqa: B018 - raises if there is no such animation
-        super().fit()
+        super().bind_parameters()
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its default in the rig.
@@ -141,7 +141,7 @@ class BodyControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        return {f"{self.mesh}.offsets": self.rig.offsets(values, self.clip)}
+        return {f"{self.mesh_name}.offsets": self.rig.offsets(values, self.clip)}
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

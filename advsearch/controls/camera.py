@@ -262,7 +262,7 @@ class CameraControl(Control):
         scene = self.scene
         name = parameter.name
         if name in COEFFICIENTS and scene.camera_model is not None:
-            return scene.camera_model.values[name]
+            return scene.camera_model.intrinsic_by_name[name]
         # All three are the distance of the object: the camera is focused on it.
         if name in ("distance", "focus", "sizes"):
             # The default distance depends on the field of view.
@@ -319,9 +319,9 @@ class CameraControl(Control):
             return search[0] * float(default), search[1] * float(default)
         return search
 
-    def setting_name(self, parameter: Parameter) -> str:
+    def get_setting_name(self, parameter: Parameter) -> str:
         equivalent_settings = {"focal_length": "camera.fov", "sizes": "camera.distance"}
-        return equivalent_settings.get(parameter.name, super().setting_name(parameter))
+        return equivalent_settings.get(parameter.name, super().get_setting_name(parameter))
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -377,7 +377,7 @@ class CameraControl(Control):
             fov: () field of view along the longer side of the image, degrees.
         """
         model_values = {
-            name: torch.tensor(value) for name, value in model.values.items()
+            name: torch.tensor(value) for name, value in model.intrinsic_by_name.items()
         }
         if not model.name:
             aspect = self.scene.aspect  # width over height
@@ -429,7 +429,7 @@ class CameraControl(Control):
         if "sizes" in self.specs:
             return values["sizes"]
         scene_has_distance = scene.values.get("camera.distance") is not None
-        searches_default_ranges = not self.has_requested_search
+        searches_default_ranges = not self.has_requested_range
         if "distance" in self.specs or searches_default_ranges or scene_has_distance:
             # from metres to object sizes
             return values["distance"] / scene.size_in_metres
@@ -467,7 +467,7 @@ class CameraControl(Control):
             return True
         return any(
             slot.n_coordinates > 0
-            for slot in self.slots
+            for slot in self.parameter_slots
             if slot.parameter.name == "height"
         )
 

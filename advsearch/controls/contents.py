@@ -88,7 +88,7 @@ class Vessel:
 
 
 @lru_cache(maxsize=8)
-def find_interior(asset: assets.ObjectAsset) -> Vessel | None:
+def find_vessel(asset: assets.ObjectAsset) -> Vessel | None:
     """Find the inside of an object in its default pose; None if it is no vessel.
 
     The largest basin of a height map is where most water would stand. Its wall is found
@@ -412,7 +412,7 @@ class ContentsControl(Control):
             rest: 1 minus the lower bounds of the proportions that are set.
         """
         # All parameters are searched unless the user sets a range for some.
-        are_searched = not self.has_requested_search or any(
+        are_searched = not self.has_requested_range or any(
             isinstance(self.specs.get(name), Range) for name in INGREDIENTS
         )
         # by default a cup of coffee, as in `parameters`
@@ -489,7 +489,7 @@ class ContentsControl(Control):
         Raises:
             InputError: the object is no vessel.
         """
-        vessel = find_interior(scene.object)
+        vessel = find_vessel(scene.object)
         if vessel is None:
             raise InputError(
                 f"`controls` {self.name}: expected a vessel, open at the top and "
@@ -509,26 +509,26 @@ class ContentsControl(Control):
             uvs=uvs.astype(np.float32),
         )
         black = np.zeros((4, 4, 3), dtype=np.float32)
-        pose = geometry.object_to_world(scene)
+        pose = geometry.compute_object_to_world(scene)
         return scene.with_part(
             parts.MeshPart(self.name, mesh, black, LIQUID_MATERIAL, to_world=pose)
         )
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Start from the default proportions, or the nearest that are possible."""
-        super().fit()
+        super().bind_parameters()
         defaults = {
             parameter.name: float(parameter.default)
             for parameter in self.parameters
             if parameter.name in INGREDIENTS
         }
         cuts = self.find_cuts(defaults)
-        for slot in self.slots:
+        for slot in self.parameter_slots:
             if slot.n_coordinates and slot.parameter.name in cuts:
-                self.start[slot.offset] = cuts[slot.parameter.name]
+                self.start[slot.coordinate_offset] = cuts[slot.parameter.name]
 
-    def values(self, u: Tensor) -> dict[str, Tensor]:
-        cuts_and_level = super().values(u)
+    def compute_values(self, u: Tensor) -> dict[str, Tensor]:
+        cuts_and_level = super().compute_values(u)
         return {**cuts_and_level, **self.cut_proportions(cuts_and_level)}
 
     def compute_measurements(
@@ -542,7 +542,7 @@ class ContentsControl(Control):
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Return the offsets, the pose and the color of the liquid's surface."""
-        vessel = find_interior(self.scene.object)
+        vessel = find_vessel(self.scene.object)
         assert vessel is not None  # see `prepare`
         # `prepare` has made the mesh at half the height.
         base = _make_liquid_surface(vessel, torch.full_like(values["level"], 0.5))
@@ -559,7 +559,7 @@ class ContentsControl(Control):
 
     # ---- proportions
 
-    def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+    def get_parameter_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         """Return the range of a parameter; for an ingredient, that of its cut.
 
         A cut is a coordinate from 0 to 1 that decides the proportion of an ingredient
@@ -567,7 +567,7 @@ class ContentsControl(Control):
         cut: it gets what the others leave.
         """
         if parameter.name not in INGREDIENTS:
-            return super().get_spec(parameter)
+            return super().get_parameter_spec(parameter)
         ranged = []
         for name in INGREDIENTS:
             lower, upper = self.proportion_bounds[name]

@@ -27,7 +27,7 @@ from advsearch.controls.ranges import (
     Fixed,
     ParameterValue,
     Range,
-    list_set_names,
+    list_allowed_names,
 )
 from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
@@ -100,12 +100,12 @@ class EnvironmentControl(Control):
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters, with files of the setting `which` among its options.
 
-        See `list_set_names` for the forms of the setting.
+        See `list_allowed_names` for the forms of the setting.
         """
         which, *others = cls.parameters
         files = [
             name
-            for name in list_set_names(settings, "which")
+            for name in list_allowed_names(settings, "which")
             if name not in which.options and is_path(name)
         ]
         options = tuple(dict.fromkeys((*which.options, *files)))
@@ -113,7 +113,7 @@ class EnvironmentControl(Control):
 
     def check_choices(self) -> None:
         """Raise InputError if `epsilon` is set without the harmonics that it limits."""
-        epsilon = self.chosen["epsilon"]
+        epsilon = self.choice_values["epsilon"]
         if "epsilon" in self._settings and "harmonics" not in self._settings:
             raise InputError(
                 f"{self.name}.epsilon: limits the harmonics, which are not set; leave "
@@ -176,12 +176,12 @@ class EnvironmentControl(Control):
         """Whether `SCENE_ENVIRONMENT` is among the allowed values of `which`."""
         return SCENE_ENVIRONMENT in self.list_allowed_values("which", SCENE_ENVIRONMENT)
 
-    def setting_name(self, parameter: Parameter) -> str:
+    def get_setting_name(self, parameter: Parameter) -> str:
         if parameter.name == "which":
             return ENVIRONMENT
-        return super().setting_name(parameter)
+        return super().get_setting_name(parameter)
 
-    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
+    def get_value_without_control(self, parameter: Parameter) -> ParameterValue:
         """Return the value of a parameter in the scene as it was described.
 
         For `which` it is `SCENE_ENVIRONMENT` if that is allowed. Otherwise it is the
@@ -211,7 +211,7 @@ class EnvironmentControl(Control):
             return FULL_RANGE
         spec = self.specs["harmonics"]
         width = spec.high - spec.low if isinstance(spec, Range) else 2.0
-        return Budget("l2", float(self.chosen["epsilon"]) / width)
+        return Budget("l2", float(self.choice_values["epsilon"]) / width)
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

@@ -39,7 +39,7 @@ from advsearch.controls.base import (
     Group,
     Parameter,
     Value,
-    make_value,
+    make_value_with_unit,
 )
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Float64Array, IntArray, Mesh, compute_area_vectors
@@ -635,21 +635,21 @@ class GeometryControl(Control):
     def check_choices(self) -> None:
         self.form = self.select_form(FORMS)
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Compute what turns coordinates into a displacement field of the mesh.
 
         In the form "modes" a coordinate is the amplitude of a smooth field. Otherwise
         it is a push on one position along one axis, which a preconditioner spreads.
         """
-        self._offsets_input = f"{self.mesh}.offsets"
+        self._offsets_input = f"{self.mesh_name}.offsets"
         self._mesh = self.get_mesh(self.scene).mesh
         welded_mesh = get_welded_mesh(self._mesh)
         self._position_of_vertex = torch.from_numpy(welded_mesh.position_of_vertex)
-        self._limits = DisplacementLimits(welded_mesh, float(self.chosen["epsilon"]))
+        self._limits = DisplacementLimits(welded_mesh, float(self.choice_values["epsilon"]))
         if self.form == "modes":
             # (P, 3, modes)
             modes = torch.from_numpy(
-                compute_shape_modes(self._mesh, int(self.chosen["modes"]))
+                compute_shape_modes(self._mesh, int(self.choice_values["modes"]))
             )
             n_modes = modes.shape[2]
             group = Group("amplitudes", n_modes, ESTIMATORS)
@@ -689,11 +689,11 @@ class GeometryControl(Control):
         offsets = self.compute_offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {
-            f"{self.name}.largest": make_value(lengths.max(), "object sizes"),
-            f"{self.name}.rms": make_value(
+            f"{self.name}.largest": make_value_with_unit(lengths.max(), "object sizes"),
+            f"{self.name}.rms": make_value_with_unit(
                 lengths.square().mean().sqrt(), "object sizes"
             ),
-            f"{self.name}.thinnest": make_value(
+            f"{self.name}.thinnest": make_value_with_unit(
                 self._limits.find_thinnest_wall(offsets), "1"
             ),
         }

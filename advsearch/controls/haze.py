@@ -85,7 +85,7 @@ class HazeControl(Control):
         default = parameter.default
         if scene_haze is not None:
             default = scene_haze.density
-        elif self.has_requested_search and not self.is_searched("density"):
+        elif self.has_requested_range and not self.is_searched("density"):
             default = DEFAULT_DENSITY
         # The adjoint needs a positive density.
         spec = self.specs.get("density")
@@ -96,7 +96,7 @@ class HazeControl(Control):
             estimators=Parameter.LIT if has_adjoint else ("differences",),
         )
 
-    def get_scene_value(self, parameter: Parameter) -> float | str:
+    def get_value_without_control(self, parameter: Parameter) -> float | str:
         # Only the value of the density is used (`strength_parameter`).
         return 0.0 if _find_haze(self.scene) is None else parameter.default
 

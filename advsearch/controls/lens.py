@@ -119,22 +119,22 @@ class LensControl(Control):
     @property
     def n_dots(self) -> int:
         """Number of dots."""
-        return int(self.chosen["dots"])
+        return int(self.choice_values["dots"])
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         is_per_dot = bool(parameter.shape)
         return replace(parameter, shape=(self.n_dots,)) if is_per_dot else parameter
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Spread the dots over the image at the start."""
-        super().fit()
+        super().bind_parameters()
         positions = spread_positions(self.n_dots)
-        for slot in self.slots:
+        for slot in self.parameter_slots:
             name = slot.parameter.name
             # A range has a coordinate for each dot, a list of values a single one.
-            is_range = slot.n_coordinates > 0 and not isinstance(slot.spec, OneOf)
+            is_range = slot.n_coordinates > 0 and not isinstance(slot.parameter_spec, OneOf)
             if name in POSITION_PARAMETERS and is_range:
-                coordinates = slice(slot.offset, slot.offset + slot.n_coordinates)
+                coordinates = slice(slot.coordinate_offset, slot.coordinate_offset + slot.n_coordinates)
                 self.start[coordinates] = positions[POSITION_PARAMETERS.index(name)]
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
@@ -157,7 +157,7 @@ class LensControl(Control):
         the user sets no range at all, x and y are searched, and `fit` has spread their
         start.
         """
-        are_positions_searched = not self.has_requested_search
+        are_positions_searched = not self.has_requested_range
         if are_positions_searched:
             return dict(values)
         positions = spread_positions(self.n_dots)

@@ -115,7 +115,7 @@ class LightControl(Control):
     )
 
     def check_choices(self) -> None:
-        if self.chosen["type"] == "point" and "size" in self._settings:
+        if self.choice_values["type"] == "point" and "size" in self._settings:
             raise InputError(
                 f"{self.name}.size: expected none for a point light, got "
                 f"{self._settings['size']!r}; leave it out, or set "
@@ -128,18 +128,18 @@ class LightControl(Control):
         If only other parameters are searched, the default power is not 0, because a
         dark lamp has no effect. The size of a point is not searched.
         """
-        needs_power = self.has_requested_search and not self.is_searched("power")
+        needs_power = self.has_requested_range and not self.is_searched("power")
         if parameter.name == "power" and needs_power:
             return replace(parameter, default=DEFAULT_POWER)
-        if parameter.name == "size" and self.chosen["type"] == "point":
+        if parameter.name == "size" and self.choice_values["type"] == "point":
             return replace(parameter, search=None)
         return parameter
 
-    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
+    def get_value_without_control(self, parameter: Parameter) -> ParameterValue:
         return 0.0  # only that of the power is used (`strength_parameter`)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        lamp = PointLamp if self.chosen["type"] == "point" else BallLamp
+        lamp = PointLamp if self.choice_values["type"] == "point" else BallLamp
         power = self.specs.get("power")
         return scene.with_part(
             lamp(self.name, dark=isinstance(power, Fixed) and power.value == 0.0)
@@ -156,7 +156,7 @@ class LightControl(Control):
             * values["power"]
             * compute_metered_irradiance(self.scene)
         )
-        if self.chosen["type"] == "point":
+        if self.choice_values["type"] == "point":
             return {
                 f"{self.name}.position": position,
                 f"{self.name}.intensity": intensity,

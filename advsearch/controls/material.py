@@ -800,10 +800,10 @@ class MaterialControl(Control):
         has_mitsuba_surface = self.get_mesh(scene).surface is not None
         if has_mitsuba_surface and (varies_surface or self._may_change_material):
             raise InputError(
-                f"`controls` {self.name}: the {self.mesh} has another surface, from a "
+                f"`controls` {self.name}: the {self.mesh_name} has another surface, from a "
                 "Mitsuba scene; search red, green or blue, "
                 "or its numbers by Mitsuba's names, "
-                f"mitsuba:{self.mesh}.bsdf.KEY=[low, high]"
+                f"mitsuba:{self.mesh_name}.bsdf.KEY=[low, high]"
             )
         return scene
 
@@ -822,8 +822,8 @@ class MaterialControl(Control):
         material = self._get_material(name)
         return replace(parameter, default=float(getattr(material, parameter.name)))
 
-    def get_scene_value(self, parameter: Parameter) -> ParameterValue:
-        setting = self.setting_name(parameter)
+    def get_value_without_control(self, parameter: Parameter) -> ParameterValue:
+        setting = self.get_setting_name(parameter)
         if setting in self.scene.requested:
             return self.scene.get_number(setting)
         return parameter.default
@@ -850,10 +850,10 @@ class MaterialControl(Control):
         inputs: dict[str, Tensor] = {}
         for name in SURFACE_PARAMETERS:
             if self._is_set(name):
-                inputs[f"{self.mesh}.{name}"] = values[name].reshape(1)
+                inputs[f"{self.mesh_name}.{name}"] = values[name].reshape(1)
             elif self._may_change_material:
                 number = float(getattr(material, name))
-                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([number])
+                inputs[f"{self.mesh_name}.{name}"] = values["which"].new_tensor([number])
         if self._changes_color():
             tint = color.combine_channels(values)
             base = self._compute_base_color(which, earlier_inputs)
@@ -890,7 +890,7 @@ class MaterialControl(Control):
     @property
     def _base_color(self) -> str:
         """Name of the scene input for the texture."""
-        return f"{self.mesh}.base_color"
+        return f"{self.mesh_name}.base_color"
 
     @property
     def _material_names(self) -> tuple[ParameterValue, ...]:
@@ -907,7 +907,7 @@ class MaterialControl(Control):
         It does if the user set the parameter, or if all parameters are searched.
         Otherwise the parameter has the value of the material.
         """
-        return name in self.specs or not self.has_requested_search
+        return name in self.specs or not self.has_requested_range
 
     def _changes_color(self) -> bool:
         is_tinted = any(self._is_set(name) for name in CHANNELS)

@@ -114,7 +114,7 @@ class MitsubaControl(Control):
             )
         return inputs
 
-    def must_match_scene(
+    def must_start_at_clean_value(
         self, parameter: Parameter, spec: Fixed | Range | OneOf
     ) -> bool:
         return not isinstance(spec, Fixed)

@@ -65,7 +65,7 @@ class PatchControl(PictureControl):
     or an image file.
 
     Attributes:
-        _painter: paints the patch into the object's base color; set by `fit`.
+        _painter: paints the patch into the object's base color; set by `bind_parameters`.
     """
 
     kind = "patch"
@@ -169,12 +169,12 @@ class PatchControl(PictureControl):
         """
         super().__init__(name, **settings)
         self._check_pixels()
-        if self.is_searched_image:
+        if self.is_image_searched:
             return
-        fixing_setting = "pixels" if self.chosen["picture"] is None else "picture"
+        fixing_setting = "pixels" if self.choice_values["picture"] is None else "picture"
         for ball_setting in ("epsilon", "norm"):
             # None and the norm "box" mean that there is no ball.
-            if self.chosen[ball_setting] not in (None, "box"):
+            if self.choice_values[ball_setting] not in (None, "box"):
                 raise InputError(
                     f"{self.name}.{ball_setting}: limits searched pixels, and the "
                     "pixels are fixed; leave it out, "
@@ -190,7 +190,7 @@ class PatchControl(PictureControl):
         pixels = self.specs.get("pixels")
         if pixels is None:
             return
-        if self.chosen["picture"] is not None:
+        if self.choice_values["picture"] is not None:
             raise InputError(
                 f"{self.name}.pixels: expected none together with "
                 f"{self.name}.picture; leave one of them out"
@@ -211,10 +211,10 @@ class PatchControl(PictureControl):
         Raises:
             InputError: `epsilon` is set together with the norm "box".
         """
-        epsilon = self.chosen["epsilon"]
+        epsilon = self.choice_values["epsilon"]
         if "norm" not in self._settings and epsilon is not None:
-            self.chosen["norm"] = "linf"
-        if self.chosen["norm"] == "box" and epsilon is not None:
+            self.choice_values["norm"] = "linf"
+        if self.choice_values["norm"] == "box" and epsilon is not None:
             raise InputError(
                 f"{self.name}.epsilon: expected none with norm box, got {epsilon:g}; "
                 "set norm to linf or l2"
@@ -229,21 +229,21 @@ class PatchControl(PictureControl):
         default = azimuth if parameter.name == "azimuth" else height
         return replace(parameter, default=default)
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Prepare the painter, and let searched pixels start as the texture underneath.
 
         Raises:
             InputError: nothing is searched.
         """
-        super().fit()
+        super().bind_parameters()
         if not self.groups:
             raise InputError(
                 f"`controls` {self.name}: the pixels are fixed, so there is nothing to "
                 "search; set a range for another parameter, "
                 f"such as {self.name}={{azimuth: [0, 360]}}"
             )
-        side = self.sides[0]
-        pixels = self.slots[0]  # the slots have the order of `parameters`
+        side = self.image_shape[0]
+        pixels = self.parameter_slots[0]  # the slots have the order of `parameters`
         picture = self.read_picture()
         self._picture = (
             None if picture is None else images.resize_to_square(picture, side)
@@ -251,12 +251,12 @@ class PatchControl(PictureControl):
         # `values` needs the picture, and the start of the pixels needs the painter.
         start_values = {
             name: float(value)
-            for name, value in self.values(self.start).items()
+            for name, value in self.compute_values(self.start).items()
             if name != "pixels"
         }
         self._painter = PatchPainter(self.scene, start_values, side)
-        if isinstance(pixels.spec, Range):
-            self._start_as_underneath(pixels.parameter, pixels.spec)
+        if isinstance(pixels.parameter_spec, Range):
+            self._start_as_underneath(pixels.parameter, pixels.parameter_spec)
 
     def _start_as_underneath(self, parameter: Parameter, pixel_range: Range) -> None:
         """Let searched pixels start as the texture underneath the patch.
@@ -284,12 +284,12 @@ class PatchControl(PictureControl):
                 used_value=f"the nearest {pixel_range}",
             )
 
-    def must_match_scene(
+    def must_start_at_clean_value(
         self, parameter: Parameter, spec: Fixed | Range | OneOf
     ) -> bool:
         # Searched pixels start as the texture underneath: then the patch is invisible,
         # wherever it is.
-        return not self.is_searched_image and parameter.name != "pixels"
+        return not self.is_image_searched and parameter.name != "pixels"
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -302,7 +302,7 @@ class PatchControl(PictureControl):
         }
 
     def get_printable_colors(self, u: Tensor) -> Tensor | None:
-        return self.values(u)["pixels"] if self.is_searched_image else None
+        return self.compute_values(u)["pixels"] if self.is_image_searched else None
 
     def make_artifact_images(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -331,7 +331,7 @@ def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     camera = np.append(geometry.camera_to_world(scene)[:3, 3], 1.0)
     # The offset from the center to the camera, in the coordinates of the object: the
     # solution is the camera's position there.
-    x, y, z = np.linalg.solve(geometry.object_to_world(scene), camera)[:3] - center
+    x, y, z = np.linalg.solve(geometry.compute_object_to_world(scene), camera)[:3] - center
     # A limit above 0, so that the height of a camera straight above is 1.
     level_distance = max(math.hypot(x, y), 1e-12)
     # latitude of the direction after the ellipsoid around the object, with a level radius
@@ -456,11 +456,11 @@ class PatchPainter:
             texture_side=max(object_color.shape[:2]),
             pixel_size=start_values["size"] / side,
         )
-        map_side = len(charts.face)
+        map_side = len(charts.face_index)
         self._object_color = _resize_to_square(object_color, map_side)
         is_on_face = charts.is_readable
         self._texels = np.flatnonzero(is_on_face)
-        self._faces = charts.face[is_on_face]
+        self._faces = charts.face_index[is_on_face]
         self._positions = charts.compute_positions()[is_on_face].astype(np.float64)
         self._normals = charts.compute_normals()[is_on_face].astype(np.float64)
         self._areas = charts.compute_areas()[is_on_face].astype(np.float64)

@@ -58,7 +58,7 @@ class PoseControl(Control):
     )
 
     def check_choices(self) -> None:
-        choice = self.chosen["on_ground"]
+        choice = self.choice_values["on_ground"]
         if choice not in ("yes", "no", True, False):
             raise InputError(
                 f"{self.name}.on_ground: expected yes or no, got {choice!r}"
@@ -85,7 +85,7 @@ class PoseControl(Control):
         )
         linear = values["scale"] * rotation
         # height of the lowest point relative to the center, so negative
-        if self.chosen["on_ground"] in ("yes", True):
+        if self.choice_values["on_ground"] in ("yes", True):
             # of the turned and scaled mesh, so that its lowest point is on the floor
             lowest = ((vertices - center) @ linear[2]).amin()
         else:

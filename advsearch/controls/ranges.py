@@ -82,7 +82,7 @@ class OneOf:
     def __str__(self) -> str:
         return f"one of {', '.join(map(format_value, dict.fromkeys(self.values)))}"
 
-    def select(self, u: Tensor) -> ParameterValue:
+    def select_value(self, u: Tensor) -> ParameterValue:
         """Return the value at a coordinate (): each has an equal part of [0, 1]."""
         index = int(float(u.detach()) * len(self.values))
         return self.values[min(len(self.values) - 1, max(0, index))]
@@ -129,13 +129,13 @@ class DistributionRange(Range):
         lower_probability: cumulative probability at the coordinate 0; above 0 if the
             distribution is cut off.
         upper_probability: cumulative probability at the coordinate 1.
-        label: the distribution as messages write it, e.g. "norm(loc=20, scale=5)".
+        distribution_text: the distribution as messages write it, e.g. "norm(loc=20, scale=5)".
     """
 
     quantiles: Quantiles
     lower_probability: float
     upper_probability: float
-    label: str
+    distribution_text: str
 
     def interpolate(self, u: Tensor, *, log: bool = False) -> Tensor:
         """Return the values at coordinates in [0, 1], quantiles of the distribution.
@@ -205,7 +205,7 @@ def to_plain_value(value: object) -> object:
     return value
 
 
-def list_set_names(settings: object, parameter: str) -> list[str]:
+def list_allowed_names(settings: object, parameter: str) -> list[str]:
     """Return the names that the settings of a control allow for a parameter.
 
     A parameter may be set to a name, a list of names, or {"choices": [...]}. Values
@@ -304,7 +304,7 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
         remedy = f"write [{high:g}, {low:g}]"
         # A wider range has no shorter form through 0.
         if parameter.periodic and low - high < FULL_TURN:
-            remedy = _explain_turn(parameter, low, high)
+            remedy = _explain_reversed_angles(parameter, low, high)
         raise InputError(
             f"{where}: the range [{low:g}, {high:g}] is reversed; {remedy}"
         )
@@ -315,7 +315,7 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
         )
 
 
-def _explain_turn(parameter: Parameter, low: float, high: float) -> str:
+def _explain_reversed_angles(parameter: Parameter, low: float, high: float) -> str:
     """Return the end of a message on a reversed range of angles, such as [350, 10].
 
     The user may have meant the 20 degrees through 0, or the 340 degrees between 10 and
@@ -535,13 +535,13 @@ class Slot:
 
     Attributes:
         parameter: the parameter, with its default in the scene.
-        spec: its fixed value, range or list of values.
-        offset: index of its first coordinate in the control's slice of u.
+        parameter_spec: its fixed value, range or list of values.
+        coordinate_offset: index of its first coordinate in the control's slice of u.
     """
 
     parameter: Parameter
-    spec: Spec
-    offset: int = 0
+    parameter_spec: Spec
+    coordinate_offset: int = 0
 
     @property
     def n_values(self) -> int:
@@ -551,9 +551,9 @@ class Slot:
     @property
     def n_coordinates(self) -> int:
         """Number of coordinates of u."""
-        if isinstance(self.spec, Fixed):
+        if isinstance(self.parameter_spec, Fixed):
             return 0
-        if isinstance(self.spec, OneOf):
+        if isinstance(self.parameter_spec, OneOf):
             return 1
         return self.n_values
 
@@ -565,7 +565,7 @@ class Slot:
     @property
     def is_full_turn(self) -> bool:
         """Whether the range is a full turn, so that both its bounds are the same."""
-        spec = self.spec
+        spec = self.parameter_spec
         # A distribution (a subclass of Range) has other densities at both bounds.
         return (
             self.parameter.periodic
@@ -573,12 +573,12 @@ class Slot:
             and abs(spec.high - spec.low - FULL_TURN) < 1e-9
         )
 
-    def start_value(self) -> ParameterValue:
+    def get_start_value(self) -> ParameterValue:
         """Return the parameter's default, or the allowed value that is nearest to it.
 
         Names have no nearest value: the first allowed one is returned.
         """
-        spec = self.spec
+        spec = self.parameter_spec
         default = self.parameter.default
         if isinstance(spec, Fixed):
             return spec.value
@@ -597,10 +597,10 @@ class Slot:
             ),
         )
 
-    def start_coordinates(self) -> list[float]:
+    def get_start_coordinates(self) -> list[float]:
         """Return the coordinates of `start_value`; none if the parameter is fixed."""
-        spec = self.spec
-        value = self.start_value()
+        spec = self.parameter_spec
+        value = self.get_start_value()
         if isinstance(spec, Range):
             return [
                 spec.find_coordinate(float(value), log=self.parameter.log)

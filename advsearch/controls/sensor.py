@@ -127,7 +127,7 @@ class SensorControl(Control):
     )
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
-        return apply_sensor(image, values, int(self.chosen["seed"]))
+        return apply_sensor(image, values, int(self.choice_values["seed"]))
 
 
 def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> Tensor:

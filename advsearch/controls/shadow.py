@@ -143,7 +143,7 @@ class ShadowControl(Control):
         hidden_pose = geometry.make_hidden_pose(
             torch.from_numpy(geometry.camera_to_world(scene))
         ).numpy()
-        card = parts.make_polygon(int(self.chosen["corners"]))
+        card = parts.make_polygon(int(self.choice_values["corners"]))
         return scene.with_part(
             parts.MeshPart(
                 self.name,
@@ -164,7 +164,7 @@ class ShadowControl(Control):
         x, y, z = light_direction
         match parameter.name:
             case "radii":
-                return replace(parameter, shape=(int(self.chosen["corners"]),))
+                return replace(parameter, shape=(int(self.choice_values["corners"]),))
             case "azimuth":
                 return replace(parameter, default=math.degrees(math.atan2(y, x)))
             case "elevation":
@@ -302,7 +302,7 @@ class ShadowControl(Control):
         if model is not None:
             # The angle between opposite corners, which is larger than that of the longer
             # side.
-            fov = 2.0 * math.atan(math.hypot(*model.visible_tangents))
+            fov = 2.0 * math.atan(math.hypot(*model.inner_half_tangents))
         elif fov_input is not None:
             fov = math.radians(float(fov_input.detach()))
         else:

@@ -52,7 +52,7 @@ EPSILON = 1e-12
 
 
 @cache
-def load_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+def load_sky_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return the tables of the sky's and the sun's model, see `read_sunsky_tables`.
 
     They are the shape of the dome's radiance, its mean level, and the sun's radiance.
@@ -128,7 +128,7 @@ def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     piece = min(SUN_PIECES - 1, int(SUN_PIECES * max(0.0, fraction) ** (1.0 / 3.0)))
     lower_bound = (math.pi / 2.0) * (piece / SUN_PIECES) ** 3
     above = radians - lower_bound
-    _, _, sun_table = load_tables(radians.device)
+    _, _, sun_table = load_sky_tables(radians.device)
     # (channel, power of the elevation, power of cos(psi))
     terms = _at_turbidity(sun_table, turbidity)[piece]
     elevation_powers = torch.stack([above**power for power in range(4)])
@@ -195,7 +195,7 @@ class Sky:
             (H, W, 3) by equation 8 of Hosek and Wilkie 2012. The letters are its
             coefficients; `level` is the mean radiance.
         """
-        coefficient_table, level_table, _ = load_tables(sun.device)
+        coefficient_table, level_table, _ = load_sky_tables(sun.device)
         # The tables have I before H.
         a, b, c, d, e, f, g, i, h = self._interpolate(
             coefficient_table, elevation, turbidity
@@ -355,17 +355,17 @@ class SkyControl(Control):
         """Return the scene with the sky at the control's start as its environment."""
         bound = self.bind(scene)
         radiance = (
-            bound.compute_radiance(bound.values(bound.start)).numpy().astype(np.float32)
+            bound.compute_radiance(bound.compute_values(bound.start)).numpy().astype(np.float32)
         )
         sky = assets.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(
             environment__rotation=0.0, environment__exposure=0.0
         )
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Fit the parameters, and compute the irradiance towards the sun at the start."""
-        super().fit()
-        start = self.values(self.start)
+        super().bind_parameters()
+        start = self.compute_values(self.start)
         sky = make_sky(self.scene.ground_color, torch.device("cpu"))
         azimuth = torch.tensor(0.0)  # has no effect on the irradiance
         _, self._start_irradiance = sky(azimuth, start["elevation"], start["turbidity"])
@@ -385,7 +385,7 @@ class SkyControl(Control):
         azimuth = values["azimuth"]
         sky = make_sky(self.scene.ground_color, azimuth.device)
         radiance, irradiance = sky(azimuth, values["elevation"], values["turbidity"])
-        if self.chosen["exposure"] == "fixed":
+        if self.choice_values["exposure"] == "fixed":
             irradiance = self._start_irradiance.to(radiance.device)
         return radiance * (METERED_IRRADIANCE / irradiance)
 

@@ -22,7 +22,7 @@ from advsearch.controls.base import (
     Value,
     to_file_name,
 )
-from advsearch.copies import is_ours
+from advsearch.copies import is_package_class
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, SCENE_ENVIRONMENT, SceneDescription
 from advsearch.scene.grounds import (
@@ -48,7 +48,7 @@ class Space:
             it.
         adjusted_defaults: default values of the clean scene that controls exclude. The
             start has the nearest allowed values instead.
-        environment: name of the environment that replaces that of the scene. None if
+        environment_name: name of the environment that replaces that of the scene. None if
             the scene keeps its own.
 
     Raises:
@@ -58,7 +58,7 @@ class Space:
     controls: tuple[Control, ...]
     scene: SceneDescription | None = None
     adjusted_defaults: tuple[AdjustedDefault, ...] = ()
-    environment: str | None = None
+    environment_name: str | None = None
 
     def __post_init__(self) -> None:
         names = [control.name for control in self.controls]
@@ -119,13 +119,13 @@ class Space:
         return not (any(unsupported) or has_medium)
 
     @cached_property
-    def sizes(self) -> list[int]:
+    def coordinate_counts(self) -> list[int]:
         """Number of coordinates of each control."""
         return [len(control.start) for control in self.controls]
 
     def split_by_control(self, u: Tensor) -> list[tuple[Control, Tensor]]:
         """Return each control with its slice of u."""
-        return list(zip(self.controls, u.split(self.sizes), strict=True))
+        return list(zip(self.controls, u.split(self.coordinate_counts), strict=True))
 
     @cached_property
     def _evaluation_order(self) -> tuple[int, ...]:
@@ -147,14 +147,14 @@ class Space:
             InputError: two controls set the same input, or one of another package sets
                 an invalid one.
         """
-        slices = u.split(self.sizes)
+        slices = u.split(self.coordinate_counts)
         merged = dict[str, Tensor]()
         first_setter = dict[str, str]()  # control that set each input first
         for index in self._evaluation_order:
             control = self.controls[index]
             new_inputs = control.inputs(slices[index], merged)
             # Built-in controls are checked by tests; checks at every image take time.
-            if not is_ours(type(control)):
+            if not is_package_class(type(control)):
                 _check_inputs(control.name, new_inputs)
             for name in new_inputs:
                 if name in merged and name not in control.refines:
@@ -181,7 +181,7 @@ class Space:
         Args:
             u: (d,) the configuration.
         """
-        slices = u.detach().split(self.sizes)
+        slices = u.detach().split(self.coordinate_counts)
         order = self._evaluation_order
         # positions in the order of evaluation
         refining_positions = [
@@ -290,7 +290,7 @@ class Space:
         Raises:
             InputError: no number of controls has k coordinates.
         """
-        sizes = self.sizes
+        sizes = self.coordinate_counts
         # Several counts may fit, as a control may have no coordinates. The smallest is
         # used: a control without coordinates is fixed anyway.
         counts = [
@@ -309,14 +309,14 @@ class Space:
             for control, u_slice in zip(first_controls, slices, strict=True)
         ]
         fixed_space = Space(first_controls, self.scene)
-        chosen_environment = fixed_space.find_environment(fixed_space.describe(u))
+        chosen_environment = fixed_space.find_environment_name(fixed_space.describe(u))
         return replace(
             self,
             controls=(*fixed, *self.controls[count:]),
-            environment=chosen_environment or self.environment,
+            environment_name=chosen_environment or self.environment_name,
         )
 
-    def find_environment(self, values: Mapping[str, Value]) -> str | None:
+    def find_environment_name(self, values: Mapping[str, Value]) -> str | None:
         """Return the environment that replaces that of the scene in a configuration.
 
         Args:
@@ -329,7 +329,7 @@ class Space:
             if group.setting == ENVIRONMENT:
                 name = str(values[group.name]["value"])
                 return None if name == SCENE_ENVIRONMENT else name
-        return self.environment
+        return self.environment_name
 
     def list_notes(self, scene: SceneDescription) -> tuple[str, ...]:
         """Return notes for the user on the scene and on the views that are searched.
@@ -368,7 +368,7 @@ class Space:
         for control, start in self.split_by_control(self.start):
             # A control without slots, such as a texture, does not move the camera. A
             # fixed control has no slots, but the control that it wraps may move it.
-            may_move_camera = bool(control.slots) or isinstance(control, _FixedControl)
+            may_move_camera = bool(control.parameter_slots) or isinstance(control, _FixedControl)
             if may_move_camera and "camera.to_world" in control.inputs(start):
                 # A single view if the control has no coordinates.
                 return [
@@ -435,9 +435,9 @@ class _FixedControl(Control):
         self.on_top = control.on_top
         self.exposure = control.exposure
         self.flashes = control.flashes
-        self.fit()
+        self.bind_parameters()
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         self.start = torch.zeros(0)
         self.groups = ()
 

@@ -174,7 +174,7 @@ class TextureControl(Control):
             InputError: the form is not possible, or `materials` are no names.
         """
         self.form = self.select_form(FORMS)
-        names = self.chosen["materials"]
+        names = self.choice_values["materials"]
         if names is None:
             return
         if isinstance(names, str):
@@ -190,7 +190,7 @@ class TextureControl(Control):
                 f"{names!r}; put quotes around a "
                 "name that reads as a number"
             )
-        self.chosen["materials"] = list(dict.fromkeys(names))
+        self.choice_values["materials"] = list(dict.fromkeys(names))
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
         """Return the mesh that the control paints.
@@ -212,7 +212,7 @@ class TextureControl(Control):
             if materials:
                 kind += " or material of the object"
             known = [*scene.meshes, *materials]
-            raise UnknownNameError(kind, self.mesh, known, hint) from None
+            raise UnknownNameError(kind, self.mesh_name, known, hint) from None
 
     def _find_named_materials(self, scene: SceneDescription) -> list[str]:
         """Return the materials of the object that the control is named after.
@@ -223,19 +223,19 @@ class TextureControl(Control):
         # imported here, as it takes time and most runs do not need it
         from advsearch.scene.importing.files import sanitize_name
 
-        if self.mesh in scene.meshes:
+        if self.mesh_name in scene.meshes:
             return []
         return [
             material
             for material in scene.object.mesh.materials
-            if self.mesh in (material, sanitize_name(material))
+            if self.mesh_name in (material, sanitize_name(material))
         ]
 
     def list_materials(self, scene: SceneDescription) -> list[str] | None:
         """Return the materials that it paints in a scene; None for all of the mesh."""
-        return self._find_named_materials(scene) or self.chosen["materials"]
+        return self._find_named_materials(scene) or self.choice_values["materials"]
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Find the texels that are painted, and make the painter of the control's form.
 
         Raises:
@@ -255,7 +255,7 @@ class TextureControl(Control):
         self._materials = ", ".join(names or ())
         self._painter = self._make_painter(part, mask)
         # computed, since rounding makes them differ a little from the original
-        self._unchanged_texels = self._painter.texels(self._painter.start)
+        self._unchanged_texels = self._painter.paint_texels(self._painter.start)
         self.start = self._painter.start
         self.groups = (self._painter.group,)
 
@@ -275,7 +275,7 @@ class TextureControl(Control):
         """
         original = torch.from_numpy(part.base_color.copy())
         longer_side = max(original.shape[:2])
-        resolution = self.chosen["resolution"]
+        resolution = self.choice_values["resolution"]
         min_side, max_side = RESOLUTIONS
         paints_some = materials is not None
         if not resolution and paints_some and longer_side >= min_side:
@@ -291,11 +291,11 @@ class TextureControl(Control):
             mask: (h, w) bool, texels that are painted.
         """
         texels = self._original[mask]
-        norm = self.chosen["norm"]
+        norm = self.choice_values["norm"]
         if self.form == "palette":
             weight = _compute_texel_areas(part, mask)
             centers = compute_palette(
-                self._original, weight, int(self.chosen["colors"])
+                self._original, weight, int(self.choice_values["colors"])
             )
             budget = Budget(norm, self._compute_radius(norm, centers.numel()))
             return make_palette_painter(texels, centers, budget)
@@ -305,7 +305,7 @@ class TextureControl(Control):
                 # Waves limit each change. If n changes are at most radius / sqrt(n),
                 # their norm is at most the radius.
                 max_change = max_change / math.sqrt(texels.numel())
-            n_waves = int(self.chosen["waves"])
+            n_waves = int(self.choice_values["waves"])
             return make_wave_painter(texels, mask, n_waves, max_change)
         budget = Budget(norm, self._compute_radius(norm, texels.numel()))
         group = Group("texels", texels.numel(), ("adjoint",), budget)
@@ -352,7 +352,7 @@ class TextureControl(Control):
             remedy = ""
             # Texels of a low resolution may lie in several materials. Without the
             # setting, the texture has its full resolution.
-            if self.chosen["resolution"]:
+            if self.choice_values["resolution"]:
                 remedy = "take a higher resolution, "
             raise InputError(
                 f"{self.name}.materials: other materials use {shared} % of the texels "
@@ -375,7 +375,7 @@ class TextureControl(Control):
 
         Texels that are not painted have their original color.
         """
-        painted = self._painter.texels(u)
+        painted = self._painter.paint_texels(u)
         original = self._original.to(u.device)
         if self._painted_mask is None:
             return painted.reshape(original.shape)
@@ -386,7 +386,7 @@ class TextureControl(Control):
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how much the texels change, and which materials are painted."""
-        change = self._painter.texels(u.detach()) - self._unchanged_texels.to(u.device)
+        change = self._painter.paint_texels(u.detach()) - self._unchanged_texels.to(u.device)
         described: dict[str, Value] = {}
         if self._materials:
             described[f"{self.name}.materials"] = {
@@ -417,7 +417,7 @@ class Painter(NamedTuple):
     group: Group  # the group of these coordinates
     # Function from coordinates (d,) in [0, 1] to texels (n, 3), display-referred sRGB in
     # [0, 1]. It is differentiable, and can be pickled for worker processes.
-    texels: Callable[[Tensor], Tensor]
+    paint_texels: Callable[[Tensor], Tensor]
 
 
 def _compute_texel_areas(part: MeshPart, mask: Tensor) -> Float32Array:

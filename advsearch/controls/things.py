@@ -129,7 +129,7 @@ class ThingsControl(Control):
                 single.append(replace(parameter_by_name[short_name], name=setting))
         return (*cls.parameters, *single)
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Find which things this control moves, and check that they stand free.
 
         Raises:
@@ -149,7 +149,7 @@ class ThingsControl(Control):
                 raise errors.UnknownNameError(
                     f"`controls` {self.name}: thing around the object", thing, things
                 )
-        super().fit()
+        super().bind_parameters()
         # Other things keep their positions, unless another control moves them.
         moved = self._find_moved_things()
         self._moved_things = tuple(name for name in things if name in moved)
@@ -158,7 +158,7 @@ class ThingsControl(Control):
     def _find_moved_things(self) -> set[str]:
         """Return the things with a searched parameter, or one that the user set."""
         moved = set()
-        for slot in self.slots:
+        for slot in self.parameter_slots:
             thing, _, short_name = slot.parameter.name.rpartition(".")
             is_set = slot.parameter.name in self.specs or short_name in self.specs
             if slot.n_coordinates or is_set:
@@ -172,7 +172,7 @@ class ThingsControl(Control):
             InputError: one overlaps with something else.
         """
         # With all parameters 0, things are present, and stand as in the scene.
-        unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.slots}
+        unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.parameter_slots}
         for name, stand in self._compute_stands(unmoved, {}).items():
             is_pushed = bool(stand.push_distance)
             if is_pushed:
@@ -190,7 +190,7 @@ class ThingsControl(Control):
         for thing in self.scene.things:
             for parameter in map(self.resolve_parameter, self.parameters):
                 name = f"{thing}.{parameter.name}"
-                spec = self.specs.get(name, self.get_spec(parameter))
+                spec = self.specs.get(name, self.get_parameter_spec(parameter))
                 yield replace(parameter, name=name), spec
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:

@@ -190,10 +190,10 @@ def compare_with_traced(
     """
     with torch.no_grad():
         # what the model would see in the search without a predictor
-        search_image = renderer(u, seeds.stream(seed, "rendered"), spp)
+        search_image = renderer(u, seeds.derive_seed(seed, "rendered"), spp)
         # two images with independent noise, and the denoised image of both
-        *halves, converged = renderer.render_halves(u, seed, CHECK_SPP)
-        object_mask = renderer.mask(u)
+        *halves, converged = renderer.render_independent_images(u, seed, CHECK_SPP)
+        object_mask = renderer.compute_object_mask(u)
     predicted_margin = measure_margin(predicted, u)
     # How far the search has moved the margin: an error of the margin that is small
     # against this is accepted.
@@ -248,7 +248,7 @@ def compute_level_errors(
         spp: samples per pixel of each of the two traced images.
     """
     # the third image is the denoised one of both
-    first_half, second_half, _ = renderer.render_halves(u, seed, spp)
+    first_half, second_half, _ = renderer.render_independent_images(u, seed, spp)
     halves = (first_half, second_half)
     return [_root(compute_squared_error(image, halves)) for image in images]
 

@@ -64,7 +64,7 @@ def sample_condition(domain: Domain, index: int, seed: int) -> Tensor:
     has_l2_block = any(block.norm == "l2" for block in domain.blocks)
     if domain.dim > MAX_SOBOL_DIM or has_l2_block:
         generator = torch.Generator().manual_seed(
-            seeds.stream(seed, "bank condition", index)
+            seeds.derive_seed(seed, "bank condition", index)
         )
         return domain.sample(generator)[0]
     sequence = SampleSequence(domain.dim, "sobol", seed, "bank conditions")
@@ -121,13 +121,13 @@ class Bank(PredictedSearch):
     adapted to the conditions of the bank, or if predictions are inaccurate.
 
     Attributes:
-        trace: collects the light of conditions, on workers if there are any.
+        collect_light: collects the light of conditions, on workers if there are any.
         growth_steps: indices of the evaluations whose comparison let the bank grow on.
         gaps: for each comparison, the mean objective under conditions of the bank minus
             that under unseen conditions.
     """
 
-    trace: Evaluate
+    collect_light: Evaluate
     draws_conditions: bool = field(default=True, kw_only=True)
     n_renewals: int | None = field(default=None, kw_only=True)
     growth_steps: list[int] = field(default_factory=list)
@@ -147,10 +147,10 @@ class Bank(PredictedSearch):
     _n_dropped: int = 0
 
     @property
-    def n_samples(self) -> int:
+    def preparation_spp(self) -> int:
         return self._count_conditions(0) * SPP
 
-    def measure_size(self) -> tuple[int, int]:
+    def count_entries_and_bytes(self) -> tuple[int, int]:
         entries = sum(condition.renderer.n_entries for condition in self._conditions)
         return entries, self._bytes
 
@@ -174,12 +174,12 @@ class Bank(PredictedSearch):
         this query are made.
         """
         if query.kind == "search" and query.phase == "search":
-            self._latest_step = query.index
-            is_due = query.index > 0 and query.index % COMPARISON_INTERVAL == 0
+            self._latest_step = query.row_index
+            is_due = query.row_index > 0 and query.row_index % COMPARISON_INTERVAL == 0
             if is_due:
-                self._compare(query.u, query.index)
+                self._compare(query.u, query.row_index)
         self._fill(self._latest_step)
-        if query.with_image:
+        if query.includes_image:
             # The image is not needed. But its first one makes a renderer, which is
             # counted in `n_traced` as when the query was evaluated.
             self._render_image(query.u)
@@ -190,9 +190,9 @@ class Bank(PredictedSearch):
         If the image is requested, it shows the scene without random conditions.
         """
         self.replay(query)  # the comparison and the growth that are due
-        conditions = self._choose_conditions(query.kind, query.index)
+        conditions = self._choose_conditions(query.kind, query.row_index)
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
-        if not query.with_image:
+        if not query.includes_image:
             return evaluation
         return replace(evaluation, picture=round_to_8_bit(self._render_image(query.u)))
 
@@ -228,7 +228,7 @@ class Bank(PredictedSearch):
             kind: kind of the search.
             index: index of the query.
         """
-        count = min(self.problem.n_draws, len(self._conditions))
+        count = min(self.problem.conditions_per_evaluation, len(self._conditions))
         previous_index = index - 1
         if kind != "search":
             # Any other search runs after "search", when the bank no longer grows. With
@@ -257,7 +257,7 @@ class Bank(PredictedSearch):
             index: index in that stream.
         """
         generator = torch.Generator().manual_seed(
-            seeds.stream(self.problem.seed, stream, index)
+            seeds.derive_seed(self.problem.seed, stream, index)
         )
         order = torch.randperm(len(conditions), generator=generator).tolist()
         return [conditions[position] for position in order[:count]]
@@ -291,13 +291,13 @@ class Bank(PredictedSearch):
     def _render_image(self, u: Tensor) -> Tensor:
         """Return the image (H, W, 3) of u (d,) without random conditions."""
         if self._image_renderer is None:
-            seed = seeds.stream(self.problem.seed, "bank still")
+            seed = seeds.derive_seed(self.problem.seed, "bank still")
             # without a seed, the conditions are those that leave the scene unchanged
-            start = self.problem.add_conditions(self.problem.domain.start)
+            start = self.problem.make_full_configuration(self.problem.domain.start)
             self._image_renderer = self.problem.make_linear_renderer(start, seed, SPP)
             self.n_traced += 1
         with torch.no_grad():
-            return self._image_renderer(self.problem.add_conditions(u))
+            return self._image_renderer(self.problem.make_full_configuration(u))
 
     def _count_conditions(self, index: int) -> int:
         """Return the number of conditions that the bank has at an evaluation.
@@ -322,11 +322,11 @@ class Bank(PredictedSearch):
             n_since_begin = max(index - begin + 1, 0)
             # the next comparison, which ends the growth, is `COMPARISON_INTERVAL` later
             n_growing_steps += min(n_since_begin, COMPARISON_INTERVAL)
-        draws = self.problem.n_draws
+        draws = self.problem.conditions_per_evaluation
         n_initial = INITIAL_CONDITIONS * draws
         return n_initial + n_growing_steps * draws // DRAWS_PER_CONDITION
 
-    def _make_query(self, number: int) -> Query:
+    def _make_query(self, condition_index: int) -> Query:
         """Return the query that collects the light of the condition with an index.
 
         A matrix is exact near the configuration at which its light is collected. The
@@ -334,19 +334,19 @@ class Bank(PredictedSearch):
         condition was added, or the start.
 
         Args:
-            number: index of the condition in the bank's sequence.
+            condition_index: index of the condition in the bank's sequence.
         """
         assert self.problem.conditions is not None
         u = self.problem.domain.start
         for growth_step in self.growth_steps:  # ascending
             size_before = self._count_conditions(growth_step - 1)
-            was_added_later = number >= size_before
+            was_added_later = condition_index >= size_before
             if was_added_later:
                 u = self._grown_at[growth_step]
-        bank_seed = seeds.stream(self.problem.seed, "bank")
-        condition = sample_condition(self.problem.conditions, number, bank_seed)
-        seed = seeds.stream(self.problem.seed, "bank matrix", number)
-        return Query(torch.cat([u, condition]), seed, spp=SPP, product="light")
+        bank_seed = seeds.derive_seed(self.problem.seed, "bank")
+        condition = sample_condition(self.problem.conditions, condition_index, bank_seed)
+        seed = seeds.derive_seed(self.problem.seed, "bank matrix", condition_index)
+        return Query(torch.cat([u, condition]), seed, spp=SPP, requested_output="light")
 
     def _fill(self, index: int, tick: ProgressCallback = lambda samples: None) -> None:
         """Make the matrices of all conditions that the bank has by an evaluation.
@@ -364,14 +364,14 @@ class Bank(PredictedSearch):
             first_missing = self._conditions[-1].index + 1
         if first_missing >= size:
             return
-        with self.count_time():
+        with self.measure_seconds():
             # An earlier call may have requested light for these conditions, too.
             is_requested = first_missing < self._collected_until
             if not is_requested:
                 self._request_light(first_missing, index)
             for number in range(first_missing, size):
                 # `_incoming` yields light in the order of the conditions
-                condition = self._make_condition(number, next(self._incoming).light)
+                condition = self._make_condition(number, next(self._incoming).collected_light)
                 self._conditions.append(condition)
                 self._bytes += condition.renderer.n_bytes
                 tick(SPP)
@@ -394,7 +394,7 @@ class Bank(PredictedSearch):
             self._make_query(number)
             for number in range(first_missing, self._collected_until)
         ]
-        self._incoming = iter(self.trace(queries))
+        self._incoming = iter(self.collect_light(queries))
 
     def _drop_oldest(self) -> None:
         """Drop the oldest matrices while all take too much memory; one always stays."""
@@ -453,8 +453,8 @@ class Bank(PredictedSearch):
             index: index of the evaluation.
         """
         problem = self.problem
-        with self.count_time():
-            seed = seeds.stream(problem.seed, "bank check", index)
+        with self.measure_seconds():
+            seed = seeds.derive_seed(problem.seed, "bank check", index)
             unseen_objectives = self._trace_unseen(u, seed)
             conditions = self._sample(self._conditions, N_COMPARED, "bank check", index)
             bank_objectives = self._predict_objectives(u, conditions)
@@ -470,7 +470,7 @@ class Bank(PredictedSearch):
             return problem.compare_view(
                 conditions[position].renderer,
                 torch.cat([u, conditions[position].u]),
-                seeds.stream(seed, "view", number),
+                seeds.derive_seed(seed, "view", number),
                 SPP,
             )
 
@@ -505,8 +505,8 @@ class Bank(PredictedSearch):
         objectives = []
         for index in range(N_COMPARED):
             # one seed for both the condition and the noise
-            draw_seed = seeds.stream(seed, "draw", index)
-            full_u = self.problem.add_conditions(u, draw_seed)
+            draw_seed = seeds.derive_seed(seed, "draw", index)
+            full_u = self.problem.make_full_configuration(u, draw_seed)
             query = Query(u, draw_seed)  # without a gradient
             evaluation, _ = self.problem.evaluate_full(query, full_u, draw_seed)
             objectives.append(evaluation.objective)

@@ -33,7 +33,7 @@ class CroppedSearch(PredictedSearch):
     """The window of a run's searches, and its surroundings.
 
     Attributes:
-        windowing: the window; None before it is chosen, or if there is none.
+        selected_window: the window; None before it is chosen, or if there is none.
         refusal: why there is no window; None if there is one.
     """
 
@@ -41,21 +41,21 @@ class CroppedSearch(PredictedSearch):
     title: ClassVar[str] = "finding the part of the picture that can change"
     what_it_renders: ClassVar[str] = "renders that part alone"
 
-    windowing: Windowing | None = None
+    selected_window: Windowing | None = None
     refusal: Refusal | None = None
     # For each kind of search the latest full image, and the renderer that pastes the
     # window into it. Key "start": those at the start, with which all searches begin.
     _current: dict[str, tuple[FullImage, Renderer]] = field(default_factory=dict)
 
     @property
-    def n_samples(self) -> int:
+    def preparation_spp(self) -> int:
         return 2 * N_WINDOW_IMAGES * PROBE_SPP  # each image has two halves
 
     @property
     def accuracy_refusal(self) -> Refusal | None:
         return self.refusal
 
-    def measure_size(self) -> tuple[int, int]:
+    def count_entries_and_bytes(self) -> tuple[int, int]:
         """Return 0 entries, as there is no matrix, and the bytes of stored images."""
         height, width = self.problem.renderer.formation.resolution
         # stored for each kind of search: the two halves of its full image, their mean,
@@ -70,22 +70,22 @@ class CroppedSearch(PredictedSearch):
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
         """Choose the window, and render the surroundings at the start."""
-        with self.count_time():
+        with self.measure_seconds():
             windowing = find_window(self.problem)
             if isinstance(windowing, Refusal):
                 self.refusal = windowing
                 return
-            self.windowing = windowing
+            self.selected_window = windowing
             self.window = windowing.window
             self.deviations.append(windowing.deviation)
             # `find_window` has rendered these
-            tick(self.n_samples)
+            tick(self.preparation_spp)
             self.n_traced += N_WINDOW_IMAGES
             self._renew_surroundings(
                 windowing,
                 "start",
                 number=0,  # it belongs to no query
-                image=windowing.start,  # full image of the start
+                image=windowing.start_image,  # full image of the start
             )
 
     def _renew_surroundings(
@@ -106,10 +106,10 @@ class CroppedSearch(PredictedSearch):
             The renderer that traces the window and pastes it into these surroundings.
         """
         problem = self.problem
-        seed = seeds.stream(problem.seed, f"crop {kind}", number)
+        seed = seeds.derive_seed(problem.seed, f"crop {kind}", number)
         with problem.renderer.scene.limit_depth(problem.search_depth):
             renderer = problem.renderer.crop_to(
-                windowing.window, image.u, seed, problem.spp
+                windowing.window, image.u, seed, problem.search_spp
             )
         self.n_traced += 1
         self._current[kind] = image, renderer
@@ -120,7 +120,7 @@ class CroppedSearch(PredictedSearch):
 
         None if there is no window, or the search ended with full images.
         """
-        if self.windowing is None or kind in self.first_traced:
+        if self.selected_window is None or kind in self.first_traced:
             return None
         _, renderer = self._current.get(kind, self._current["start"])
         return renderer
@@ -145,14 +145,14 @@ class CroppedSearch(PredictedSearch):
         full images from there on.
         """
         kind = query.kind
-        number = query.index
+        number = query.row_index
         # index of the first query that renders a full image
         first_full = self.first_traced.get(kind, self.steps)
         if query.phase != "search" or number >= first_full:
             return None
-        if self.windowing is None:
+        if self.selected_window is None:
             self.prepare()
-        assert self.windowing is not None
+        assert self.selected_window is not None
         # a search begins with the surroundings of the start
         image_in_use, renderer = self._current.setdefault(kind, self._current["start"])
         is_due = number > 0 and number % COMPARISON_INTERVAL == 0
@@ -161,15 +161,15 @@ class CroppedSearch(PredictedSearch):
         if not is_due or not kind.startswith("search"):
             return renderer
         was_accepted = self.deviations[-1].is_accepted
-        with self.count_time():
+        with self.measure_seconds():
             new_image, deviation = self.measure_surroundings(
-                self.windowing.window, image_in_use, query.u
+                self.selected_window.window, image_in_use, query.u
             )
             self.deviations.append(deviation)
             # After a single bad comparison new surroundings may be enough.
             if deviation.is_accepted or was_accepted:
                 assert self.n_renewals is not None  # None only for a `Bank`
                 self.n_renewals += 1
-                return self._renew_surroundings(self.windowing, kind, number, new_image)
-        self.trace_from(kind, number, f" of the {kind}")
+                return self._renew_surroundings(self.selected_window, kind, number, new_image)
+        self.stop_predicting(kind, number, f" of the {kind}")
         return None

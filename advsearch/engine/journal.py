@@ -69,13 +69,13 @@ class ParallelEvaluator:
     Attributes:
         optional_problem: the problem; None for a sweep, which has one for each scene
             and model.
-        executor: workers that run `make_worker_call`; None to evaluate in this process.
-        key: identifies the problem among those of workers.
+        workers: workers that run `make_worker_call`; None to evaluate in this process.
+        problem_key: identifies the problem among those of workers.
     """
 
     optional_problem: Problem | None
-    executor: Workers | None = None
-    key: ProblemKey = ""
+    workers: Workers | None = None
+    problem_key: ProblemKey = ""
 
     @property
     def problem(self) -> Problem:
@@ -88,7 +88,7 @@ class ParallelEvaluator:
     @property
     def worker_stats(self) -> WorkerStats | None:
         """Statistics of the workers; None without workers."""
-        return None if self.executor is None else self.executor.stats
+        return None if self.workers is None else self.workers.stats
 
     @property
     def progress_stats(self) -> dict[str, float | str]:
@@ -102,18 +102,18 @@ class ParallelEvaluator:
         earlier queries have been yielded.
         """
         # a single query is evaluated here: sending it away would save no time
-        if self.executor is None or len(queries) < 2:
+        if self.workers is None or len(queries) < 2:
             yield from map(self.problem.evaluate, queries)
             return
         items: list[WorkItem] = [
-            (self.key, self.problem.preparation, query) for query in queries
+            (self.problem_key, self.problem.preparation, query) for query in queries
         ]
         # A result has the very object that was sent, so that its id finds the query.
         index_of_item = {id(item): index for index, item in enumerate(items)}
         # evaluations that came too early, by the index of their query
         waiting = dict[int, Evaluation]()
         next_index = 0
-        results: Any = self.executor.compute([item] for item in items)
+        results: Any = self.workers.compute([item] for item in items)
         with closing(results):
             for result in results:
                 index = index_of_item[id(result.items[0])]
@@ -126,7 +126,7 @@ class ParallelEvaluator:
                     evaluation = waiting.pop(next_index)
                     # The renderer counts non-finite values as it renders. A worker has
                     # another renderer, so that its count is added here.
-                    self.problem.renderer.non_finite += evaluation.non_finite
+                    self.problem.renderer.n_non_finite += evaluation.n_non_finite
                     yield evaluation
                     next_index += 1
 
@@ -170,9 +170,9 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     Raises:
         ClusterError: the query is for an image or for light, which nothing replaces.
     """
-    if query.product != "judgement":
+    if query.requested_output != "judgement":
         product = (
-            "a picture" if query.product == "picture" else "the light of a condition"
+            "a picture" if query.requested_output == "picture" else "the light of a condition"
         )
         raise ClusterError(
             f"{product}: {reason}; `advsearch resume RUN workers=null` makes it here"
@@ -370,7 +370,7 @@ class Journal:
     """The stored evaluations of a run.
 
     Attributes:
-        run: directory whose store has the rows; None to store them in `rows`.
+        run_directory: directory whose store has the rows; None to store them in `rows`.
         evaluator: evaluates queries whose images are not predicted.
         rows: rows of a journal without a run directory.
         n_lost: number of queries whose workers all died.
@@ -378,7 +378,7 @@ class Journal:
             rows that they evaluated.
     """
 
-    run: RunDirectory | None
+    run_directory: RunDirectory | None
     evaluator: ParallelEvaluator
     rows: list[Row] = field(default_factory=list)
     n_lost: int = 0
@@ -398,9 +398,9 @@ class Journal:
         A copy made by `dataclasses.replace`, for another problem of the same run, has
         the same dicts and `_opened`, so that nothing is read again.
         """
-        if self.run is not None and not self._opened:
+        if self.run_directory is not None and not self._opened:
             self.machines |= self.get_note(MACHINES_NOTE) or {}
-            self._counts |= self.run.store.count_by_kind()
+            self._counts |= self.run_directory.store.count_by_kind()
             self._opened = True
 
     # ---- queries
@@ -457,8 +457,8 @@ class Journal:
         if kind in self._trials:
             return self._trials[kind]
         rows: Iterable[Row] = ()
-        if self.run is not None and kind in self._counts:
-            rows = self.run.store.rows(kind)
+        if self.run_directory is not None and kind in self._counts:
+            rows = self.run_directory.store.rows(kind)
         trials = {}
         for row in rows:
             # Rows of old runs may have no judgement.
@@ -490,11 +490,11 @@ class Journal:
         """
         is_trial = query.phase is None
         if is_trial:
-            return self._trials_of(query.kind).get(query.index)
+            return self._trials_of(query.kind).get(query.row_index)
         n_stored = self._counts.get(query.kind, 0)
-        if self.run is None or query.index >= n_stored:
+        if self.run_directory is None or query.row_index >= n_stored:
             return None
-        stored = self.run.store.read_cached(query.kind, query.index)
+        stored = self.run_directory.store.read_cached(query.kind, query.row_index)
         # A complete run deletes what the rows do not have, such as gradients.
         if stored is None:
             return None
@@ -503,13 +503,13 @@ class Journal:
         is_same_query = cached.u == compute_digest(query.u) and row.seed == query.seed
         if not is_same_query:
             raise InputError(
-                f"{self.run.path}: cannot resume: evaluation {query.index} of the "
+                f"{self.run_directory.path}: cannot resume: evaluation {query.row_index} of the "
                 f"{query.kind} is not the one that was stored, so advsearch, its "
                 "packages or the number of threads have changed since; "
-                f"{self.run.restart_advice}"
+                f"{self.run_directory.restart_advice}"
             )
         if cached.non_finite:
-            self.problem.renderer.non_finite += cached.non_finite
+            self.problem.renderer.n_non_finite += cached.non_finite
         return _restore_evaluation(row, cached)
 
     def store(
@@ -544,20 +544,20 @@ class Journal:
                 if not id_is_number:
                     # so that later calls find it; its image is stored elsewhere
                     trials = self._trials_of(query.kind)
-                    trials[query.index] = replace(evaluation, picture=None)
-            elif query.index < self._counts.get(query.kind, 0):
+                    trials[query.row_index] = replace(evaluation, picture=None)
+            elif query.row_index < self._counts.get(query.kind, 0):
                 # The store has this row, but not its gradient, which a complete run
                 # deletes. So it was evaluated again, and is not stored twice.
                 continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
             if id_is_number:
-                row = replace(row, id=query.index + 1)  # ids begin at 1
+                row = replace(row, id=query.row_index + 1)  # ids begin at 1
             rows.append(row)
-        if self.run is None:
+        if self.run_directory is None:
             self._append_in_memory(rows)
         elif rows:
-            self.run.append_rows(*rows, cached=cached)
+            self.run_directory.append_rows(*rows, cached=cached)
         return rows
 
     def _append_in_memory(self, rows: Iterable[Row]) -> None:
@@ -597,7 +597,7 @@ class Journal:
             values |= self.problem.describe_conditions(query.u, query.seed)
         row = make_trial_row(
             query.kind,
-            query.index,
+            query.row_index,
             # A predicted image has no noise, hence no seed. Its row has the samples per
             # pixel of the prediction in place of those of a render.
             seed=None if evaluation.predicted else query.seed,
@@ -630,17 +630,17 @@ class Journal:
         is_predicted = bool(evaluation.predicted)
         row = Row(
             query.kind,
-            query.index,
+            query.row_index,
             query.seed,
             # A predicted image was not rendered, so it has neither samples nor renders.
-            spp=None if is_predicted else problem.spp * query.samples,
+            spp=None if is_predicted else problem.search_spp * query.samples,
             objective=evaluation.objective if is_finite else math.nan,
             success=evaluation.success and is_finite,
             values=problem.describe(query.u),
             seconds=evaluation.seconds,
             phase=query.phase,
             # A cost of 1 is an image under each of the `n_draws` conditions.
-            renders=0 if is_predicted else evaluation.cost * problem.n_draws,
+            renders=0 if is_predicted else evaluation.cost * problem.conditions_per_evaluation,
             machine=evaluation.machine,
         )
         if evaluation.judgement is not None:
@@ -652,9 +652,9 @@ class Journal:
         if evaluation.picture is not None:
             image = to_uint8(evaluation.picture).numpy()
         cached = CachedEvaluation(
-            query.index,
+            query.row_index,
             compute_digest(query.u),
-            evaluation.non_finite,
+            evaluation.n_non_finite,
             evaluation.cost,
             gradient,
             image,
@@ -680,8 +680,8 @@ class Journal:
         if seconds is None:
             return None
         stored: Iterable[Row] = ()
-        if self.run is not None and self.run.store.has_cached:
-            stored = self.run.store.rows(kind)
+        if self.run_directory is not None and self.run_directory.store.has_cached:
+            stored = self.run_directory.store.rows(kind)
         search_seconds = []
         has_ranking = False
         for row in stored:
@@ -724,12 +724,12 @@ class Journal:
 
     def get_note(self, key: str) -> Any:
         """Return the stored note of a key; None if there is none."""
-        return None if self.run is None else self.run.store.read_json_note(key)
+        return None if self.run_directory is None else self.run_directory.store.read_json_note(key)
 
     def set_note(self, key: str, value: Any) -> None:
         """Store a value that JSON can hold as the note of a key."""
-        if self.run is not None:
-            self.run.store.write_note(key, json.dumps(value))
+        if self.run_directory is not None:
+            self.run_directory.store.write_note(key, json.dumps(value))
 
 
 def compute_digest(u: Tensor) -> bytes:
@@ -759,7 +759,7 @@ def _restore_evaluation(row: Row, cached: CachedEvaluation) -> Evaluation:
         objective=math.nan if row.objective is None else row.objective,
         gradient=gradient,
         success=bool(row.success),
-        non_finite=cached.non_finite,
+        n_non_finite=cached.non_finite,
         cost=cached.cost,
         judgement=None if row.correct is None else read_judgement(row),
         picture=image,

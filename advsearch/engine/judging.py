@@ -37,7 +37,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.features import features_of
-from advsearch.options import Value, check_takes
+from advsearch.options import Value, check_takes_arguments
 from advsearch.report.wording import format_image_prediction
 from advsearch.runs.export import LEADING_COLUMNS, TRAILING_COLUMNS
 from advsearch.runs.results import PrintTerms
@@ -47,7 +47,7 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.things import ALL_THINGS
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.tasks.base import Output, Prediction, Truth, mean
-from advsearch.tasks.together import Ensemble, EnsembleTask, Outputs, split_by_model
+from advsearch.tasks.together import Ensemble, EnsembleTask, Outputs, regroup_by_model
 from advsearch.trust.code import check_import, current_directory_importable
 
 Metric = Callable[[Tensor, Any, Any], Any]
@@ -99,7 +99,7 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
                 f"metrics: {name}: expected a function of (image, output, "
                 f"truth), got {function!r:.80}"
             )
-        check_takes(f"metrics: {name}", function, "image", "output", "truth")
+        check_takes_arguments(f"metrics: {name}", function, "image", "output", "truth")
         settings[name] = _import_name(function)
     return settings
 
@@ -410,9 +410,9 @@ def calibrate_task(
         )
         view = rendering.views[0]  # `render` made one, as `around` was not given
         task = task.after_calibration(view.output, view.truth)
-        if not task.ambiguities:
+        if not task.ambiguity_message:
             return task
-    raise InputError(f"model {model.name}: {task.ambiguities}")
+    raise InputError(f"model {model.name}: {task.ambiguity_message}")
 
 
 def _get_unique_label(model: Model, prediction: Prediction) -> str:
@@ -558,7 +558,7 @@ def make_domain(
                 group.budget.epsilon,
                 periodic=group.periodic,
                 name=f"{control.name}.{group.parameter}",
-                options=group.options,
+                n_options=group.options,
             )
             blocks.append(block)
     if start is None:
@@ -884,7 +884,7 @@ def _make_feature_objective(
         clean_image = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)
     remark = ""
     if features is not None and not features.penultimate:
-        remark = features.source
+        remark = features.source_description
     objective = get_objective(
         requested, task, features=features or model, clean=clean_image
     )
@@ -941,7 +941,7 @@ def reduce_objectives(
         values = [
             objective_of_model(output_of_model, images, truth_of_model, more)
             for objective_of_model, output_of_model, truth_of_model in zip(
-                objectives, split_by_model(output), truth, strict=True
+                objectives, regroup_by_model(output), truth, strict=True
             )
         ]
         stacked = torch.stack(values)

@@ -27,7 +27,7 @@ from advsearch.distributions import PythonQuantiles, distribution_to_setting
 from advsearch.errors import InputError
 from advsearch.options import describe_value, format_things
 from advsearch.scene import settings
-from advsearch.scene.assembly import Assembly, Motion
+from advsearch.scene.assembly import InputAssembler, Motion
 from advsearch.scene.assets import EnvironmentAsset, Float32Array, ObjectAsset
 from advsearch.scene.backdrop import (
     find_photographed_light,
@@ -62,7 +62,7 @@ from advsearch.scene.library import import_environment
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.photograph_files import (
     is_photograph_folder,
-    put_into_photograph,
+    make_photograph_scene,
     read_photograph_folder,
     read_photograph_view,
 )
@@ -71,7 +71,7 @@ from advsearch.scene.rig import read_photograph_cameras
 from advsearch.scene.settings import ORBIT_CAMERA, SettingValues
 from advsearch.settings import parse_controls, to_python
 from advsearch.trust.code import allow_code_of_call
-from advsearch.trust.foreign_code import use_plain_switches
+from advsearch.trust.foreign_code import use_default_torch_state
 from advsearch.trust.stored_files import track_opened_files
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
@@ -140,7 +140,7 @@ class Scene:
         resolution = to_python(resolution)
         description = fit_camera(self.description, resolution)
         # global switches of torch that the caller has set do not change the result
-        with use_plain_switches():
+        with use_default_torch_state():
             space = make_space(make_controls(controls), description)
             return make_renderer(
                 description,
@@ -258,7 +258,7 @@ class Scene:
 
 
 @with_checked_arguments
-@use_plain_switches()
+@use_default_torch_state()
 def load_scene(
     object: str | Path | ObjectAsset,
     environment: str | Path | EnvironmentAsset | None = None,
@@ -398,7 +398,7 @@ def _put_into_photographs(
     if not is_folder:
         # `load_scene` has given the scene the light next to a single photograph.
         view = read_photograph_view(spec)
-        return put_into_photograph(description, view, camera, occluder)
+        return make_photograph_scene(description, view, camera, occluder)
     if occluder is not None:
         raise InputError(
             f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs to "
@@ -419,7 +419,7 @@ def _put_into_photographs(
             if light is not None:
                 environment = import_environment(light)
                 lit_scene = Scene(description).with_environment(environment).description
-            scenes[name] = put_into_photograph(lit_scene, view, photograph_camera)
+            scenes[name] = make_photograph_scene(lit_scene, view, photograph_camera)
     folder = PhotographFolder(str(spec), camera, scenes)
     # The scene shows the first photograph, until a control chooses another one.
     return replace(next(iter(scenes.values())), photographs=folder)
@@ -664,12 +664,12 @@ def make_renderer(
     # outlines, and for the moments of an exposure.
     motion = None
     if differentiated:
-        motion = Motion(description, size, scene.assembly)
+        motion = Motion(description, size, scene.input_assembler)
     # images at these moments are averaged to an image with motion blur
     moments: tuple[Moment, ...] = ()
     if has_exposure_time:
-        exposure_motion = motion or Motion(description, size, scene.assembly)
-        moments = choose_moments(space, exposure_motion, scene.assembly, height=size[0])
+        exposure_motion = motion or Motion(description, size, scene.input_assembler)
+        moments = choose_moments(space, exposure_motion, scene.input_assembler, height=size[0])
     return Renderer(
         scene,
         space,
@@ -723,7 +723,7 @@ N_MOTION_SAMPLES = 64
 
 
 def choose_moments(
-    space: Space, motion: Motion, assembly: Assembly, height: int
+    space: Space, motion: Motion, assembly: InputAssembler, height: int
 ) -> tuple[Moment, ...]:
     """Return the moments of an exposure at which an image is rendered.
 
@@ -758,7 +758,7 @@ def choose_moments(
 
 
 def _measure_max_motion(
-    space: Space, motion: Motion, assembly: Assembly, duration: float
+    space: Space, motion: Motion, assembly: InputAssembler, duration: float
 ) -> float:
     """Return how many pixels a point moves in the image at most during an exposure.
 

@@ -41,7 +41,7 @@ from advsearch.scene.settings import Parameter, SettingValues
 from advsearch.settings import split_names
 from advsearch.tasks import Task
 from advsearch.tasks.together import EnsembleTask, join_models
-from advsearch.trust.foreign_code import use_plain_switches
+from advsearch.trust.foreign_code import use_default_torch_state
 
 CONTROL = "control"
 MODEL = "model"
@@ -62,7 +62,7 @@ def load_configured_scene(
             configuration is used.
     """
     if name is None:
-        scene: Scene | None = config.python_object(SCENE, config.object)
+        scene: Scene | None = config.get_python_object(SCENE, config.object)
         if scene is not None:
             return scene
         name = config.object
@@ -104,7 +104,7 @@ def list_imported_code(
 ) -> tuple[str, ...]:
     """List the Python code, "package.module:attribute", that these names import."""
     code = [*(parse_code_reference(name) for name in models), *metrics]
-    code += [name for name in kinds if CONTROLS.names_class(name)]
+    code += [name for name in kinds if CONTROLS.is_class_path(name)]
     return tuple(dict.fromkeys(name for name in code if name))
 
 
@@ -126,10 +126,10 @@ def load_models(
         InputError: another number of models than tasks, a task that cannot judge a rig,
             or a model that takes another number of images than there are cameras.
     """
-    threads.configure(config.used_threads)
+    threads.configure(config.n_used_threads)
     if isinstance(task, EnsembleTask):
         tasks = task.parts
-        models = list_models(models)
+        models = to_model_list(models)
     else:
         tasks = (task,) * len(models)
     if len(models) != len(tasks):
@@ -185,7 +185,7 @@ def _load_for_task(
         prompt = config.prompt
     if isinstance(model, str):
         # The name may be that of an object that a Python caller passed.
-        model = config.python_object(MODEL, model) or model
+        model = config.get_python_object(MODEL, model) or model
     return load_model(
         model,
         labels=labels,
@@ -239,7 +239,7 @@ def _check_n_images(model: Model) -> None:
 AnyModel = Model | nn.Module | str | Path
 
 
-def list_models(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
+def to_model_list(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
     """Return one model or several as a list.
 
     One string may have several names, with commas between them.
@@ -386,7 +386,7 @@ def make_configured_controls(
     control_by_name: dict[str, Any] = {}
     for name, control in normalize_controls(controls).items():
         if not isinstance(control, Control):
-            control = config.python_object(CONTROL, name) or control
+            control = config.get_python_object(CONTROL, name) or control
         control_by_name[name] = control
     # This only checks the controls: an unknown one is rejected before settings are
     # read.
@@ -664,5 +664,5 @@ def hold_process_lock() -> Iterator[None]:
     Gradients are enabled in it, even if the caller has disabled them (`torch.no_grad`,
     `torch.inference_mode`). Afterwards torch and Dr.Jit have as many threads as before.
     """
-    with _PROCESS_LOCK, threads.restore_threads(), use_plain_switches():
+    with _PROCESS_LOCK, threads.restore_threads(), use_default_torch_state():
         yield

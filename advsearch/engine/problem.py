@@ -21,7 +21,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Domain, Evaluation, Objective
 from advsearch.attacks.evaluation import Query, WhichGradient
-from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
+from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, VerificationRule
 from advsearch.controls import Space
 from advsearch.engine.acceptance import ComparedView, compare_with_traced
 from advsearch.engine.judging import (
@@ -60,12 +60,12 @@ class Preparation(NamedTuple):
     Attributes:
         spp: samples per pixel.
         search_depth: segments of the longest light path; None for that of the scene.
-        plan: how derivatives are computed.
+        gradient_plan: how derivatives are computed.
     """
 
     spp: int
     search_depth: int | None
-    plan: GradientPlan
+    gradient_plan: GradientPlan
 
 
 LIGHT_DEPTH = 4
@@ -116,12 +116,12 @@ class Problem:
             arguments are functions that describe and render a configuration.
         objective: the function that a search maximizes; None for a sweep, which only
             evaluates images.
-        spp: samples per pixel of a search.
+        search_spp: samples per pixel of a search.
         seed: root seed.
         n_searched: number of controls that are searched; None for all. The others are
             the conditions: every image has new ones from their full range.
         steps: number of renders of a search.
-        n_draws: number of conditions of an evaluation, whose objective is the mean over
+        conditions_per_evaluation: number of conditions of an evaluation, whose objective is the mean over
             them; 1 without conditions.
         search_depth: segments of the longest light path in a search; None for that of
             the scene.
@@ -140,11 +140,11 @@ class Problem:
     task: Task
     make_facts: Callable[[DescribeConfiguration, RenderSurfaces], Facts]
     objective: Objective | None
-    spp: int
+    search_spp: int
     seed: int
     n_searched: int | None = None
     steps: int = 0
-    n_draws: int = 1
+    conditions_per_evaluation: int = 1
     search_depth: int | None = None
     aovs: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
@@ -153,17 +153,17 @@ class Problem:
     conditions: Domain | None = field(init=False)
 
     def __post_init__(self) -> None:
-        self.plan = self.renderer.plan
+        self.gradient_plan = self.renderer.plan
         self._truths: dict[bytes, Truth] = {}
         self._things: dict[bytes, JsonObject | None] = {}
 
     @property
-    def plan(self) -> GradientPlan:
+    def gradient_plan(self) -> GradientPlan:
         """How derivatives are computed."""
         return self.renderer.plan
 
-    @plan.setter
-    def plan(self, plan: GradientPlan) -> None:
+    @gradient_plan.setter
+    def gradient_plan(self, plan: GradientPlan) -> None:
         """Set the plan of the gradient.
 
         Groups of conditions are forced to the estimator "none", as their derivatives
@@ -192,7 +192,7 @@ class Problem:
     @property
     def preparation(self) -> Preparation:
         """What another process needs to evaluate the same problem."""
-        return Preparation(self.spp, self.search_depth, self.plan)
+        return Preparation(self.search_spp, self.search_depth, self.gradient_plan)
 
     @cached_property
     def searched_space(self) -> Space:
@@ -202,8 +202,8 @@ class Problem:
     @property
     def environment(self) -> str:
         """The name of the environment under which the scene is rendered."""
-        if self.space.environment:
-            return self.space.environment
+        if self.space.environment_name:
+            return self.space.environment_name
         scene = self.space.scene
         return NO_ENVIRONMENT if scene is None else scene.environment_name
 
@@ -215,7 +215,7 @@ class Problem:
         return find_refusal(self.renderer, condition_names) is None
 
     @property
-    def rule(self) -> Rule:
+    def verification_rule(self) -> VerificationRule:
         """The rule by which trials verify a success."""
         if self.task.minimise:
             return EASIER
@@ -223,7 +223,7 @@ class Problem:
 
     # ---- pictures
 
-    def add_conditions(self, u: Tensor, draw_seed: int | None = None) -> Tensor:
+    def make_full_configuration(self, u: Tensor, draw_seed: int | None = None) -> Tensor:
         """Return the full configuration: u (d,), followed by conditions.
 
         Conditions are the coordinates of the controls that vary by chance, such as the
@@ -236,7 +236,7 @@ class Problem:
             return torch.cat([u, self.conditions.start])
         # The noise has the same seed. Another stream makes the conditions independent
         # of it.
-        generator = torch.Generator().manual_seed(seeds.stream(draw_seed, "conditions"))
+        generator = torch.Generator().manual_seed(seeds.derive_seed(draw_seed, "conditions"))
         # `sample` returns a batch (1, d) of one configuration
         return torch.cat([u, self.conditions.sample(generator)[0]])
 
@@ -255,7 +255,7 @@ class Problem:
         Returns:
             (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
         """
-        full_u = self.add_conditions(u, seed if with_conditions else None)
+        full_u = self.make_full_configuration(u, seed if with_conditions else None)
         with torch.no_grad(), self.renderer.share_paths(self.shared_paths):
             return round_to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
 
@@ -486,18 +486,18 @@ class Problem:
         facts, *camera_facts = [
             self.make_facts(describe, render_surfaces) for render_surfaces in renders
         ]
-        return replace(facts, views=tuple(camera_facts))
+        return replace(facts, facts_of_views=tuple(camera_facts))
 
     @cached_property
     def _start_truth(self) -> Truth:
         """What is true at the start, and always if the task's truth does not vary."""
-        start = self.add_conditions(self.domain.start)
+        start = self.make_full_configuration(self.domain.start)
         if self.task.varies:
             # with a configuration, `find_truth` does not come back here
             return self.find_truth(start)
         # functions, since a task may need neither
         facts = self.make_facts(
-            lambda: self.space.describe(start), lambda: self.renderer.surfaces(start)
+            lambda: self.space.describe(start), lambda: self.renderer.find_surfaces(start)
         )
         return self.task.truth(facts)
 
@@ -513,7 +513,7 @@ class Problem:
         for group in self.space.groups:
             # Names of the scene inputs that the group changes; None for a group that
             # only changes the finished image.
-            changed_inputs = self.renderer.routes.get(group.name)
+            changed_inputs = self.renderer.inputs_by_group.get(group.name)
             if changed_inputs:
                 only_colors = changed_inputs <= color_inputs  # a subset
                 is_geometric[group.coordinates] = not only_colors
@@ -534,7 +534,7 @@ class Problem:
                 the conditions leave the scene unchanged.
         """
         return self.space.describe(
-            self.add_conditions(u, draw_seed), self.space.controls[: self.n_searched]
+            self.make_full_configuration(u, draw_seed), self.space.controls[: self.n_searched]
         )
 
     def summarize_plan(self, plan: GradientPlan) -> PlannedGradient:
@@ -561,7 +561,7 @@ class Problem:
         has_step = bool(group.step_reason)
         if not has_step or group.size != 1:
             return None, ""
-        u = self.add_conditions(self.domain.start).clone()
+        u = self.make_full_configuration(self.domain.start).clone()
         step = min(group.step, 0.5)  # from the center, it stays within the range
         u[group.coordinates] = 0.5 - step
         lower = self.space.describe(u).get(group.name)  # {"value": 30.0, "unit": ...}
@@ -582,7 +582,7 @@ class Problem:
         if self.conditions is None:
             return {}
         return self.space.describe(
-            self.add_conditions(u, draw_seed), self.space.controls[self.n_searched :]
+            self.make_full_configuration(u, draw_seed), self.space.controls[self.n_searched :]
         )
 
     # ---- evaluations
@@ -599,11 +599,11 @@ class Problem:
                 that both processes compute the same.
         """
         if preparation is not None:
-            self.spp = preparation.spp
+            self.search_spp = preparation.spp
             self.search_depth = preparation.search_depth
             # setting an equal plan would only cost time
-            if self.plan != preparation.plan:
-                self.plan = preparation.plan
+            if self.gradient_plan != preparation.gradient_plan:
+                self.gradient_plan = preparation.gradient_plan
         return map(self.evaluate, queries)
 
     def evaluate(self, query: Query) -> Evaluation:
@@ -613,14 +613,14 @@ class Problem:
         kinds of queries: for light for a predictor, for an image, for a trial of the
         verification (it has no phase), and for an evaluation of the search.
         """
-        non_finite_before = self.renderer.non_finite
-        if query.product == "light":
+        non_finite_before = self.renderer.n_non_finite
+        if query.requested_output == "light":
             linear = self.make_linear_renderer(query.u, query.seed, query.spp)
             # neither light nor an image has an objective
             evaluation = Evaluation(
-                math.nan, gradient=None, success=False, light=linear.collected
+                math.nan, gradient=None, success=False, collected_light=linear.collected
             )
-        elif query.product == "picture":
+        elif query.requested_output == "picture":
             image = self.picture(query.u, query.seed, query.spp)
             evaluation = Evaluation(
                 math.nan, gradient=None, success=False, picture=image
@@ -633,9 +633,9 @@ class Problem:
             evaluation = self._evaluate_over_conditions(query)
         # The renderer counts over all renders of the query, also those of light and
         # images, for which the evaluation has no count yet.
-        n_non_finite = self.renderer.non_finite - non_finite_before
+        n_non_finite = self.renderer.n_non_finite - non_finite_before
         if n_non_finite:
-            return replace(evaluation, non_finite=n_non_finite)
+            return replace(evaluation, n_non_finite=n_non_finite)
         return evaluation
 
     def _evaluate_trial(self, query: Query) -> Evaluation:
@@ -647,12 +647,12 @@ class Problem:
         image = self.picture(
             query.u, query.seed, query.spp, with_conditions=query.draws_conditions
         )
-        full_u = self.add_conditions(
+        full_u = self.make_full_configuration(
             query.u, query.seed if query.draws_conditions else None
         )
         judgement = self.judge(image, full_u)
         return Evaluation.from_judgement(
-            judgement, picture=image if query.with_image else None
+            judgement, picture=image if query.includes_image else None
         )
 
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
@@ -664,19 +664,19 @@ class Problem:
         all of them.
         """
         condition_seeds = [
-            seeds.stream(query.seed, "draw", index) for index in range(self.n_draws)
+            seeds.derive_seed(query.seed, "draw", index) for index in range(self.conditions_per_evaluation)
         ]
-        query_without_image = replace(query, with_image=False)
+        query_without_image = replace(query, includes_image=False)
         evaluated = [
             self.evaluate_full(
-                query_without_image, self.add_conditions(query.u, seed), seed
+                query_without_image, self.make_full_configuration(query.u, seed), seed
             )
             for seed in condition_seeds
         ]
         evaluation = self.average_evaluations(evaluated, query.u)
-        if not query.with_image:
+        if not query.includes_image:
             return evaluation
-        image = self.picture(query.u, query.seed, self.spp, with_conditions=False)
+        image = self.picture(query.u, query.seed, self.search_spp, with_conditions=False)
         return replace(evaluation, picture=image)
 
     def _compute_objective(
@@ -720,9 +720,9 @@ class Problem:
         searched_names = {control.name for control in self.searched_space.controls}
         # scene inputs that the search changes, such as "object.base_color"
         searched_inputs: frozenset[str] = frozenset()
-        for group in self.plan.groups:
+        for group in self.gradient_plan.groups:
             if group.control in searched_names:
-                searched_inputs |= self.renderer.routes.get(group.name, frozenset())
+                searched_inputs |= self.renderer.inputs_by_group.get(group.name, frozenset())
         # images are only linear in some of them
         input_names = searched_inputs & find_linear_inputs(self.renderer)
         # Light paths are no longer than those of a search.
@@ -760,8 +760,8 @@ class Problem:
             The evaluation and the model's output.
         """
         renderer = self.renderer if renderer is None else renderer
-        non_finite_before = renderer.non_finite
-        renders_before = renderer.renders
+        non_finite_before = renderer.n_non_finite
+        renders_before = renderer.n_renders
         truth = self.find_truth(full_u)
         variable_u = full_u.detach().clone().requires_grad_(bool(query.gradient))
         inputs = self.make_objective_inputs(variable_u)
@@ -784,7 +784,7 @@ class Problem:
                 input_gradient = _differentiate_by_inputs(objective, variable_u)
             return objective
 
-        spp = self.spp * query.samples
+        spp = self.search_spp * query.samples
         gradient = None
         with self._limit_search_depth(renderer):
             if query.gradient:
@@ -799,15 +799,15 @@ class Problem:
         image, output = calls[0]
         (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
         # at least 1, since a renderer that predicts counts no renders
-        n_renders = max(1, renderer.renders - renders_before)
+        n_renders = max(1, renderer.n_renders - renders_before)
         evaluation = Evaluation(
             objective=float(value),
             gradient=gradient,
             success=judgement.success,
-            non_finite=renderer.non_finite - non_finite_before,
+            n_non_finite=renderer.n_non_finite - non_finite_before,
             cost=n_renders * query.samples,  # each counts `samples` times
             judgement=judgement,
-            picture=round_to_8_bit(image) if query.with_image else None,
+            picture=round_to_8_bit(image) if query.includes_image else None,
         )
         return evaluation, output
 
@@ -980,7 +980,7 @@ class Problem:
             objective=total_objective / len(evaluations),
             gradient=gradient,
             success=n_successes >= n_needed,
-            non_finite=sum(evaluation.non_finite for evaluation in evaluations),
+            n_non_finite=sum(evaluation.non_finite for evaluation in evaluations),
             cost=max(evaluation.cost for evaluation in evaluations),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
         )
@@ -1012,7 +1012,7 @@ class Problem:
 
     def compute_loss(self, image: Tensor) -> Tensor:
         """Return the objective of an image (H, W, 3) near the start, with a graph."""
-        inputs = self.make_objective_inputs(self.add_conditions(self.domain.start))
+        inputs = self.make_objective_inputs(self.make_full_configuration(self.domain.start))
         output = self.model(image)
         values = self._compute_objective(output, image[None], self.find_truth(), inputs)
         return values[0]

@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch.attacks import (
     SampleCount,
     SearchResult,
-    Trials,
+    TrialCounts,
     Verification,
     count_right,
 )
@@ -35,14 +35,14 @@ class RunState:
     """The results of a run so far. A result that was not reached is None or empty.
 
     Attributes:
-        first_look: renders of the clean configuration at the search's sample count.
-        search: result of the search by the policy; a claim.
-        baseline: result of the random search.
+        first_look_trials: renders of the clean configuration at the search's sample count.
+        search_result: result of the search by the policy; a claim.
+        random_search_result: result of the random search.
         sample_count: how the sample count of the verification was chosen.
         clean_trials: trials of the control group.
         verification: verification of the adversarial configuration of the run.
         baseline_verification: verification of the result of the random search.
-        unprinted: result of a search by the policy without print terms, if the search
+        result_without_print_terms: result of a search by the policy without print terms, if the search
             of the run has them.
         unprinted_verification: verification of that result.
         outdone_verification: verification of the policy's result, if the random search
@@ -50,13 +50,13 @@ class RunState:
             adversarial one of the run.
         failure_verifications: verifications of the first different failures that the
             policy found.
-        ambient_verifications: verifications of a projector's image in brighter or
+        verification_by_lux: verifications of a projector's image in brighter or
             darker rooms, by lux.
         random_trials: trials of random configurations of the full space.
-        bracket: the smallest change that makes the model fail.
+        smallest_change_bracket: the smallest change that makes the model fail.
         trial_images: images of the first trials, (H, W, 3) with 8-bit values in [0, 1],
             by kind and number. A resumed run only has those that it rendered itself.
-        frames: images of the search in its order, numpy (H, W, 3) with 8-bit values in
+        search_frames: images of the search in its order, numpy (H, W, 3) with 8-bit values in
             [0, 1].
         interrupted: whether the run was interrupted.
         predictor: predictor of the images of the searches; None if they were rendered.
@@ -69,22 +69,22 @@ class RunState:
         n_predicted_trials: number of trials whose image was predicted.
     """
 
-    first_look: tuple[Judgement, ...] = ()
-    search: SearchResult | None = None
-    baseline: SearchResult | None = None
+    first_look_trials: tuple[Judgement, ...] = ()
+    search_result: SearchResult | None = None
+    random_search_result: SearchResult | None = None
     sample_count: SampleCount | None = None
     clean_trials: tuple[Judgement, ...] = ()
     verification: Verification | None = None
     baseline_verification: Verification | None = None
-    unprinted: SearchResult | None = None
+    result_without_print_terms: SearchResult | None = None
     unprinted_verification: Verification | None = None
     outdone_verification: Verification | None = None
     failure_verifications: tuple[Verification, ...] = ()
-    ambient_verifications: dict[float, Verification] = field(default_factory=dict)
+    verification_by_lux: dict[float, Verification] = field(default_factory=dict)
     random_trials: tuple[Judgement, ...] = ()
-    bracket: Bracket | None = None
+    smallest_change_bracket: Bracket | None = None
     trial_images: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    frames: list[Any] = field(default_factory=list)
+    search_frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
     predictor: PredictedSearch | None = None
     predictor_refusal: Refusal | None = None
@@ -220,11 +220,11 @@ def make_verified_rate(verification: Verification) -> VerifiedRate:
         trials=verification.valid_trials,
         successes=verification.successful_trials,
     )
-    return rate.model_copy(update={"stopped": verification.stopped})
+    return rate.model_copy(update={"stopped": verification.stop_reason})
 
 
 def make_rate(
-    counts: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]
+    counts: TrialCounts, trials: Sequence[Judgement], successes: Sequence[Judgement]
 ) -> VerifiedRate:
     """Return a rate of success as a result stores it.
 
@@ -239,7 +239,7 @@ def make_rate(
     # mean score of 0, but 0.0 - x is 0.
     mean_margin = 0.0 - mean_number(trial.score for trial in trials)
     return VerifiedRate(
-        successes=counts.successes,
+        successes=counts.n_successes,
         spp=counts.spp,
         labels=dict(labels.most_common()),
         # outcomes such as "missed", which tasks put into the payload
@@ -259,15 +259,15 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
     right = count_right(trials, spp)
     outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
     return ControlGroup(
-        correct=right.successes, outcomes=outcomes, **_rate_fields(right, trials)
+        correct=right.n_successes, outcomes=outcomes, **_rate_fields(right, trials)
     )
 
 
-def _rate_fields(counts: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:
+def _rate_fields(counts: TrialCounts, trials: Sequence[Judgement]) -> dict[str, Any]:
     """Return the fields that all rates of a result have, from counts and trials."""
     n_not_a_number = sum(trial.is_non_finite for trial in trials)
     return {
-        "trials": counts.trials,
+        "trials": counts.n_trials,
         "rate": counts.rate,
         "interval": counts.interval,
         "not_a_number": n_not_a_number,

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.config import IMAGE_SUFFIXES, PICTURE_SPP
-from advsearch.controls import Control, Space, compose
+from advsearch.controls import Control, Space, compose_space
 from advsearch.controls.base import describe_adjusted_defaults
 from advsearch.engine.loading import (
     Controls,
@@ -45,7 +45,7 @@ from advsearch.scene.things import ALL_THINGS
 from advsearch.settings import to_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, Task, make_task
 from advsearch.tasks.together import make_each_thing_task
-from advsearch.trust.foreign_code import use_plain_switches
+from advsearch.trust.foreign_code import use_default_torch_state
 from advsearch.trust.writing import name_setting_in_errors
 
 MAX_PREDICTIONS = 5  # predictions of the model that a view has at most
@@ -294,7 +294,7 @@ class _RenderedView(NamedTuple):
     truth_error: str
 
 
-@use_plain_switches()
+@use_default_torch_state()
 def render(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
@@ -390,7 +390,7 @@ def render(
     return Rendering(
         scene=replace(
             description,
-            environment_spec=space.environment or description.environment_spec,
+            environment_spec=space.environment_name or description.environment_spec,
         ),
         model=model.name,
         task=unbound_task.name,
@@ -419,8 +419,8 @@ def _list_view_warnings(rendered_views: Sequence[_RenderedView]) -> list[str]:
     if truth_errors:
         sentences.append(f"Nothing is drawn into the picture: {truth_errors[-1]}")
     for rendered in rendered_views:
-        if rendered.task.remarks:
-            sentences += rendered.task.remarks
+        if rendered.task.output_remarks:
+            sentences += rendered.task.output_remarks
             break
     return sentences
 
@@ -452,7 +452,7 @@ def _render_view(
         settings: the arguments of `render` that are the same for all views.
     """
     description = fit_camera(description, settings.size)
-    space = compose(settings.controls, description)
+    space = compose_space(settings.controls, description)
     renderer = make_renderer(
         description,
         space,
@@ -465,9 +465,9 @@ def _render_view(
     u = _choose_configuration(space, settings.at)
     with torch.no_grad():
         radiance = renderer.radiance(
-            u, seeds.stream(settings.seed, "pictures"), settings.spp
+            u, seeds.derive_seed(settings.seed, "pictures"), settings.spp
         )
-        image = round_to_8_bit(space.apply_to_image(u, formation.display(radiance)))
+        image = round_to_8_bit(space.apply_to_image(u, formation.map_to_display(radiance)))
         output = model(image)
         truth = None
         truth_error = ""
@@ -484,7 +484,7 @@ def _render_view(
         linear=radiance * formation.gain,
         predictions=predictions,
         marks=marks,
-        surfaces=renderer.surfaces(u) if settings.with_surfaces else None,
+        surfaces=renderer.find_surfaces(u) if settings.with_surfaces else None,
         output=output,
         truth=truth,
         things=find_visible_things(renderer, u),
@@ -545,7 +545,7 @@ def _make_view_facts(
         )
         for render_surfaces in render_functions
     ]
-    return replace(facts, views=tuple(camera_facts))
+    return replace(facts, facts_of_views=tuple(camera_facts))
 
 
 def check_judged_thing(description: SceneDescription, judge: str) -> None:
@@ -589,9 +589,9 @@ def list_camera_renders(
         A function for the main camera, followed by one for each camera of the rig.
     """
     return [
-        partial(renderer.surfaces, u),
+        partial(renderer.find_surfaces, u),
         *(
-            partial(renderer.surfaces, u, camera=index)
+            partial(renderer.find_surfaces, u, camera=index)
             for index in range(n_rig_cameras)
         ),
     ]
@@ -683,7 +683,7 @@ def _add_others(facts_by_mesh: Mapping[str, Facts]) -> dict[str, Facts]:
         others = tuple(
             other for other_mesh, other in facts_by_mesh.items() if other_mesh != mesh
         )
-        complete_facts[mesh] = replace(facts, others=others)
+        complete_facts[mesh] = replace(facts, facts_of_others=others)
     return complete_facts
 
 
@@ -722,7 +722,7 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         An entry for the object and for each other thing; None if the scene has only
         the object.
     """
-    description = renderer.scene.definition[0]
+    description = renderer.scene.description_and_filter[0]
     if not description.things:
         return None
     names = (OBJECT, *description.things)

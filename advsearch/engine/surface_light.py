@@ -83,7 +83,7 @@ def find_surface_light_refusal(
     moves_camera = bool(changed_inputs & CAMERA_INPUTS)
     if not moves_camera:
         return NO_CAMERA
-    n_images = steps * problem.n_draws
+    n_images = steps * problem.conditions_per_evaluation
     if n_images < MIN_IMAGES:
         return Refusal(
             f"light on surfaces pays from {MIN_IMAGES} pictures on",
@@ -91,7 +91,7 @@ def find_surface_light_refusal(
         )
     if policy.takes_differences(problem.domain, steps):
         return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
-    for group in problem.plan.groups:
+    for group in problem.gradient_plan.groups:
         # The user may force an estimator of derivatives of rendered images. Derivatives
         # of predicted images are computed in another way.
         needs_estimator = group.estimator not in ("none", "image")
@@ -212,7 +212,7 @@ class SurfaceLight(PredictedSearch):
         Two environment maps are computed, for two values of the coordinates of the
         group. Only the brightness differs if one map is a multiple of the other.
         """
-        start = self.problem.add_conditions(self.problem.domain.start)
+        start = self.problem.make_full_configuration(self.problem.domain.start)
         fingerprints = []
         # Any two different values in (0, 1) would do. 0 and 1 might switch the
         # environment off.
@@ -222,10 +222,10 @@ class SurfaceLight(PredictedSearch):
             environment = self._compute_inputs(full_u)[ENVIRONMENT_INPUT]
             fingerprints.append(MapFingerprint.compute(environment))
         first_map, second_map = fingerprints
-        return first_map.find_factor(second_map) is not None
+        return first_map.compute_map_ratio(second_map) is not None
 
     @property
-    def n_samples(self) -> int:
+    def preparation_spp(self) -> int:
         return N_LIGHTS
 
     def summarize_conditions(self) -> BankOfConditions | None:
@@ -236,7 +236,7 @@ class SurfaceLight(PredictedSearch):
             created=self._n_lights, dropped=self.renderer.n_dropped, grown=0, gap=None
         )
 
-    def measure_size(self) -> tuple[int, int]:
+    def count_entries_and_bytes(self) -> tuple[int, int]:
         return self.renderer.n_entries, self.renderer.n_bytes
 
     @property
@@ -269,16 +269,16 @@ class SurfaceLight(PredictedSearch):
         """
         problem = self.problem
         u = problem.domain.start if self.light_u is None else self.light_u
-        with self.count_time(), torch.no_grad():
+        with self.measure_seconds(), torch.no_grad():
             # Without a seed, the conditions leave the scene unchanged.
-            full_u = problem.add_conditions(u)
+            full_u = problem.make_full_configuration(u)
             self._renderer = SurfaceRenderer(
-                problem.renderer, full_u, seeds.stream(problem.seed, "surface light")
+                problem.renderer, full_u, seeds.derive_seed(problem.seed, "surface light")
             )
             self._bank_conditions = self._sample_bank_conditions()
             for condition in self._bank_conditions:
                 inputs = self._compute_inputs(torch.cat([u, condition]))
-                self._renderer.get_light(inputs)  # computes it, and stores it
+                self._renderer.get_light_and_factor(inputs)  # computes it, and stores it
                 # `N_LIGHTS` is the length of the progress bar (`n_samples`), also if
                 # there is a single condition
                 tick(N_LIGHTS // len(self._bank_conditions))
@@ -296,7 +296,7 @@ class SurfaceLight(PredictedSearch):
         problem = self.problem
         if problem.conditions is None:
             return [torch.empty(0)]
-        seed = seeds.stream(problem.seed, "bank")
+        seed = seeds.derive_seed(problem.seed, "bank")
         # If no coordinate of the conditions needs new light, one light serves all.
         n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
         return [
@@ -352,8 +352,8 @@ class SurfaceLight(PredictedSearch):
         if query.gradient is True and takes_differences:
             return True
         # number of predicted evaluations among the first ones, up to this query
-        n_predicted = self.count_predicted(query.kind, query.index + 1)
-        is_predicted = query.index < n_predicted
+        n_predicted = self.count_predicted(query.kind, query.row_index + 1)
+        is_predicted = query.row_index < n_predicted
         return not is_predicted
 
     def evaluate(self, query: Query, image: Tensor | None = None) -> Evaluation:
@@ -379,14 +379,14 @@ class SurfaceLight(PredictedSearch):
             query: the trial.
             image: (H, W, 3) predicted image; None to predict it here.
         """
-        full_u = self.problem.add_conditions(query.u)
+        full_u = self.problem.make_full_configuration(query.u)
         with torch.no_grad():
             rounded = round_to_8_bit(self.renderer(full_u) if image is None else image)
         return Evaluation.from_judgement(
             self.problem.judge(rounded, full_u),
             cost=0,  # nothing is rendered
             predicted=RAYS_PER_PIXEL,  # samples per pixel of a predicted image
-            picture=rounded if query.with_image else None,
+            picture=rounded if query.includes_image else None,
         )
 
     def _evaluate_image(self, query: Query, image: Tensor) -> Evaluation:
@@ -403,7 +403,7 @@ class SurfaceLight(PredictedSearch):
             evaluation,
             cost=query.samples,
             predicted=RAYS_PER_PIXEL,  # samples per pixel of a predicted image
-            picture=round_to_8_bit(image) if query.with_image else None,
+            picture=round_to_8_bit(image) if query.includes_image else None,
         )
 
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
@@ -413,11 +413,11 @@ class SurfaceLight(PredictedSearch):
         image that the query requests shows the scene without random conditions.
         """
         problem = self.problem
-        set_index = query.index
+        set_index = query.row_index
         reuses_conditions = self._reuses_conditions(query.kind)
         if reuses_conditions:
-            set_index = query.index % N_CONDITION_SETS
-        conditions = self._choose_conditions(query.kind, set_index, problem.n_draws)
+            set_index = query.row_index % N_CONDITION_SETS
+        conditions = self._choose_conditions(query.kind, set_index, problem.conditions_per_evaluation)
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
         ]
@@ -431,11 +431,11 @@ class SurfaceLight(PredictedSearch):
             predict, full_configurations, query.u, query.gradient, BATCH_SIZE
         )
         evaluation = replace(evaluation, cost=query.samples, predicted=RAYS_PER_PIXEL)
-        if not query.with_image:
+        if not query.includes_image:
             return evaluation
         with torch.no_grad():
             # Without a seed, the conditions leave the scene unchanged.
-            clean_full_u = problem.add_conditions(query.u)
+            clean_full_u = problem.make_full_configuration(query.u)
             images = self._predict_images([clean_full_u], query.u)
             return replace(evaluation, picture=round_to_8_bit(images[0]))
 
@@ -464,7 +464,7 @@ class SurfaceLight(PredictedSearch):
             # the bank has a single condition without coordinates, which is repeated
             return self._bank_conditions * count
         generator = torch.Generator().manual_seed(
-            seeds.stream(problem.seed, f"surface {kind}", number)
+            seeds.derive_seed(problem.seed, f"surface {kind}", number)
         )
         n_lights = len(self._bank_conditions)
         positions = torch.randint(n_lights, (count,), generator=generator).tolist()
@@ -489,7 +489,7 @@ class SurfaceLight(PredictedSearch):
             first = len(full_u) - len(self._input_space.start)
             inputs = self._input_space.inputs(full_u[first:])
             # completed by the inputs that nothing changes
-            return self.problem.renderer.scene.assembly(inputs)
+            return self.problem.renderer.scene.input_assembler(inputs)
 
     def _predict_images(
         self,
@@ -545,24 +545,24 @@ class SurfaceLight(PredictedSearch):
         is_of_search = query.kind == "search" and query.phase == "search"
         predictions_failed = self.tracing_reason is not None
         next_comparison = self._next_comparison or COMPARISON_INTERVAL
-        is_due = query.index >= next_comparison
+        is_due = query.row_index >= next_comparison
         if not is_of_search or predictions_failed or not is_due:
             return
         # the comparison before, whose deviation is the latest so far
         was_accurate = self.deviations[-1].is_accepted
-        is_accurate = self._compare(query.u, query.index).is_accepted
+        is_accurate = self._compare(query.u, query.row_index).is_accepted
         interval = COMPARISON_INTERVAL
         if is_accurate and not self._searches_colors:
             # doubles: the next comparison is at twice the index of this one
-            interval = query.index
-        self._next_comparison = query.index + interval
+            interval = query.row_index
+        self._next_comparison = query.row_index + interval
         if is_accurate:
             return
         if not was_accurate:
-            self.trace_from("search", query.index)
+            self.stop_predicting("search", query.row_index)
         elif self._searches_colors:
-            with self.count_time():
-                self.renderer.update_base_color(self.problem.add_conditions(query.u))
+            with self.measure_seconds():
+                self.renderer.update_base_color(self.problem.make_full_configuration(query.u))
             assert self.n_renewals is not None  # None only for a `Bank`
             self.n_renewals += 1
 
@@ -579,8 +579,8 @@ class SurfaceLight(PredictedSearch):
         """
         problem = self.problem
         kind = "surface check"
-        seed = seeds.stream(problem.seed, kind, index)
-        with self.count_time():
+        seed = seeds.derive_seed(problem.seed, kind, index)
+        with self.measure_seconds():
             generator = torch.Generator().manual_seed(seed)
             random_configurations = problem.domain.sample(generator, N_VIEWS)
             # (N_VIEWS, d): random in the moving coordinates, else u
@@ -604,8 +604,8 @@ class SurfaceLight(PredictedSearch):
             return problem.compare_view(
                 self.renderer,
                 full_configurations[number],
-                seeds.stream(seed, "view", number),
-                problem.spp,
+                seeds.derive_seed(seed, "view", number),
+                problem.search_spp,
                 is_random=is_random,
             )
 

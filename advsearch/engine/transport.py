@@ -169,7 +169,7 @@ class PredictedSearch(ABC):
 
     @property
     @abstractmethod
-    def n_samples(self) -> int:
+    def preparation_spp(self) -> int:
         """Samples per pixel that are traced before the search can begin."""
 
     @abstractmethod
@@ -238,7 +238,7 @@ class PredictedSearch(ABC):
             yield evaluation
 
     @abstractmethod
-    def measure_size(self) -> tuple[int, int]:
+    def count_entries_and_bytes(self) -> tuple[int, int]:
         """Return the number of entries of the matrices, for one color channel, and their
         size in bytes.
         """
@@ -256,7 +256,7 @@ class PredictedSearch(ABC):
 
         `compare_view` compares a single view; see `acceptance.compare_views`.
         """
-        with self.count_time():
+        with self.measure_seconds():
             self.deviations.append(compare_views(compare_view))
         self.n_traced += self.deviations[-1].n_traced
         return self.deviations[-1]
@@ -278,7 +278,7 @@ class PredictedSearch(ABC):
         self.n_traced += 1
         return current, measure_outside(self.problem, window, before, [current])
 
-    def trace_from(self, kind: str, number: int, where: str = "") -> None:
+    def stop_predicting(self, kind: str, number: int, where: str = "") -> None:
         """Give predictions up for a kind of search, and trace its images from now on.
 
         Args:
@@ -295,7 +295,7 @@ class PredictedSearch(ABC):
         self.tracing_reason = self.tracing_reason or reason
 
     @contextmanager
-    def count_time(self) -> Iterator[None]:
+    def measure_seconds(self) -> Iterator[None]:
         """Count the time of a block as spent on the predictor."""
         started = time.perf_counter()
         yield
@@ -307,7 +307,7 @@ class PredictedSearch(ABC):
         A predictor was used even if predictions were given up later; `reason` then says
         why.
         """
-        entries, n_bytes = self.measure_size()
+        entries, n_bytes = self.count_entries_and_bytes()
         error = None
         if self.deviations:
             latest_deviation = self.deviations[-1]
@@ -356,7 +356,7 @@ class Transport(PredictedSearch):
     _is_prepared: bool = False
 
     @property
-    def n_samples(self) -> int:
+    def preparation_spp(self) -> int:
         return count_samples(self.problem.renderer)
 
     def prepare(self, tick: ProgressCallback = lambda samples: None) -> None:
@@ -368,12 +368,12 @@ class Transport(PredictedSearch):
             tick: called with samples per pixel as they are traced.
         """
         if not self._is_prepared:
-            with self.count_time():
+            with self.measure_seconds():
                 windowing = find_window(self.problem)
             # It may be a `Refusal`: there is no window, and full images are predicted.
             if isinstance(windowing, Windowing):
                 self.window = windowing.window
-                self._full_images["start"] = windowing.start
+                self._full_images["start"] = windowing.start_image
                 self.n_traced += N_WINDOW_IMAGES  # those of `find_window`
             self._is_prepared = True
         # `clean_matrix` may be shared with another search that has computed it.
@@ -387,16 +387,16 @@ class Transport(PredictedSearch):
             self.clean_matrix.predictors[self.window] = predictor
 
     @property
-    def start(self) -> Predictor:
+    def clean_predictor(self) -> Predictor:
         """The matrix of the clean configuration."""
         self.prepare()
         return self.clean_matrix.predictors[self.window]
 
-    def measure_size(self) -> tuple[int, int]:
+    def count_entries_and_bytes(self) -> tuple[int, int]:
         """Return the entries of the clean matrix, for one color channel, and its
         bytes.
         """
-        return self.start.n_entries, self.start.n_bytes
+        return self.clean_predictor.n_entries, self.clean_predictor.n_bytes
 
     def _make_predictor(
         self,
@@ -413,12 +413,12 @@ class Transport(PredictedSearch):
             number: index of its query, for the seed.
             tick: called with the samples that were traced.
         """
-        with self.count_time():
-            seed = seeds.stream(self.problem.seed, f"transport {kind}", number)
+        with self.measure_seconds():
+            seed = seeds.derive_seed(self.problem.seed, f"transport {kind}", number)
             renderer = self.problem.renderer
             if self.window is not None:
                 # only the window is predicted: what surrounds it is rendered once
-                base_seed = seeds.stream(seed, "surroundings")
+                base_seed = seeds.derive_seed(seed, "surroundings")
                 renderer = renderer.crop_to(self.window, u, base_seed, SURROUNDINGS_SPP)
                 self.n_traced += 1
             predictor = make_predictor(renderer, u, seed, tick)
@@ -433,7 +433,7 @@ class Transport(PredictedSearch):
         """
         if self.window is None or kind in self.first_traced:
             return None
-        predictor = self._current.get(kind, self.start)
+        predictor = self._current.get(kind, self.clean_predictor)
         return self.problem.renderer.copy_with(crop=predictor.path_renderer.crop)
 
     def replay(self, query: Query) -> None:
@@ -462,12 +462,12 @@ class Transport(PredictedSearch):
         lights would be the same again: then the rest of the search is traced.
         """
         kind = query.kind
-        number = query.index
+        number = query.row_index
         # number of queries of this search whose images are predicted
         n_predicted = self.count_predicted(kind, self.steps)
         if query.phase != "search" or number >= n_predicted:
             return None
-        predictor = self._current.setdefault(kind, self.start)
+        predictor = self._current.setdefault(kind, self.clean_predictor)
         is_due = number > 0 and number % COMPARISON_INTERVAL == 0
         # A random search ("baseline") does not move away from the start, so that its
         # predictor does not get old.
@@ -480,9 +480,9 @@ class Transport(PredictedSearch):
             return predictor
         # Basis images of lights do not depend on u, so that computing them again would
         # change nothing. They are no matrix, and so have 0 entries.
-        has_basis_images = self.start.n_entries == 0
+        has_basis_images = self.clean_predictor.n_entries == 0
         if has_basis_images:
-            self.trace_from(kind, number, f" of the {kind}")
+            self.stop_predicting(kind, number, f" of the {kind}")
             return None
         self._current[kind] = self._make_predictor(query.u, kind, number)
         if full_image is not None:
@@ -496,7 +496,7 @@ class Transport(PredictedSearch):
 
         If there is a window, only the window is traced and compared.
         """
-        seed = seeds.stream(self.problem.seed, "transport check", query.index)
+        seed = seeds.derive_seed(self.problem.seed, "transport check", query.row_index)
         renderer = self.problem.renderer
         if self.window is not None:
             renderer = renderer.copy_with(crop=predictor.path_renderer.crop)
@@ -504,8 +504,8 @@ class Transport(PredictedSearch):
             lambda view: self.problem.compare_view(
                 predictor,
                 query.u,
-                seeds.stream(seed, "view", view),
-                self.problem.spp,
+                seeds.derive_seed(seed, "view", view),
+                self.problem.search_spp,
                 renderer=renderer,
             )
         )
@@ -526,7 +526,7 @@ class Transport(PredictedSearch):
         if self.window is None:
             return True, None
         before = self._full_images.get(kind, self._full_images["start"])
-        with self.count_time():
+        with self.measure_seconds():
             current, deviation = self.measure_surroundings(self.window, before, u)
         return deviation.is_accepted, current
 
@@ -559,5 +559,5 @@ class Transport(PredictedSearch):
     def _predict_score(self, u: Tensor) -> float:
         """Return the score of the image that is predicted from the start."""
         with torch.no_grad():
-            image = round_to_8_bit(self.start(u))
+            image = round_to_8_bit(self.clean_predictor(u))
             return self.problem.judge(image, u).score

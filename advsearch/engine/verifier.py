@@ -73,20 +73,20 @@ class Verifier:
 
     Attributes:
         journal: evaluates and stores the trials.
-        ladder: sample counts to choose from, ascending; a single one is not tested.
-        stages: stages of the progress of the run.
-        state: results, images and the number of renders.
-        looks: numbers of trials, ascending, after which there may be a verdict
+        spp_ladder: sample counts to choose from, ascending; a single one is not tested.
+        progress_stages: stages of the progress of the run.
+        run_state: results, images and the number of renders.
+        look_sizes: numbers of trials, ascending, after which there may be a verdict
             (`attacks.verify`); the last is the largest number of trials of a group.
         has_success: whether a certain prediction is sought, so that rows state whether
             a trial is a success.
     """
 
     journal: Journal
-    ladder: Sequence[int]
-    stages: Stages
-    state: RunState = field(default_factory=RunState)
-    looks: tuple[int, ...] = (0,)
+    spp_ladder: Sequence[int]
+    progress_stages: Stages
+    run_state: RunState = field(default_factory=RunState)
+    look_sizes: tuple[int, ...] = (0,)
     has_success: bool = True
     _clean_spp: int = 0
     _clean_kind: str = "control"
@@ -108,7 +108,7 @@ class Verifier:
     @property
     def n_trials(self) -> int:
         """Largest number of trials of a group."""
-        return self.looks[-1]
+        return self.look_sizes[-1]
 
     def evaluate_all(
         self,
@@ -136,17 +136,17 @@ class Verifier:
             queries = [replace(query, has_success=False) for query in queries]
         evaluations = self.journal.evaluate_all(queries, evaluate)
         for query, evaluation in zip(queries, evaluations, strict=True):
-            trial = (query.kind, query.index)
+            trial = (query.kind, query.row_index)
             if evaluation.picture is not None:
-                self.state.trial_images[trial] = evaluation.picture
+                self.run_state.trial_images[trial] = evaluation.picture
             if evaluation.predicted:
-                self.state.n_predicted_trials += 1
+                self.run_state.n_predicted_trials += 1
             else:
                 self._rendered.add(trial)  # a set, in which each trial counts once
-            self.state.verification_renders = len(self._rendered)
+            self.run_state.verification_renders = len(self._rendered)
             steps = query.spp if in_samples else 1
             worker_stats = self.journal.evaluator.progress_stats
-            self.stages.progress.advance(steps, **worker_stats)
+            self.progress_stages.progress.advance(steps, **worker_stats)
             yield evaluation
 
     def choose_spp(
@@ -165,9 +165,9 @@ class Verifier:
         """
         has_conditions = self.problem.conditions is not None
         # sample counts to choose from, ascending
-        ladder = self.ladder
-        is_set_by_user = len(ladder) == 1
-        n_trials_of_first_look = self.looks[0]
+        ladder = self.spp_ladder
+        is_set_by_user = len(spp_ladder) == 1
+        n_trials_of_first_look = self.look_sizes[0]
         # `max_samples` is for the progress bar: samples per pixel of all renders, if
         # every sample count of the ladder is tried.
         if has_conditions:
@@ -194,14 +194,14 @@ class Verifier:
             )
             for name, u in candidates.items()
         }
-        self.state.sample_count = choose(margins, seed=self.problem.seed, ladder=ladder)
+        self.run_state.sample_count = choose(margins, seed=self.problem.seed, ladder=ladder)
 
     def _begin_sample_count_stage(self, max_samples: int) -> None:
         """Begin the stage of the progress in which the sample count is chosen.
 
         `max_samples` are the samples per pixel of all its renders, at most.
         """
-        self.stages.begin(
+        self.progress_stages.begin(
             "verification",
             "finding how many samples the check needs",
             max_samples,
@@ -228,7 +228,7 @@ class Verifier:
         n_groups = n_candidates + 1  # a group of trials for each, and the control group
         return limit_ladder(OVER_LADDER, n_groups * self.n_trials, search_samples)
 
-    def try_clean(self) -> None:
+    def run_clean_trials(self) -> None:
         """Run the trials of the clean configuration, which are the control group.
 
         They have the same seeds as those of the adversarial configuration. If they were
@@ -241,16 +241,16 @@ class Verifier:
         """
         if self.has_clean_trials:
             return
-        self._clean_spp = self.state.spp
-        is_before_search = self.state.search is None
+        self._clean_spp = self.run_state.spp
+        is_before_search = self.run_state.search_result is None
         self._clean_kind = "first control" if is_before_search else "control"
-        self.state.clean_trials = run_trials(
+        self.run_state.clean_trials = run_trials(
             self.evaluate_all,
             self.problem.domain.start,
             spp=self._clean_spp,
             seed=self.problem.seed,
             # `verify` runs more if the first look does not decide
-            trials=self.looks[0],
+            trials=self.look_sizes[0],
             kind=self._clean_kind,
             n_images=MAX_STORED_IMAGES,
         )
@@ -258,7 +258,7 @@ class Verifier:
     @property
     def has_clean_trials(self) -> bool:
         """Whether the control group was tried at the current sample count."""
-        return bool(self.state.clean_trials) and self._clean_spp == self.state.spp
+        return bool(self.run_state.clean_trials) and self._clean_spp == self.run_state.spp
 
     def verify(
         self,
@@ -282,17 +282,17 @@ class Verifier:
                 after all others.
         """
         # with new seeds the control group starts again
-        clean_trials = () if with_new_trials else self.state.clean_trials
+        clean_trials = () if with_new_trials else self.run_state.clean_trials
         verification = verify(
             self.evaluate_all,
             self.problem.domain,
             result.best_u,
             claim=result.ending,  # an ending of FOUND claims a failure
-            spp=self.state.spp,
+            spp=self.run_state.spp,
             seed=self.problem.seed,
-            trials=self.looks,
+            trials=self.look_sizes,
             clean=clean_trials,
-            rule=self.problem.rule,
+            rule=self.problem.verification_rule,
             kind=kind,
             control_kind=self._clean_kind,
             n_images=MAX_STORED_IMAGES,
@@ -301,7 +301,7 @@ class Verifier:
             first_index=self.n_trials if with_new_trials else 0,
         )
         if not with_new_trials:
-            self.state.clean_trials = verification.clean_trials
+            self.run_state.clean_trials = verification.clean_trials
         return verification
 
     def try_configurations(
@@ -323,7 +323,7 @@ class Verifier:
         problem = self.problem
         queries = list[Query]()
         for number, u in configurations.items():
-            seed = seeds.stream(problem.seed, kind, number)
+            seed = seeds.derive_seed(problem.seed, kind, number)
             # The row of the trial states the values of the configuration, unless it has
             # many: the texels of a texture would fill the store.
             values: dict[str, Any] = {}
@@ -335,7 +335,7 @@ class Verifier:
                 seed,
                 kind,
                 number,
-                spp=self.state.spp,
+                spp=self.run_state.spp,
                 values=values,
                 has_success=has_success,
             )
@@ -382,12 +382,12 @@ class Verifier:
         def sample_configuration(number: int) -> Tensor:
             """Return the random configuration (d,) with a number."""
             generator = torch.Generator().manual_seed(
-                seeds.stream(problem.seed, "draw", number)
+                seeds.derive_seed(problem.seed, "draw", number)
             )
             return problem.domain.sample(generator)[0]
 
         trials = self.try_in_batches("average", n_trials, sample_configuration)
-        self.state.random_trials = tuple(trials)
+        self.run_state.random_trials = tuple(trials)
 
     def begin_stage(
         self,
@@ -408,9 +408,9 @@ class Verifier:
             at_most: whether there may be fewer.
         """
         bound = "at most " if at_most else ""
-        samples = plural(self.state.spp, "sample")
+        samples = plural(self.run_state.spp, "sample")
         hint = f"{bound}{n_trials} pictures of {samples} a pixel; {flags} shorten it"
-        self.stages.begin(name, title, n_trials, hint=hint, at_most=at_most)
+        self.progress_stages.begin(name, title, n_trials, hint=hint, at_most=at_most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -499,7 +499,7 @@ class Retrials:
             if condition.radiance_key is not None
         )
 
-    def try_clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
+    def run_clean_trials(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         """Return the trials of the clean scene under a condition."""
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
@@ -534,8 +534,8 @@ class Retrials:
             spp=condition.spp,
             seed=self._seed,
             trials=self._n_trials,
-            clean=self.try_clean(condition),
-            rule=condition.problem.rule,
+            clean=self.run_clean_trials(condition),
+            rule=condition.problem.verification_rule,
             kind=f"{kind} under {condition.name}",
         )
 
@@ -577,7 +577,7 @@ class Retrials:
             self._cached_kind = kind
         keys = [(condition.image_key, query.seed, condition.spp) for query in queries]
         missing = [
-            replace(query, product="picture")
+            replace(query, requested_output="picture")
             for query, key in zip(queries, keys, strict=True)
             if key not in self._images
         ]
@@ -602,7 +602,7 @@ class Retrials:
         """Judge a rendered image (H, W, 3) after the change of a condition."""
         if condition.change_image is not None:
             image = condition.change_image(image, query.seed)
-        full_u = condition.problem.add_conditions(query.u, query.seed)
+        full_u = condition.problem.make_full_configuration(query.u, query.seed)
         return condition.problem.judge(round_to_8_bit(image), full_u)
 
     def _render_on_workers(
@@ -618,7 +618,7 @@ class Retrials:
             queries: queries for images that are not cached.
         """
         evaluator = self._journals[condition.name].evaluator
-        if evaluator.executor is not None and len(queries) > 1:
+        if evaluator.workers is not None and len(queries) > 1:
             return iter(evaluator(queries))
         return iter(())
 
@@ -640,13 +640,13 @@ class Retrials:
         if not is_radiance_shared:
             return problem.picture(u, seed, condition.spp)
         renderer = problem.renderer
-        full_u = problem.add_conditions(u, seed)
+        full_u = problem.make_full_configuration(u, seed)
         key = (condition.radiance_key, seed, condition.spp)
         with torch.no_grad():
             if key not in self._radiances:
                 self._radiances[key] = renderer.radiance(full_u, seed, condition.spp)
             # the same two steps by which `problem.picture` forms an image
-            displayed = renderer.formation.display(self._radiances[key])
+            displayed = renderer.formation.map_to_display(self._radiances[key])
             return round_to_8_bit(renderer.space.apply_to_image(full_u, displayed))
 
 

@@ -58,12 +58,12 @@ class FullImage(NamedTuple):
 
     Attributes:
         u: (d,) configuration of the image.
-        halves: linear radiance (H, W, 3 or 4) of both, with noise.
+        independent_renders: linear radiance (H, W, 3 or 4) of both, with noise.
         radiance: mean of both (H, W, 3 or 4), denoised.
     """
 
     u: Tensor
-    halves: Sequence[Tensor]
+    independent_renders: Sequence[Tensor]
     radiance: Tensor
 
 
@@ -73,13 +73,13 @@ class Windowing:
 
     Attributes:
         window: window of the pixels that are traced.
-        start: the full image at the start.
+        start_image: the full image at the start.
         deviation: error of images at both bounds of the budget if their surroundings
             are those of the start.
     """
 
     window: Window
-    start: FullImage
+    start_image: FullImage
     deviation: Deviation
 
 
@@ -140,7 +140,7 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
         )
     if renderer.scene.is_volumetric:
         return HAZE
-    definition, *_ = renderer.scene.definition
+    definition, *_ = renderer.scene.description_and_filter
     if definition.camera_model is not None:
         return Refusal("the camera has a lens of its own")
     if renderer.formation.denoiser != "oidn":
@@ -160,7 +160,7 @@ def find_searched_refusal(problem: Problem) -> Refusal | None:
     input_names = find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
     if not input_names:
         return Refusal("nothing that is searched needs a render")
-    mesh_names = problem.renderer.surfaces(problem.renderer.start).names
+    mesh_names = problem.renderer.find_surfaces(problem.renderer.start).shape_names
     for name in sorted(input_names):
         part = name.partition(".")[0]  # "mug": the mesh or light that has the input
         if name in light_inputs:
@@ -180,7 +180,7 @@ def find_searched_inputs(problem: Problem) -> frozenset[str]:
 
 def _find_box(problem: Problem) -> Window | None:
     """Return the box around all searched meshes at the start; None if none is visible."""
-    surfaces = problem.renderer.surfaces(problem.domain.start)
+    surfaces = problem.renderer.find_surfaces(problem.domain.start)
     mask = torch.zeros(problem.renderer.formation.resolution, dtype=torch.bool)
     for name in find_searched_inputs(problem):
         mask |= surfaces.visible_mask(name.partition(".")[0])
@@ -199,13 +199,13 @@ def render_full(problem: Problem, u: Tensor) -> FullImage:
         u: (d,) the configuration.
     """
     renderer = problem.renderer
-    noise_seed = seeds.stream(problem.seed, "crop")
+    noise_seed = seeds.derive_seed(problem.seed, "crop")
     with (
         torch.no_grad(),
         renderer.scene.limit_depth(problem.search_depth),
         renderer.share_paths(problem.shared_paths),
     ):
-        halves, radiance = renderer.trace_halves(
+        halves, radiance = renderer.trace_independent_radiances(
             _compute_inputs(problem, u), noise_seed, PROBE_SPP
         )
     return FullImage(u.detach().clone(), halves, radiance)
@@ -213,7 +213,7 @@ def render_full(problem: Problem, u: Tensor) -> FullImage:
 
 def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
     """Return the scene inputs of u (d,)."""
-    return problem.renderer.scene.assembly(problem.space.inputs(u))
+    return problem.renderer.scene.input_assembler(problem.space.inputs(u))
 
 
 def measure_outside(
@@ -270,13 +270,13 @@ def _measure_square(
         they are squared. The result may be below 0 by chance.
     """
     # (H, W, 1) 1 outside of the window, 0 inside
-    outside = window.is_outside(problem.renderer.formation.resolution).float()
+    outside = window.make_outside_mask(problem.renderer.formation.resolution).float()
     outside = outside[..., None]
     # converts a small difference of radiance to one of displayed values, in [0, 1]
     slope = _compute_slope(problem, before)
     # for each of the two seeds, differences summed over the squares: (1, 3, h, w)
     difference_sums = []
-    for old, new in zip(before.halves, after.halves, strict=True):
+    for old, new in zip(before.independent_renders, after.independent_renders, strict=True):
         difference = (new - old)[..., :3]  # without coverage
         levels = 255.0 * slope * difference * outside
         difference_sums.append(_sum_over_squares(levels))
@@ -316,7 +316,7 @@ def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
         radiance.requires_grad_()
         # the two steps of displaying an image, without rounding
         linear = renderer.finish_image(radiance, inputs, image.u, display=False)
-        displayed = renderer.formation.display(linear)
+        displayed = renderer.formation.map_to_display(linear)
         (slope,) = torch.autograd.grad(displayed.sum(), radiance)
     return slope[..., :3]  # without coverage
 
@@ -336,7 +336,7 @@ def _measure_margin(
         The margin with pasted surroundings minus the true margin of `after`; and the
         absolute difference between the margins of `after` and `before`.
     """
-    pasted = window.paste(window.select(after.radiance), before.radiance)
+    pasted = window.paste(window.crop_image(after.radiance), before.radiance)
     margin = _compute_margin(problem, after.radiance, after.u)
     bias = _compute_margin(problem, pasted, after.u) - margin
     change = margin - _compute_margin(problem, before.radiance, before.u)

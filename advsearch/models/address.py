@@ -124,10 +124,10 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         name=name,
         spec=spec,
         limits=resolve_limits(purpose.ask),
-        chat=address.fragment if is_chat else "",
+        chat_model_name=address.fragment if is_chat else "",
         question=question or (models.QUESTION if is_free else ""),
         tokens=purpose.tokens,
-        times=purpose.times if is_free else 1,
+        n_answers_per_image=purpose.times if is_free else 1,
     )
     if not is_free:
         module.names = purpose.names or _request_names(module)
@@ -340,10 +340,10 @@ class AddressModel(models.RemoteNetwork):
         name: name in messages.
         spec: what the user wrote.
         limits: limits and prices of a run, with all names of `LIMITS`.
-        chat: the name of a chat's model; empty for the plain protocol.
+        chat_model_name: the name of a chat's model; empty for the plain protocol.
         question: question about the image; may be empty.
         tokens: maximum length of an answer in words.
-        times: number of requests per image.
+        n_answers_per_image: number of requests per image.
         names: names with scores in answers.
         spent: number of "calls", "tokens_in" and "tokens_out" of a run. If the run was
             resumed, those before the interruption are included.
@@ -355,10 +355,10 @@ class AddressModel(models.RemoteNetwork):
     name: str
     spec: str
     limits: Mapping[str, float]
-    chat: str
+    chat_model_name: str
     question: str
     tokens: int
-    times: int
+    n_answers_per_image: int
     names: tuple[str, ...] = ()
     spent: Counter[str] = field(default_factory=Counter)
     store: AnswerStore | None = None
@@ -390,15 +390,15 @@ class AddressModel(models.RemoteNetwork):
         highest score.
         """
         # turn: the number of the request about the same image
-        requests = [(image, turn) for image in images for turn in range(self.times)]
+        requests = [(image, turn) for image in images for turn in range(self.n_answers_per_image)]
         texts = []
         for answer in self._get_answers(requests):
             scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}
             texts.append(max(scores, key=scores.__getitem__))
         # The texts about one image follow each other.
         return [
-            texts[start : start + self.times]
-            for start in range(0, len(texts), self.times)
+            texts[start : start + self.n_answers_per_image]
+            for start in range(0, len(texts), self.n_answers_per_image)
         ]
 
     def request_scores(self, images: Sequence[Image8Bit]) -> list[dict[str, float]]:
@@ -461,7 +461,7 @@ class AddressModel(models.RemoteNetwork):
             if not isinstance(answers[key], dict):  # it is not stored, or corrupt
                 new_bodies[key] = body
         new_keys = list(new_bodies)
-        read_answer = self._read_chat if self.chat else self._read_plain
+        read_answer = self._read_chat if self.chat_model_name else self._read_plain
         for index, response in self._send(list(new_bodies.values())):
             self._count_tokens(response)
             key = new_keys[index]
@@ -489,7 +489,7 @@ class AddressModel(models.RemoteNetwork):
         plain protocol, {"image": PNG in base64, "prompt": question}.
         """
         encoded = base64.b64encode(models.encode_levels(image)).decode()
-        if not self.chat:
+        if not self.chat_model_name:
             body: dict[str, Any] = {"image": encoded}
             if self.question:
                 body["prompt"] = self.question
@@ -502,7 +502,7 @@ class AddressModel(models.RemoteNetwork):
             },
         ]
         return {
-            "model": self.chat,
+            "model": self.chat_model_name,
             "messages": [{"role": "user", "content": content}],
             "max_tokens": self.tokens,
         }
@@ -628,7 +628,7 @@ class AddressModel(models.RemoteNetwork):
         ]
         max_concurrent = self._max_concurrent()
         while pending:
-            models.INTERRUPTS.look()
+            models.INTERRUPTS.raise_pending()
             count = self._reserve(min(max_concurrent, len(pending)))
             batch = pending[:count]
             del pending[:count]

@@ -49,11 +49,11 @@ class Features:
     """
 
     model: Model
-    read: Read = field(repr=False)
+    compute_batch: Read = field(repr=False)
     size: int  # F, numbers per image
     # Where the features come from, for messages and reports: "the input of head
     # (Linear), 192 numbers".
-    source: str
+    source_description: str
     # False if the features are the logits, since no last layer was found.
     penultimate: bool = True
 
@@ -69,7 +69,7 @@ class Features:
         images = check_images(images)
         batches = images.split(self.model.batch_limits[1])
         features: Tensor = join_outputs(
-            [self.read(self.model.prepare(b))[: len(b)].float() for b in batches]
+            [self.compute_batch(self.model.prepare(b))[: len(b)].float() for b in batches]
         )
         return features.to(images.device)
 

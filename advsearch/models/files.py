@@ -29,7 +29,7 @@ from advsearch.models.labels import parse_names
 from advsearch.models.source import Source, import_library, make_source
 from advsearch.trust import exported_programs
 from advsearch.trust.archives import (
-    LARGEST,
+    MAX_ARCHIVE_BYTES,
     Archive,
     make_archive_error,
     open_archive,
@@ -78,7 +78,7 @@ def load_file(path: Path) -> Source:
         ModelError: the program does not take one floating-point image.
     """
     try:
-        opened = open_regular(path, "a model file", LARGEST)
+        opened = open_regular(path, "a model file", MAX_ARCHIVE_BYTES)
     except FileNotFoundError:
         raise FileFormatError(
             f"model file {path}: no such file.{_make_missing_hint(path)}"

@@ -31,7 +31,7 @@ from advsearch.models.labels import (
     read_prompts,
 )
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read, RemoteNetwork
-from advsearch.models.probe import probe
+from advsearch.models.probe import probe_model
 from advsearch.models.source import (
     Purpose,
     Source,
@@ -41,9 +41,9 @@ from advsearch.models.source import (
 )
 from advsearch.registry import Registry, load_attribute
 from advsearch.trust.foreign_code import (
-    call_with_switches,
-    find_code_switches,
-    use_plain_switches,
+    use_torch_state_in_calls,
+    find_expected_torch_state,
+    use_default_torch_state,
 )
 
 DEFAULT_INPUT_SIZE = (224, 224)  # if neither the model nor the caller states one
@@ -67,7 +67,7 @@ FORMS = (
 )
 
 
-@use_plain_switches()
+@use_default_torch_state()
 def load_model(
     spec: str | os.PathLike[str] | nn.Module | Model,
     *,
@@ -131,7 +131,7 @@ def load_model(
             (N, classes).
 
     Warns:
-        ModelWarning: see `advsearch.models.probe.probe`.
+        ModelWarning: see `advsearch.models.probe.probe_model`.
     """
     options = _drop_unset(
         input_size=input_size,
@@ -154,11 +154,11 @@ def load_model(
         )
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     source = _find_source(spec, _state_purpose(task, names, prompts, ask))
-    switches = find_code_switches()
+    switches = find_expected_torch_state()
     if prompts is not None:
         _check_reads_text(source, spec)
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
-        call_with_switches(source.module, switches)
+        use_torch_state_in_calls(source.module, switches)
     if task:
         source = replace(source, module=task.wrap_network(source.module))
     if isinstance(source, Model):
@@ -347,7 +347,7 @@ def _probe_source(
         read=read,
     )
     class_names = source.labels if names is None else names
-    return probe(model, class_names, origin)
+    return probe_model(model, class_names, origin)
 
 
 def _adapt_to_images_alone(
@@ -488,7 +488,7 @@ def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
         # A network of a library that is not imported cannot exist.
         if library in sys.modules:
             recognize: Callable[[nn.Module, Purpose], Source | None] = load_attribute(
-                recognizer.target
+                recognizer.import_path
             )
             source = recognize(network, purpose)
             if source is not None:

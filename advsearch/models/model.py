@@ -32,7 +32,7 @@ class _Recomputed(torch.autograd.Function):
     """Compute a function of images without storing activations.
 
     For the gradient, the function is computed again. `torch.utils.checkpoint` does the
-    same, but not under `autograd.grad`, and not with `mend_batch_norms`.
+    same, but not under `autograd.grad`, and not with `correct_batch_norm_gradients`.
     """
 
     @staticmethod
@@ -494,7 +494,7 @@ class Model:
             The output as `Model` returns it; with `raw`, the network's own return
             value.
         """
-        INTERRUPTS.look()  # ends here after Ctrl-C
+        INTERRUPTS.raise_pending()  # ends here after Ctrl-C
         # In an `attached` model, gradients also go through what its network detaches.
         ignores_detach = self.attached and torch.is_grad_enabled()
         mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
@@ -639,7 +639,7 @@ def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
             f"images, got {len(output)}"
         )
     # torch computes some gradients of batch norms wrongly; hooks correct them.
-    mend_batch_norms(output)
+    correct_batch_norm_gradients(output)
     return output
 
 
@@ -731,7 +731,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
         and output.shape == (count, classes)
     ):
         if output.requires_grad:
-            mend_batch_norms(output)
+            correct_batch_norm_gradients(output)
         return output.float()
     tensor = _find_logits(output)
     expected = (
@@ -752,7 +752,7 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
             f"{expected} and floating type, got {tensor.dtype}; return "
             "scores, not the predicted class"
         )
-    mend_batch_norms(tensor)
+    correct_batch_norm_gradients(tensor)
     return tensor.float()
 
 
@@ -782,7 +782,7 @@ def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> N
         )
 
 
-def mend_batch_norms(output: Any) -> None:
+def correct_batch_norm_gradients(output: Any) -> None:
     """Add hooks to the graph of an output that prevent wrong gradients of batch norms.
 
     On the CPU, batch norms of torch 2.13 read the gradient of a single image in a wrong

@@ -29,7 +29,7 @@ from advsearch.models.model import (
     read_output,
     warn,
 )
-from advsearch.trust.foreign_code import TimedOut, get_first_line, run_within_limits
+from advsearch.trust.foreign_code import ForeignCodeTimeoutError, get_first_line, run_within_limits
 from advsearch.trust.stored_files import FACTOR, scale_limit
 
 # Non-negative rows that sum to 1 within this tolerance are probabilities.
@@ -83,7 +83,7 @@ MIN_CHANGE = 1e-5
 MAX_PIXELS = 1 << 26
 
 
-def probe(
+def probe_model(
     model: Model, labels: tuple[str, ...] | None, labels_origin: LabelsOrigin
 ) -> Model:
     """Run a model on test images, and set the fields of the model that follow from it.
@@ -112,8 +112,8 @@ def probe(
     gray = torch.full((1, height, width, 3), 0.5)
     noise = torch.rand(gray.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        rows = torch.cat([_run(model, gray), _run(model, noise)])
-        repeated_rows = _run(model, gray)
+        rows = torch.cat([_compute_output_rows(model, gray), _compute_output_rows(model, noise)])
+        repeated_rows = _compute_output_rows(model, gray)
     _check_finite(model, rows)
     returns_logits = model.read is None
     if returns_logits:
@@ -216,7 +216,7 @@ def _warn_of_odd_scores(model: Model, rows: Tensor) -> None:
         )
 
 
-def _run(model: Model, images: Tensor) -> Tensor:
+def _compute_output_rows(model: Model, images: Tensor) -> Tensor:
     """Run a network on images (N, H, W, 3), and return a row of numbers for each image.
 
     The rows are for comparisons. For a classifier they are its raw scores (N, classes),
@@ -289,7 +289,7 @@ def _call_guarded(model: Model, call: Callable[[], Any]) -> Any:
         if stop or isinstance(network, PROGRAMS):
             return run_within_limits(call, stop)
         return call()
-    except TimedOut as error:
+    except ForeignCodeTimeoutError as error:
         raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything
         reason, advice = _explain_failed_call(model, network, error)
@@ -455,9 +455,9 @@ def _run_on_extreme_images(model: Model) -> Tensor:
     far_colors = torch.linspace(0.0, FAR_COLOR, 3 * height * width).reshape(
         height, width, 3
     )
-    rows = _run(model, torch.zeros_like(far_colors)[None])
+    rows = _compute_output_rows(model, torch.zeros_like(far_colors)[None])
     with suppress(ModelError):  # the network may reject such colors
-        far_rows = _run(model, torch.stack([far_colors, -far_colors]))
+        far_rows = _compute_output_rows(model, torch.stack([far_colors, -far_colors]))
         rows = torch.cat([rows, far_rows])
     return rows
 
@@ -600,7 +600,7 @@ def _find_batch_limits(
         return min_batch, max_batch
     try:
         with torch.no_grad():
-            batch_rows = _run(model, pair)
+            batch_rows = _compute_output_rows(model, pair)
     except ModelError:  # it takes only one image at a time
         return 1, 1
     if rows is not None and not _are_equal(model, rows, batch_rows):
@@ -666,7 +666,7 @@ class _FirstGradient(NamedTuple):
     """The gradient of a network whose calls of `detach` are not ignored.
 
     Attributes:
-        rows: rows that `_run` returned for the images.
+        rows: rows that `_compute_output_rows` returned for the images.
         gradient: gradient with respect to the images (N, H, W, 3).
         has_detached: whether the network detaches tensors with a gradient.
         reason: why there is no gradient; None if there is one, or if it is not known.
@@ -696,7 +696,7 @@ def _compute_first_gradient(
             if not (repeatable and detaching.has_detached):
                 raise
             with torch.no_grad():
-                rows = _run(model, images)
+                rows = _compute_output_rows(model, images)
             reason = get_first_line(error)
             no_gradient = torch.zeros_like(images)
             return _FirstGradient(rows, no_gradient, has_detached=True, reason=reason)
@@ -752,7 +752,7 @@ def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
     """
     leaf = images.clone().requires_grad_()  # autograd differentiates with respect to it
     with torch.enable_grad():
-        rows = _run(model, leaf)
+        rows = _compute_output_rows(model, leaf)
         if _has_no_output(model, rows):
             return rows, torch.zeros_like(images)
         return rows, torch.autograd.grad(_compute_checked_value(rows), leaf)[0]
@@ -763,7 +763,7 @@ def _has_no_output(model: Model, rows: Tensor) -> bool:
 
     Args:
         model: model that is probed.
-        rows: rows that `_run` returned.
+        rows: rows that `_compute_output_rows` returned.
     """
     if model.read is None:  # logits are never empty
         return False
@@ -772,7 +772,7 @@ def _has_no_output(model: Model, rows: Tensor) -> bool:
 
 
 def _compute_checked_value(rows: Tensor) -> Tensor:
-    """Return one number from the rows (N, n) of `_run`, whose gradient is checked.
+    """Return one number from the rows (N, n) of `_compute_output_rows`, whose gradient is checked.
 
     It is a sum with weights from -1 to 1. A plain sum of probabilities would always be
     1.
@@ -814,8 +814,8 @@ def _measure_change(
     """
     end = (images + step).clamp(0.0, 1.0)
     start = (images - step).clamp(0.0, 1.0)
-    end_rows = _run(model, end)
-    start_rows = _run(model, start)
+    end_rows = _compute_output_rows(model, end)
+    start_rows = _compute_output_rows(model, start)
     return _Change(
         actual=float(_compute_checked_value(end_rows - start_rows)),
         predicted=[float(((end - start) * gradient).sum()) for gradient in gradients],

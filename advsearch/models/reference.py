@@ -23,7 +23,7 @@ from torch.nn.utils import fuse_conv_bn_eval
 from advsearch.errors import ModelError
 from advsearch.models.labels import LabelsOrigin
 from advsearch.models.model import Model, Preprocessing
-from advsearch.models.probe import probe
+from advsearch.models.probe import probe_model
 from advsearch.models.source import freeze_network, load_weights
 
 INPUT_SIZE = (128, 128)
@@ -191,12 +191,12 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
     model = Model(
         freeze_network(fold_batch_norms(net), name),
         name,
-        labels=(),  # set by `probe`
+        labels=(),  # set by `probe_model`
         preprocessing=Preprocessing(INPUT_SIZE),
         # The folded network has no batch norms. For training it is loaded once more.
         make_trainable=lambda: load_network(folder, weights)[0],
     )
-    return probe(model, labels, LabelsOrigin("labels of the reference model"))
+    return probe_model(model, labels, LabelsOrigin("labels of the reference model"))
 
 
 def load_network(

@@ -44,7 +44,7 @@ from advsearch.models.model import (
     copy_sharing_weights,
     warn,
 )
-from advsearch.trust.archives import LARGEST
+from advsearch.trust.archives import MAX_ARCHIVE_BYTES
 from advsearch.trust.code import check_import, current_directory_importable
 from advsearch.trust.foreign_code import get_first_line
 from advsearch.trust.stored_files import open_regular
@@ -300,7 +300,7 @@ def _read_weights(path: Path, name: str) -> dict[str, Tensor]:
     """
     try:
         # Opened only to check that it is a regular file of limited size.
-        open_regular(path, "weights", LARGEST).close()
+        open_regular(path, "weights", MAX_ARCHIVE_BYTES).close()
         return load_file(path)
     except FileNotFoundError:
         raise FileFormatError(f"weights {path} of model {name}: no such file") from None

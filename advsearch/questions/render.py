@@ -34,7 +34,7 @@ def make_view(result: RenderResult) -> ShownResult:
         )
         # The first column has the names of the things, and no head.
         heads = ("", *VISIBLE_HEADS)
-        sections.append(ResultPart("In the picture", heads=heads, rows=things))
+        sections.append(ResultPart("In the picture", column_heads=heads, rows=things))
     return ShownResult(headline, sections)
 
 
@@ -46,7 +46,7 @@ def _make_table_of_views(result: RenderResult) -> ResultPart:
             format_image_prediction(result.task, answer) for answer in view.answers
         ]
         rows.append([f"{view.azimuth:g}", "; ".join(predictions)])
-    return ResultPart(heads=("azimuth", f"model {result.model} sees"), rows=rows)
+    return ResultPart(column_heads=("azimuth", f"model {result.model} sees"), rows=rows)
 
 
 @experiment(

@@ -63,31 +63,31 @@ class Piece:
     Attributes:
         name: name that is printed next to it.
         picture: (h, w, 3) uint8 sRGB, with the bleed.
-        pixel: (width, height) of a pixel in millimetres.
+        pixel_size_mm: (width, height) of a pixel in millimetres.
         bleed: (columns, rows) of pixels beyond the line to cut, on each side.
-        inside: (h, w) bool, the part to cut out; None for the rectangle within the
+        cut_mask: (h, w) bool, the part to cut out; None for the rectangle within the
             bleed.
     """
 
     name: str
     picture: Bytes
-    pixel: tuple[float, float]
+    pixel_size_mm: tuple[float, float]
     bleed: tuple[int, int] = (0, 0)
-    inside: Mask | None = None
+    cut_mask: Mask | None = None
 
     @property
     def size(self) -> tuple[float, float]:
         height, width = self.picture.shape[:2]
-        return (width - 2 * self.bleed[0]) * self.pixel[0], (
+        return (width - 2 * self.bleed[0]) * self.pixel_size_mm[0], (
             height - 2 * self.bleed[1]
-        ) * self.pixel[1]
+        ) * self.pixel_size_mm[1]
 
     @property
-    def frame(self) -> tuple[float, float]:
+    def frame_size_mm(self) -> tuple[float, float]:
         """Width of bleed and marks on each side, in millimetres: (x, y)."""
-        return self.bleed[0] * self.pixel[0] + MARK_GAP + MARK_LENGTH, self.bleed[
+        return self.bleed[0] * self.pixel_size_mm[0] + MARK_GAP + MARK_LENGTH, self.bleed[
             1
-        ] * self.pixel[1] + MARK_GAP + MARK_LENGTH
+        ] * self.pixel_size_mm[1] + MARK_GAP + MARK_LENGTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ class PlacedPart:
     Attributes:
         piece: the piece.
         name: name that is printed next to the part.
-        trim: columns and rows of the part in the picture of the piece: (x0, x1, y0,
+        pixel_bounds: columns and rows of the part in the picture of the piece: (x0, x1, y0,
             y1), of which x1 and y1 are excluded.
         x: position of its left edge on the page in millimetres.
         y: position of its upper edge.
@@ -105,16 +105,16 @@ class PlacedPart:
 
     piece: Piece
     name: str
-    trim: tuple[int, int, int, int]
+    pixel_bounds: tuple[int, int, int, int]
     x: float = 0.0
     y: float = 0.0
 
     @property
-    def extent(self) -> tuple[float, float]:
+    def outer_size_mm(self) -> tuple[float, float]:
         """Width and height with bleed and marks, in millimetres."""
-        (x0, x1, y0, y1) = self.trim
-        frame = self.piece.frame
-        pixel = self.piece.pixel
+        (x0, x1, y0, y1) = self.pixel_bounds
+        frame = self.piece.frame_size_mm
+        pixel = self.piece.pixel_size_mm
         return (x1 - x0) * pixel[0] + 2 * frame[0], (y1 - y0) * pixel[1] + 2 * frame[1]
 
 
@@ -232,7 +232,7 @@ def arrange_pages(
     width = paper[0] - 2 * MARGIN
     height = paper[1] - 2 * MARGIN - FOOT
     parts = [part for piece in pieces for part in _cut_piece(piece, width, height)]
-    parts.sort(key=lambda part: -part.extent[1])
+    parts.sort(key=lambda part: -part.outer_size_mm[1])
     page: list[PlacedPart] = []
     # (x, y): upper left corner of the next part, inside the margins; and the height of
     # the current row of parts
@@ -240,7 +240,7 @@ def arrange_pages(
     y = 0.0
     row_height = 0.0
     for part in parts:
-        part_width, part_height = part.extent
+        part_width, part_height = part.outer_size_mm
         if x + part_width > width and x > 0.0:  # the row is full
             x = 0.0
             y = y + row_height
@@ -252,7 +252,7 @@ def arrange_pages(
             y = 0.0
             row_height = 0.0
         # The position of a part is that of its corner inside of bleed and marks.
-        frame_width, frame_height = part.piece.frame
+        frame_width, frame_height = part.piece.frame_size_mm
         page.append(
             replace(part, x=MARGIN + x + frame_width, y=MARGIN + y + frame_height)
         )
@@ -280,9 +280,9 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
     # The first argument is a length in pixels without bleed. The second one is the page
     # in pixels, without the frame of a part, which is its bleed and its marks.
     columns = _cut_evenly(
-        n_columns - 2 * left, (width - 2 * piece.frame[0]) / piece.pixel[0]
+        n_columns - 2 * left, (width - 2 * piece.frame_size_mm[0]) / piece.pixel_size_mm[0]
     )
-    rows = _cut_evenly(n_rows - 2 * top, (height - 2 * piece.frame[1]) / piece.pixel[1])
+    rows = _cut_evenly(n_rows - 2 * top, (height - 2 * piece.frame_size_mm[1]) / piece.pixel_size_mm[1])
     n_parts = len(columns) * len(rows)
     if n_parts > MAX_SHEETS:
         raise InputError(
@@ -411,9 +411,9 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
         convert: converts colours from sRGB to those of the printer; None leaves them.
     """
     piece = part.piece
-    x0, x1, y0, y1 = part.trim
+    x0, x1, y0, y1 = part.pixel_bounds
     bleed_x, bleed_y = piece.bleed
-    pixel_width, pixel_height = piece.pixel
+    pixel_width, pixel_height = piece.pixel_size_mm
     # the part with the bleed around it
     picture = piece.picture[y0 - bleed_y : y1 + bleed_y, x0 - bleed_x : x1 + bleed_x]
     if convert is not None:
@@ -432,8 +432,8 @@ def _draw_part(axes: Axes, part: PlacedPart, convert: Any) -> None:
         aspect="auto",
     )
     _draw_cut_marks(axes, trim_x, trim_y, outer_x, outer_y)
-    if piece.inside is not None:
-        _draw_cut_line(axes, part, piece.inside[y0:y1, x0:x1])
+    if piece.cut_mask is not None:
+        _draw_cut_line(axes, part, piece.cut_mask[y0:y1, x0:x1])
     axes.text(part.x, outer_y[0] - MARK_GAP, part.name, fontsize=6, va="bottom")
 
 
@@ -480,7 +480,7 @@ def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:
             what is cut out.
     """
     n_rows, n_columns = inside.shape
-    pixel_width, pixel_height = part.piece.pixel
+    pixel_width, pixel_height = part.piece.pixel_size_mm
     # one pixel of outside around all, or the outline would stay open at the edges
     padded = np.pad(inside.astype(float), 1)
     # the centre of each pixel, in millimetres

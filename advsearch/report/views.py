@@ -100,7 +100,7 @@ class ResultPart:
     Attributes:
         title: title of the part.
         text: paragraphs.
-        heads: heads of the columns.
+        column_heads: heads of the columns.
         rows: rows of the table as texts, the first of which is the name of the row.
         note: explanation of the table, for a page.
         figure: file of a figure in the folder of the run, for a page.
@@ -111,7 +111,7 @@ class ResultPart:
         size: (width, height) in inches of the figure file of the chart; None to use the
             height of the chart.
         parts: for each row, the name of its run among the parts of the run.
-        shares: fractions in [0, 1], by row and column. The larger one is, the stronger
+        cell_fractions: fractions in [0, 1], by row and column. The larger one is, the stronger
             is the color of the cell.
         bars: for each row a bar on a page, as (begin, end, mark) in [0, 1]; None for no
             bar.
@@ -120,13 +120,13 @@ class ResultPart:
         live: name of the part for the script of the page that fills it. Without the
             script the part is hidden.
         folded: whether a page displays it only on request.
-        only: `page`, `text` or `notebook` if only this one displays the part; empty for
+        only_medium: `page`, `text` or `notebook` if only this one displays the part; empty for
             all three.
     """
 
     title: str = ""
     text: Sequence[str] = ()
-    heads: Sequence[str] = ()
+    column_heads: Sequence[str] = ()
     rows: Sequence[Sequence[str]] = ()
     note: str = ""
     figure: str = ""
@@ -135,12 +135,12 @@ class ResultPart:
     height: int = 300
     size: tuple[float, float] | None = None
     parts: Sequence[str | None] = ()
-    shares: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    cell_fractions: Mapping[tuple[int, int], float] = field(default_factory=dict)
     bars: Sequence[tuple[float, float, float] | None] = ()
     layout: str = ""
     live: str = ""
     folded: bool = False
-    only: str = ""
+    only_medium: str = ""
 
     @classmethod
     def make_table(
@@ -161,7 +161,7 @@ class ResultPart:
             ]
             for row in rows
         ]
-        return cls(heads=tuple(columns), rows=cells, **more)
+        return cls(column_heads=tuple(columns), rows=cells, **more)
 
     @property
     def is_empty(self) -> bool:
@@ -172,7 +172,7 @@ class ResultPart:
 
     def is_visible_in(self, medium: str) -> bool:
         """Return whether a `page`, `text` or `notebook` shows the part."""
-        return self.only in ("", medium) and not self.is_empty
+        return self.only_medium in ("", medium) and not self.is_empty
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ def get_view(result: Result) -> ShownResult:
     return view
 
 
-def takes_twins(command: str) -> bool:
+def has_twins_setting(command: str) -> bool:
     """Return whether a command has the setting `twins`."""
     declared = settings(registry.get_experiment(command).settings)
     return any(setting.field == "twins" for setting in declared)
@@ -232,7 +232,7 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
     twins = getattr(result, "twins", None)
     if twins is not None:
         remarks.append(wording.format_twin_evidence(twins))
-    elif takes_twins(result.command):
+    elif has_twins_setting(result.command):
         remarks.append(wording.NO_TWINS)
     return [*remarks, *view.cautions, *getattr(result, "warnings", ())]
 
@@ -284,7 +284,7 @@ def make_default_view(result: Result) -> ShownResult:
     Lists of rows become tables, and other fields become facts. A last table explains
     the names of both.
     """
-    values = {name: getattr(result, name) for name in type(result).described()}
+    values = {name: getattr(result, name) for name in type(result).get_described_fields()}
     tables = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, tables)
     # pairs of an object with fields, and the names of its fields that are on the page
@@ -295,9 +295,9 @@ def make_default_view(result: Result) -> ShownResult:
     for name, rows in tables.items():
         table = _make_table(name, rows)
         sections.append(table)
-        objects_with_words.append((rows[0], set(table.heads)))
+        objects_with_words.append((rows[0], set(table.column_heads)))
     sections.append(_explain_words(objects_with_words))
-    brief = result.brief or str(values.get("ending", "done"))
+    brief = result.outcome_summary or str(values.get("ending", "done"))
     statement = f"{brief[:1].upper()}{brief[1:]}."
     return ShownResult(statement, sections, facts)
 
@@ -349,7 +349,7 @@ def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
     heads = list(map(_format_name, columns))
     return ResultPart(
         _format_name(name),
-        heads=heads,
+        column_heads=heads,
         rows=cells,
         folded=len(rows) > MAX_UNFOLDED_ROWS,
     )
@@ -368,12 +368,12 @@ def _explain_words(
     """
     meanings = dict[str, str]()
     for fields, words in objects_with_words:
-        for name, about in type(fields).described().items():
+        for name, about in type(fields).get_described_fields().items():
             word = _format_name(name)
             if about.description and word in words:
                 meanings.setdefault(word, about.description.replace("`", ""))
     rows = [[word, meaning] for word, meaning in meanings.items()]
-    return ResultPart("What these words mean", rows=rows, folded=True, only="page")
+    return ResultPart("What these words mean", rows=rows, folded=True, only_medium="page")
 
 
 def _format_value(value: object) -> str:
@@ -483,19 +483,19 @@ def make_case_claim(
     rate_text = wording.format_rate(rate)
     if ending == "found" and rate.successes:
         statement = f"{name}: an adversarial scene holds in {rate_text}."
-        return claim("found", statement, extent)
+        return make_claim("found", statement, extent)
     found_nothing = ending in FAILED_SEARCH_ENDINGS
     was_searched = spent is not None
     if not was_searched and (found_nothing or ending == "not verified"):
         # Nothing follows about other scenes, so only the rate of this one is claimed.
         statement = f"{name}: the adversarial scene is not confirmed, in {rate_text}."
-        return claim("measured", statement, extent)
+        return make_claim("measured", statement, extent)
     if found_nothing:
         statement = (
             f"{name}: no failure was found; the best configuration counts in "
             f"{rate_text}. Searched were {spent}. {NO_PROOF}"
         )
-        return claim("not found", statement, extent)
+        return make_claim("not found", statement, extent)
     return no_claim
 
 
@@ -513,7 +513,7 @@ def make_average_claim(case: AverageCase, name: str) -> Claim:
         f"{name}: the model is right in {format_extent(extent)} configurations drawn "
         "by chance from the whole space and budget."
     )
-    return claim("measured", statement, extent)
+    return make_claim("measured", statement, extent)
 
 
 def format_searches(renders: Mapping[str, int], policy: str, random: bool) -> str:
@@ -544,15 +544,15 @@ def make_rate_extent(what: str, rate: VerifiedRate | None) -> Extent | None:
     )
 
 
-def make_no_claim(why: str, more: str = "") -> Claim:
-    return claim(
+def make_no_claim(reason: str, more: str = "") -> Claim:
+    return make_claim(
         "nothing claimed",
-        f"{NOTHING_CLAIMED}: {why}.{' ' + more if more else ''}",
+        f"{NOTHING_CLAIMED}: {reason}.{' ' + more if more else ''}",
         None,
     )
 
 
-def claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
+def make_claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
     return Claim(kind=kind, statement=text, extent=extent)
 
 
@@ -692,8 +692,8 @@ def _make_section_html(part: ResultPart) -> Html:
     texts = part.text if part.draw is None else ()
     children = [make_element("p", text) for text in texts if text]
     if part.rows:
-        heads = make_element("tr", *(make_element("th", cell) for cell in part.heads))
-        head = make_element("thead", heads) if part.heads else None
+        heads = make_element("tr", *(make_element("th", cell) for cell in part.column_heads))
+        head = make_element("thead", heads) if part.column_heads else None
         rows = [
             make_element("tr", *(make_element("td", cell) for cell in row))
             for row in part.rows

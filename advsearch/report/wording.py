@@ -602,9 +602,9 @@ def format_seconds(seconds: Any) -> str:
     return f"{minutes // 60} h {minutes % 60} min"
 
 
-def format_count(number: Any, thing: str) -> str:
+def format_count(number: Any, noun: str) -> str:
     """Return ``1 step``, ``40 steps``."""
-    return f"{number or 0} {thing}{'' if number == 1 else 's'}"
+    return f"{number or 0} {noun}{'' if number == 1 else 's'}"
 
 
 def format_workers(shared: SharedWork | None) -> str:

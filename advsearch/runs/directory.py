@@ -205,7 +205,7 @@ class RunDirectory:
             RunExistsError: there is something already.
         """
         location, overwrite = config.run_location
-        first, *others = config.title_words
+        first, *others = config.run_name_words
         return cls.create(
             location,
             config=config,
@@ -452,7 +452,7 @@ class RunDirectory:
         return (
             not has_files
             and self.store.count_rows() == 0
-            and not self.store.has_answers
+            and not self.store.has_model_answers
         )
 
     def discard(self) -> None:

@@ -20,7 +20,7 @@ from advsearch.pictures import encode_levels
 from advsearch.trust.databases import (
     LARGEST,
     check_before_writing,
-    protect,
+    set_defensive_options,
     read_version,
 )
 from advsearch.trust.stored_files import open_regular
@@ -115,7 +115,7 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
             db.executescript(f"BEGIN; {SCHEMA} COMMIT;")
     with storage_errors(path):
         db = sqlite3.connect(path)
-        protect(db)
+        set_defensive_options(db)
     return db
 
 

@@ -196,7 +196,7 @@ def _make_listed_run(
         controls=tuple(map(str, controls)),
         rows=sum(kinds.values()),
         state=_find_state(result, running),
-        outcome=result.brief if result else "",
+        outcome=result.outcome_summary if result else "",
         kinds=kinds,
         started=bool(config),
         when=_find_start_time(path),

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
-from advsearch.interrupts import interruptible
+from advsearch.interrupts import reraise_lost_interrupt
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, Fields, Result
 from advsearch.runs.summary import NAME, read_stored_result
 
@@ -32,7 +32,7 @@ class Measurements:
     is resumed. Stored measurements are read back before.
 
     Attributes:
-        n_new: number of measurements that were made, and not read back.
+        n_new_measurements: number of measurements that were made, and not read back.
 
     Args:
         context: `experiment.RunContext` of the run that stores them.
@@ -44,9 +44,9 @@ class Measurements:
         self._context = context
         self._store = context.run.store
         self._end = math.inf if seconds is None else time.monotonic() + seconds
-        self.n_new = 0
+        self.n_new_measurements = 0
 
-    def get(self, key: str, measure: Callable[[], Any]) -> Any:
+    def get_or_measure(self, key: str, measure: Callable[[], Any]) -> Any:
         """Return the JSON value that is stored under a key, or measure and store it.
 
         Args:
@@ -57,19 +57,19 @@ class Measurements:
             OutOfTime: it would have to be measured, the time is up, and something was
                 measured since the run was started or resumed.
         """
-        stored = self.read(key)
+        stored = self.read_stored(key)
         if stored is None:
             # The first one is always made, or a run with too little time would make no
             # progress however often it is resumed.
-            if self.n_new and time.monotonic() >= self._end:
+            if self.n_new_measurements and time.monotonic() >= self._end:
                 raise OutOfTime
-            self.n_new += 1
+            self.n_new_measurements += 1
             # encoded and decoded, so that it is equal to what is read back later
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored
 
-    def get_row(
+    def get_or_measure_row(
         self, key: str, row_type: type[AnyFields], measure: Callable[[], AnyFields]
     ) -> AnyFields:
         """Return the fields that are stored under a key, or measure and store them.
@@ -82,9 +82,9 @@ class Measurements:
         Raises:
             OutOfTime: they would have to be measured, and the time is up.
         """
-        return row_type.from_values(self.get(key, lambda: measure().to_dict()))
+        return row_type.from_values(self.get_or_measure(key, lambda: measure().to_dict()))
 
-    def get_rows(
+    def get_or_measure_rows(
         self,
         key: str,
         row_type: type[AnyFields],
@@ -102,16 +102,16 @@ class Measurements:
         """
         return [
             row_type.from_values(row)
-            for row in self.get(key, lambda: [row.to_dict() for row in measure()])
+            for row in self.get_or_measure(key, lambda: [row.to_dict() for row in measure()])
         ]
 
     def put(self, key: str, value: Any) -> None:
         self._store.write_note(key, json.dumps(value))
 
-    def read(self, key: str) -> Any:
+    def read_stored(self, key: str) -> Any:
         return self._store.read_json_note(key)
 
-    def collect(
+    def make_result_of_rows(
         self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]
     ) -> AnyResult:
         """Collect rows until they end, and return their result.
@@ -132,10 +132,10 @@ class Measurements:
         # replaced when the rows end, or the time is up.
         context.ending = INTERRUPTED
         try:
-            with interruptible():
+            with reraise_lost_interrupt():
                 for row in rows:
                     collected_rows.append(row)
-                    if self.n_new:  # otherwise the row was read back
+                    if self.n_new_measurements:  # otherwise the row was read back
                         context.run.write_summary(make_result(collected_rows))
                 context.ending = "done"
         except KeyboardInterrupt:
@@ -145,7 +145,7 @@ class Measurements:
         result = make_result(collected_rows)
         # Stored rows come first. If the user interrupted before any new row, some
         # stored rows may not have been read, and the earlier result may have more rows.
-        may_lack_stored_rows = context.ending == INTERRUPTED and not self.n_new
+        may_lack_stored_rows = context.ending == INTERRUPTED and not self.n_new_measurements
         if may_lack_stored_rows and (context.run.path / NAME).is_file():
             earlier = read_stored_result(context.run.path)
             return earlier if isinstance(earlier, type(result)) else result

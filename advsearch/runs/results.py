@@ -61,7 +61,7 @@ def key_validator(*names: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-def as_fact(form: str = "{}") -> dict[str, JsonValue]:
+def make_fact_schema(form: str = "{}") -> dict[str, JsonValue]:
     """Return the `json_schema_extra` of a field that terminal, page and notebook
     display with its name.
 
@@ -105,7 +105,7 @@ class Fields(BaseModel):
         return cls.model_validate(source)
 
     @classmethod
-    def described(cls) -> dict[str, FieldInfo | ComputedFieldInfo]:
+    def get_described_fields(cls) -> dict[str, FieldInfo | ComputedFieldInfo]:
         """Return the fields by name, and after them those that are computed from others
         (`computed_field`).
         """
@@ -128,13 +128,13 @@ class Result(Fields):
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
 
     def facts(self) -> dict[str, str]:
-        """Return the fields that are declared with `as_fact`, as texts by their names.
+        """Return the fields that are declared with `make_fact_schema`, as texts by their names.
 
         Terminal, report and notebook show them. Fields that are None or NaN are left
         out.
         """
         facts = {}
-        for name, field in self.described().items():
+        for name, field in self.get_described_fields().items():
             extra = field.json_schema_extra
             value = getattr(self, name)
             if (
@@ -155,7 +155,7 @@ class Result(Fields):
         return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME, RUNNING)
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """The result in a few words; empty if the class has no such text."""
         return ""
 
@@ -842,7 +842,7 @@ class SharedWork(Fields):
     )
 
     @classmethod
-    def of_facts(
+    def from_worker_stats(
         cls, facts: Any, machines: Mapping[str, Mapping[str, str]]
     ) -> SharedWork | None:
         """Return how workers shared a run; None where there were none.
@@ -862,7 +862,7 @@ class SharedWork(Fields):
         )
 
 
-def kind_of(values: JsonObject) -> type[Result] | None:
+def find_result_type(values: JsonObject) -> type[Result] | None:
     """Return the class of the result in a `summary.json`.
 
     An experiment may have several kinds of results besides the main one. Each of these

@@ -376,7 +376,7 @@ class Store:
             ) from None
 
     @property
-    def has_answers(self) -> bool:
+    def has_model_answers(self) -> bool:
         """Whether a model behind an address has answered, which took time and money."""
         return any(self._select("key FROM meta WHERE key LIKE ? LIMIT 1", "answer %"))
 

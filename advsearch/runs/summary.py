@@ -27,7 +27,7 @@ from pydantic import ValidationError
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import FileFormatError
 from advsearch.files import split_paths
-from advsearch.runs.results import RUNNING, SCHEMA, Result, kind_of
+from advsearch.runs.results import RUNNING, SCHEMA, Result, find_result_type
 from advsearch.settings.configuration import FILES
 from advsearch.trust.stored_files import (
     list_opened_files,
@@ -95,7 +95,7 @@ def read_stored_result(folder: Path) -> Result:
             f"schema {str(values['schema'])[:40]} of another version (this one writes "
             f"{SCHEMA}); run it again",
         )
-    result_type = kind_of(values)  # the class of the experiment's result
+    result_type = find_result_type(values)  # the class of the experiment's result
     if result_type is None:
         raise make_summary_error(
             path, f"one of the command {str(values.get('command'))[:40]!r}"

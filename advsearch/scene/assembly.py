@@ -183,7 +183,7 @@ def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
 HIDDEN_OFFSET = 1000.0
 
 
-class Assembly:
+class InputAssembler:
     """Turn the inputs of a space into those of `MitsubaScene`, for a scene's parts.
 
     Args:
@@ -432,7 +432,7 @@ class Motion:
         self,
         description: SceneDescription,
         resolution: tuple[int, int],
-        assembly: Assembly,
+        assembly: InputAssembler,
     ) -> None:
         """Choose the points whose motion in the image is followed.
 

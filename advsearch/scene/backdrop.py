@@ -57,7 +57,7 @@ from advsearch.scene.camera_model import (
 from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
 from advsearch.scene.depth_pictures import check_no_depth, is_depth, read_depth
 from advsearch.scene.formation import Surfaces
-from advsearch.scene.geometry import camera_to_world, object_to_world, project_points
+from advsearch.scene.geometry import camera_to_world, compute_object_to_world, project_points
 from advsearch.scene.image_quality import measure_blur
 from advsearch.scene.scene_data import AnyScene, SceneData
 from advsearch.trust.stored_files import (
@@ -260,7 +260,7 @@ def make_image_inputs(
     return {name: value for name, value in inputs.items() if value is not None}
 
 
-def compose(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> Tensor:
+def compose_over_photograph(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> Tensor:
     """Lay rendered radiance over a photograph.
 
     The photograph is visible where the object does not cover the pixel, and where
@@ -336,7 +336,7 @@ def compute_front(
     """
     is_hidden = photograph_depth < surfaces.z_depth * (1.0 - DEPTH_TOLERANCE)
     is_ground = torch.zeros_like(is_hidden)
-    if GROUND in surfaces.names:
+    if GROUND in surfaces.shape_names:
         is_ground = surfaces.visible_mask(GROUND)
     is_object = surfaces.z_depth.isfinite() & ~is_ground
     is_covered = torch.stack([is_object, is_ground])  # (2, H n, W n)
@@ -530,7 +530,7 @@ def _sample_ring(description: SceneData) -> Float64Array:
     rng = np.random.default_rng(0)
     angle = rng.uniform(0.0, 2.0 * math.pi, N_CONTACT_POINTS)
     radius = rng.uniform(*CONTACT_RING, N_CONTACT_POINTS)
-    center = object_to_world(description)[:2, 3]
+    center = compute_object_to_world(description)[:2, 3]
     x = center[0] + radius * np.cos(angle)
     y = center[1] + radius * np.sin(angle)
     level = np.full(N_CONTACT_POINTS, description.get_number("ground.level"))
@@ -680,7 +680,7 @@ def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraMod
         )
     left, top, width, height = photograph.crop
     full_height, full_width = photograph.full_size
-    values = model.values  # a new dictionary
+    values = model.intrinsic_by_name  # a new dictionary
     values["fx"] *= full_width / width
     values["skew"] *= full_width / width
     values["cx"] = (values["cx"] * full_width - left) / width
@@ -688,7 +688,7 @@ def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraMod
     values["cy"] = (values["cy"] * full_height - top) / height
     numbers = tuple(values[name] for name in NUMBER_NAMES)
     # Without a size: the model's own is that of the full photograph.
-    return replace(model, numbers=numbers, size=None)
+    return replace(model, intrinsics=numbers, calibrated_shape=None)
 
 
 def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> None:
@@ -759,10 +759,10 @@ def _check_camera_shape(photograph: BackdropPhotograph, model: CameraModel) -> N
     Raises InputError: their ratios of width and height differ by more than
     `SHAPE_TOLERANCE`. A camera without a size fits any photograph.
     """
-    if model.size is None:
+    if model.calibrated_shape is None:
         return
     height, width = photograph.full_size
-    camera_height, camera_width = model.size
+    camera_height, camera_width = model.calibrated_shape
     stretch = camera_width * height / (camera_height * width)
     if abs(stretch - 1.0) > SHAPE_TOLERANCE:
         raise InputError(

@@ -55,7 +55,7 @@ def normalize_key(name: str) -> str:
     return re.sub(r"[-_\s.]", "", name).lower()
 
 
-class Entries:
+class CameraEntries:
     """The entries of a camera file, with a record of which have been read.
 
         entries.get("cameramatrix", "k")   # the first that has a value, or None
@@ -166,7 +166,7 @@ class Entries:
             value = self._keys.peek(name)
             if not self._is_image_changing_entry(name, value):
                 unread.append(prefix + spelling)
-            elif not is_neutral(value):
+            elif not has_no_effect(value):
                 raise FileFormatError(
                     f"{self.path}: expected no {format_name(prefix + spelling)}, got "
                     f"{format_name(str(value))}: it changes the picture and is not "
@@ -226,7 +226,7 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
     return cameras[camera_name or names[0]]
 
 
-def is_neutral(value: object) -> bool:
+def has_no_effect(value: object) -> bool:
     """Return whether an entry changes nothing: it is missing, 0, "", false or "none".
 
     A matrix, a list or a mapping is neutral if all of its values are.

@@ -28,9 +28,9 @@ from advsearch.scene.camera_dialects import (
     translate_entries,
 )
 from advsearch.scene.camera_entries import (
-    Entries,
+    CameraEntries,
     add_notes,
-    is_neutral,
+    has_no_effect,
     make_camera_model,
     normalize_key,
     parse_number,
@@ -209,7 +209,7 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
     # The translated entries are those of the selected camera alone.
     translated = translate_entries(path, camera_name, data)
     if translated is not None:
-        return _read_opencv(spec, Entries(path, translated))
+        return _read_opencv(spec, CameraEntries(path, translated))
     if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
         return _read_nerfstudio(spec, camera_name, data)
     cameras = {
@@ -221,8 +221,8 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
         other_entries = {
             name: entry for name, entry in data.items() if name not in cameras
         }
-        camera = Entries(path, select_camera(path, camera_name, cameras))
-        unread_outside = Entries(path, other_entries).find_unread()
+        camera = CameraEntries(path, select_camera(path, camera_name, cameras))
+        unread_outside = CameraEntries(path, other_entries).find_unread()
         return _read_kalibr(spec, camera, unread_outside)
     if camera_name:
         raise FileFormatError(
@@ -230,8 +230,8 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
             f"one; leave #{camera_name} out"
         )
     if "intrinsics" in data and "camera_model" in data:
-        return _read_kalibr(spec, Entries(path, data))
-    return _read_opencv(spec, Entries(path, _flatten_groups(data)))
+        return _read_kalibr(spec, CameraEntries(path, data))
+    return _read_opencv(spec, CameraEntries(path, _flatten_groups(data)))
 
 
 def read_camera_entries(path: str) -> dict[str, Any]:
@@ -409,7 +409,7 @@ def _read_nerfstudio(
     frames = _list_frames(data)
     lens = _select_lens(path, camera_name, frames)
     scene_entries = {key: value for key, value in data.items() if key not in SCENE_KEYS}
-    entries = Entries(path, scene_entries | lens)
+    entries = CameraEntries(path, scene_entries | lens)
     width = entries.get_number("w")
     height = entries.get_number("h")
     kind = _read_projection(path, entries)
@@ -423,7 +423,7 @@ def _read_nerfstudio(
         numbers |= _read_optional_numbers(entries, ("k1", "k2", "k3", "p1", "p2"))
     model = make_camera_model(spec, kind, (height, width), numbers)
     unread = entries.find_unread()
-    frame_entries = Entries(path, _select_other_entries(frames))
+    frame_entries = CameraEntries(path, _select_other_entries(frames))
     return add_notes(model, [*unread, *frame_entries.find_unread("frames.")])
 
 
@@ -448,7 +448,7 @@ def _select_other_entries(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     return other_entries
 
 
-def _read_projection(path: str, entries: Entries) -> str:
+def _read_projection(path: str, entries: CameraEntries) -> str:
     """Return the kind of a camera model by nerfstudio's entries.
 
     Raises:
@@ -467,7 +467,7 @@ def _read_projection(path: str, entries: Entries) -> str:
 
 
 def _read_focal_lengths(
-    path: str, data: Mapping[str, Any], entries: Entries, width: float, height: float
+    path: str, data: Mapping[str, Any], entries: CameraEntries, width: float, height: float
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
@@ -540,7 +540,7 @@ def _compute_focal_length(path: str, angle: object, side: float) -> float | None
 
 
 def _read_kalibr(
-    spec: str, entries: Entries, unread: Sequence[str] = ()
+    spec: str, entries: CameraEntries, unread: Sequence[str] = ()
 ) -> CameraModel:
     """Return the model of a camera of Kalibr.
 
@@ -576,7 +576,7 @@ def _read_kalibr(
     return add_notes(camera, [*unread, *entries.find_unread()])
 
 
-def _read_opencv(spec: str, entries: Entries) -> CameraModel:
+def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
     """Return the model of a camera of OpenCV or ROS.
 
     The calibration is of the sensor's pixels. ROS may bin several of them into one
@@ -604,12 +604,12 @@ def _read_opencv(spec: str, entries: Entries) -> CameraModel:
     used_size = (height - height % y_binning, width - width % x_binning)
     model = make_camera_model(spec, kind, used_size, numbers, FIRST_PIXEL_CENTER)
     binned_size = (int(height // y_binning), int(width // x_binning))
-    model = replace(model, size=binned_size)
+    model = replace(model, calibrated_shape=binned_size)
     rectified_keys = _find_rectified(entries, matrix)
     return add_notes(model, unread_roi_keys + entries.find_unread(), rectified_keys)
 
 
-def _find_opencv_kind(path: str, entries: Entries) -> str:
+def _find_opencv_kind(path: str, entries: CameraEntries) -> str:
     """Return the kind of model that a camera of OpenCV or ROS states.
 
     Without an entry that states it, it is Brown's and Conrady's. The flag
@@ -621,7 +621,7 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
     keys = ("distortionmodel", "cameramodel", "modeltype")
     models = [entries.get(key) for key in keys]
     kinds = {_find_kind(path, model) for model in models if model is not None}
-    is_fisheye = not is_neutral(entries.get("fisheyemodel"))
+    is_fisheye = not has_no_effect(entries.get("fisheyemodel"))
     if len(kinds) > 1:
         raise FileFormatError(
             f"{path}: expected one model, got a camera_model that contradicts the "
@@ -630,7 +630,7 @@ def _find_opencv_kind(path: str, entries: Entries) -> str:
     return FISHEYE if is_fisheye else next(iter(kinds), BROWN_CONRADY)
 
 
-def _read_camera_matrix(path: str, entries: Entries) -> list[float]:
+def _read_camera_matrix(path: str, entries: CameraEntries) -> list[float]:
     """Return the camera matrix, nine numbers row by row.
 
     If the file has only fx, fy, cx and cy, the matrix is made of them. Some tools write
@@ -672,7 +672,7 @@ def _name_matrix_entries(matrix: Sequence[float]) -> dict[str, float]:
 
 
 def _read_distortion(
-    entries: Entries, names: Sequence[str], counts: Sequence[int]
+    entries: CameraEntries, names: Sequence[str], counts: Sequence[int]
 ) -> dict[str, float]:
     """Return the distortion coefficients, from a list or from single entries.
 
@@ -688,7 +688,7 @@ def _read_distortion(
     distortion = entries.get(*DISTORTION_KEYS)
     # A list of zeros leaves the coefficients to single entries; a matrix (a mapping)
     # does not.
-    has_list = isinstance(distortion, Mapping) or not is_neutral(distortion)
+    has_list = isinstance(distortion, Mapping) or not has_no_effect(distortion)
     if not has_list:
         coefficients = _read_optional_numbers(entries, names)
     else:
@@ -705,7 +705,7 @@ def _read_distortion(
     return coefficients
 
 
-def _read_opencv_distortion(entries: Entries, kind: str) -> dict[str, float]:
+def _read_opencv_distortion(entries: CameraEntries, kind: str) -> dict[str, float]:
     """Return the distortion coefficients of a camera of OpenCV or ROS, by name.
 
     Raises FileFormatError: the sensor is tilted, which `CameraModel` cannot express.
@@ -725,12 +725,12 @@ def _read_opencv_distortion(entries: Entries, kind: str) -> dict[str, float]:
     return coefficients
 
 
-def _read_optional_numbers(entries: Entries, names: Sequence[str]) -> dict[str, float]:
+def _read_optional_numbers(entries: CameraEntries, names: Sequence[str]) -> dict[str, float]:
     """Return entries that are numbers, by name; 0 for those that are missing."""
     return {name: entries.get_number(name, 0.0) for name in names}
 
 
-def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
+def _find_rectified(entries: CameraEntries, matrix: Sequence[float]) -> list[str]:
     """Return the names of matrices of rectified images that differ from the camera's.
 
     A rectification matrix changes nothing if it is the identity. A projection changes
@@ -747,7 +747,7 @@ def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
         ("projection_matrix", "p", [fx, skew, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]),
     ):
         value = entries.get(normalize_key(name), short_name)  # either of its names
-        if is_neutral(value):  # missing, or all zeros
+        if has_no_effect(value):  # missing, or all zeros
             continue
         numbers = entries.parse_numbers(name, value, (len(expected),))
         if any(
@@ -758,7 +758,7 @@ def _find_rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
     return differing_names
 
 
-def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
+def _check_roi(entries: CameraEntries, size: tuple[float, float]) -> list[str]:
     """Check that a region of interest of ROS is the full image.
 
     ROS writes zeros for the full image.
@@ -776,7 +776,7 @@ def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
     value = entries.get("roi")
     if not isinstance(value, Mapping):
         value = {}
-    roi = Entries(entries.path, {str(key): value[key] for key in value})
+    roi = CameraEntries(entries.path, {str(key): value[key] for key in value})
     numbers = _read_optional_numbers(roi, ("x_offset", "y_offset", "height", "width"))
     roi.get("dorectify")  # marks it as read: it changes nothing in a full image
     offset = (numbers["x_offset"], numbers["y_offset"])
@@ -805,7 +805,7 @@ def _find_kind(path: str, model: object) -> str:
     return KIND_OF_DISTORTION[name]
 
 
-def _read_size(entries: Entries) -> tuple[float, float]:
+def _read_size(entries: CameraEntries) -> tuple[float, float]:
     """Return the height and width of the image in pixels."""
     size = entries.get(*SIZE_KEYS)
     if size is not None:
@@ -815,7 +815,7 @@ def _read_size(entries: Entries) -> tuple[float, float]:
     return entries.get_number("image_height", aliases=HEIGHT_KEYS), width
 
 
-def _read_binning(entries: Entries) -> tuple[float, float]:
+def _read_binning(entries: CameraEntries) -> tuple[float, float]:
     """Return how many of the sensor's pixels ROS bins into one, along y and x."""
     # ROS writes 0 for no binning, as for 1.
     y_binning = entries.get_number("binning_y", 1.0) or 1.0

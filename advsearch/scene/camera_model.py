@@ -70,23 +70,23 @@ class CameraModel:
     kind: str  # `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`
     # (17,) in the order of `NUMBER_NAMES`: fx, cx and skew in image widths, fy and cy
     # in image heights, the coefficients.
-    numbers: tuple[float, ...]
+    intrinsics: tuple[float, ...]
     # The file or the bundled model that the user named; "" if the camera is a pinhole
     # whose focal length `camera.fov` sets.
     name: str = ""
     # (height, width) in pixels for which it was calibrated; None for any size.
-    size: tuple[int, int] | None = None
-    max_angle: float = 180.0  # largest visible angle to the optical axis, degrees
+    calibrated_shape: tuple[int, int] | None = None
+    max_angle_degrees: float = 180.0  # largest visible angle to the optical axis, degrees
     reading_notes: tuple[str, ...] = ()  # sentences about entries that were not read
 
     @property
-    def values(self) -> dict[str, float]:
+    def intrinsic_by_name(self) -> dict[str, float]:
         """The numbers by name: `LINEAR_PARAMETERS` and `COEFFICIENTS`."""
-        return dict(zip(NUMBER_NAMES, self.numbers, strict=True))
+        return dict(zip(NUMBER_NAMES, self.intrinsics, strict=True))
 
-    def with_numbers(self, numbers: Tensor) -> CameraModel:
+    def with_intrinsics(self, numbers: Tensor) -> CameraModel:
         """Return the model with other numbers (17,), in the order of `NUMBER_NAMES`."""
-        return replace(self, numbers=tuple(numbers.double().tolist()))
+        return replace(self, intrinsics=tuple(numbers.double().tolist()))
 
     def check_no_fov(self, setting_names: Iterable[str]) -> None:
         """Raise InputError if settings of a scene contain a field of view.
@@ -117,7 +117,7 @@ class CameraModel:
             distorted, is_visible = self._project_fisheye(x, y, z)
         else:
             distorted, is_visible = self._project_perspective(x, y, z)
-        (fx, fy, cx, cy, skew) = self.numbers[: len(LINEAR_PARAMETERS)]
+        (fx, fy, cx, cy, skew) = self.intrinsics[: len(LINEAR_PARAMETERS)]
         (x, y) = distorted.unbind(dim=-1)
         column = fx * x + skew * y + cx
         row = fy * y + cy
@@ -179,7 +179,7 @@ class CameraModel:
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
         # The limit is the fold, not the visible angle: points just outside the view
         # get a solution as well, and the margin passes through 0 at its edge.
-        max_solved_angle = min(self.fold_angle, math.pi)
+        max_solved_angle = min(self.fold_angle_radians, math.pi)
         angle, converged = self._invert_radial(radius, max_solved_angle)
         directions = torch.cat(
             [radial_direction * angle.sin()[..., None], angle.cos()[..., None]], dim=-1
@@ -206,7 +206,7 @@ class CameraModel:
         undistorted_radius, converged = self._invert_radial(radius, max_visible)
         undistorted = radial_direction * undistorted_radius[..., None]
         # p1 and the numbers after it do not depend on the radius alone
-        has_decentering = any(self.numbers[NUMBER_NAMES.index("p1") :])
+        has_decentering = any(self.intrinsics[NUMBER_NAMES.index("p1") :])
         if has_decentering:
             undistorted, converged = self._invert_distortion(
                 undistorted, distorted, max_visible
@@ -230,7 +230,7 @@ class CameraModel:
         """Return distorted points (N, 2) at image coordinates (N,): invert
         `LINEAR_PARAMETERS`.
         """
-        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR_PARAMETERS)]
+        fx, fy, cx, cy, skew = self.intrinsics[: len(LINEAR_PARAMETERS)]
         y = (v - cy) / fy
         return torch.stack([(u - cx - skew * y) / fx, y], dim=-1)
 
@@ -348,13 +348,13 @@ class CameraModel:
     @cached_property
     def _polynomials(self) -> tuple[Polynomial, Polynomial]:
         """Numerator and denominator of radial(r) / r, as polynomials in r^2."""
-        k = self.numbers[len(LINEAR_PARAMETERS) :]
+        k = self.intrinsics[len(LINEAR_PARAMETERS) :]
         if self.kind == FISHEYE:
             return Polynomial([1.0, *k[:4]]), Polynomial([1.0])
         return Polynomial([1.0, *k[:3]]).trim(), Polynomial([1.0, *k[3:6]]).trim()
 
     @cached_property
-    def fold_angle(self) -> float:
+    def fold_angle_radians(self) -> float:
         """Angle to the axis, radians, at which the radial distortion turns back.
 
         Beyond it the image point moves back towards the center, so that two directions
@@ -380,10 +380,10 @@ class CameraModel:
     def _max_visible(self) -> float:
         """The largest visible angle of a fisheye, or tangent of another lens."""
         if self.kind == FISHEYE:
-            return min(self.fold_angle, math.radians(self.max_angle), math.pi)
-        if self.fold_angle < math.pi / 2.0:
+            return min(self.fold_angle_radians, math.radians(self.max_angle_degrees), math.pi)
+        if self.fold_angle_radians < math.pi / 2.0:
             # just before the fold, where the slope is not zero yet
-            return math.tan(self.fold_angle) * (1.0 - 1e-9)
+            return math.tan(self.fold_angle_radians) * (1.0 - 1e-9)
         return math.inf
 
     def _compute_radial_scale(self, square: Tensor) -> Tensor:
@@ -411,7 +411,7 @@ class CameraModel:
         this module.
         """
         # the last six of `NUMBER_NAMES`
-        p1, p2, s1, s2, s3, s4 = self.numbers[NUMBER_NAMES.index("p1") :]
+        p1, p2, s1, s2, s3, s4 = self.intrinsics[NUMBER_NAMES.index("p1") :]
         x, y = undistorted.unbind(dim=-1)
         square = x * x + y * y
         x_shift = (
@@ -425,7 +425,7 @@ class CameraModel:
     # ---- Derived properties ----
 
     @cached_property
-    def visible_tangents(self) -> tuple[float, float]:
+    def inner_half_tangents(self) -> tuple[float, float]:
         """Half width and half height, as tangents, of a rectangle inside the image.
 
         The rectangle is centered on the optical axis. It reaches the image's edges, and
@@ -512,9 +512,9 @@ class CameraModel:
         name = self.name or "the lens"
         black_part = f"{100.0 * self.black_fraction:.2g} % of the picture"
         sentence = f"{name}: {black_part} lies outside the lens's circle and is black."
-        if self.fold_angle < math.radians(self.max_angle):
+        if self.fold_angle_radians < math.radians(self.max_angle_degrees):
             sentence = (
-                f"{name}: the lens folds at {math.degrees(self.fold_angle):.1f} "
+                f"{name}: the lens folds at {math.degrees(self.fold_angle_radians):.1f} "
                 f"degrees from its axis, and {black_part}, which only directions "
                 "beyond that would fill, is black."
             )
@@ -529,9 +529,9 @@ class CameraModel:
         Args:
             resolution: height and width of the image in pixels.
         """
-        if self.size is None or self.size == resolution:
+        if self.calibrated_shape is None or self.calibrated_shape == resolution:
             return ()
-        (model_height, model_width) = self.size
+        (model_height, model_width) = self.calibrated_shape
         (height, width) = resolution
         stretch = model_width * height / (model_height * width)
         stretch_text = ""
@@ -580,10 +580,10 @@ def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     fisheye_numbers = (focal_x, focal_y, 0.5, 0.5, 0.0, *no_distortion)
     panorama_numbers = (1.0, 1.0, 0.5, 0.5, 0.0, *no_distortion)
     fisheye = CameraModel(
-        kind=FISHEYE, numbers=fisheye_numbers, name=FISHEYE, max_angle=90.0
+        kind=FISHEYE, intrinsics=fisheye_numbers, name=FISHEYE, max_angle_degrees=90.0
     )
     panorama = CameraModel(
-        kind=EQUIRECTANGULAR, numbers=panorama_numbers, name=EQUIRECTANGULAR
+        kind=EQUIRECTANGULAR, intrinsics=panorama_numbers, name=EQUIRECTANGULAR
     )
     return {FISHEYE: fisheye, EQUIRECTANGULAR: panorama}
 

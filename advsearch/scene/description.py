@@ -62,7 +62,7 @@ from advsearch.scene.importing.scenes import (
     MITSUBA_SUFFIX,
     ImportedScene,
     import_scene,
-    split_node,
+    split_node_argument,
 )
 from advsearch.scene.parts import (
     Lamp,
@@ -284,7 +284,7 @@ class SceneDescription(SceneData):
                 "not known; give its longest side in metres, such as `size=0.1`"
             )
         with track_opened_files(photograph):
-            pose, model = photograph_cameras.find(photograph)
+            pose, model = photograph_cameras.find_pose_and_model(photograph)
         # `AXES` turns our camera axes (left, up, ahead) to those of the file's pose.
         to_world = pose @ AXES
         # from meters to object sizes
@@ -292,7 +292,7 @@ class SceneDescription(SceneData):
         model.check_no_fov(self.requested)
         # Focal lengths are in widths and heights of the image, so that half a side's
         # angle has the tangent 0.5 / focal. The field of view is along the larger side.
-        tangents = (0.5 / model.values["fx"], 0.5 / model.values["fy"])
+        tangents = (0.5 / model.intrinsic_by_name["fx"], 0.5 / model.intrinsic_by_name["fy"])
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
         # The pose becomes a camera of the scene, and is selected; `with_camera` also
         # checks the settings. Then it gets its lens, which `with_camera` has removed.
@@ -370,7 +370,7 @@ class SceneDescription(SceneData):
         rig = read_rig(camera) if is_path(camera) else ()
         if rig:
             first_camera = rig[0]
-            model = first_camera.model
+            model = first_camera.camera_model
             scene = replace(scene, rig=rig, rig_spec=camera)
             if first_camera.fov is not None:
                 scene = scene.with_values(camera__fov=first_camera.fov)
@@ -748,12 +748,12 @@ def _find_source(
     """Return the file and the node that an object spec names.
 
     With `plugins`, a Mitsuba scene as a dictionary, the spec is the id of a shape, and
-    its file is not used. `split_node` cuts "scene.glb#car" into file and node.
+    its file is not used. `split_node_argument` cuts "scene.glb#car" into file and node.
     """
     file: str | Path | ObjectAsset = object_spec
     node = None
     if isinstance(object_spec, str):
-        file, node = split_node(object_spec)
+        file, node = split_node_argument(object_spec)
     is_mitsuba_file = node is not None and str(file).lower().endswith(MITSUBA_SUFFIX)
     return _Source(file, node, is_mitsuba=plugins is not None or is_mitsuba_file)
 

@@ -35,7 +35,7 @@ from advsearch.scene.geometry import (
     compute_base_vertices,
     list_lamps,
     make_rotation,
-    object_to_world,
+    compute_object_to_world,
 )
 from advsearch.scene.grounds import is_paved
 from advsearch.scene.parts import MeshPart
@@ -104,7 +104,7 @@ class ImageFormation:
                 f"resolution: expected 8 to 4096 pixels, got {self.resolution}"
             )
 
-    def display(self, radiance: Tensor) -> Tensor:
+    def map_to_display(self, radiance: Tensor) -> Tensor:
         """Map linear radiance (..., 3) to display-referred values in [0, 1].
 
         Radiance is multiplied by `gain` and goes through the tone curve `transfer`:
@@ -495,7 +495,7 @@ def _interpolate_normals(
         weights: (N, 3) barycentric weights of the corners at the point.
     """
     normals = (weights[:, :, None] * scene.object.mesh.normals[corners]).sum(axis=1)
-    normals = normals @ object_to_world(scene)[:3, :3].T
+    normals = normals @ compute_object_to_world(scene)[:3, :3].T
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return np.asarray(normals)
 
@@ -597,7 +597,7 @@ class InputMapping(Protocol):
 class Moment:
     """A part of an exposure."""
 
-    space: InputMapping  # maps configurations to scene inputs at that time
+    input_mapping: InputMapping  # maps configurations to scene inputs at that time
     row_fractions: Tensor  # (H,) its weight in each row; 1 in sum over all moments
     sample_fraction: float  # its fraction of the samples per pixel
 
@@ -701,7 +701,7 @@ def parse_aovs(text: str | None) -> tuple[str, ...]:
 class Surfaces:
     """The surface in each pixel, by the ray through its center."""
 
-    names: tuple[str, ...]  # names of the shapes
+    shape_names: tuple[str, ...]  # names of the shapes
     # (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing
     id: Tensor
     # (H, W) distance from the camera, infinite where there is nothing. Renderers return
@@ -711,11 +711,11 @@ class Surfaces:
     z_depth: Tensor  # (H, W) component of the distance along the camera's axis
     normal: Tensor  # (H, W, 3) unit shading normal in world space
     uv: Tensor  # (H, W, 2) texture coordinates; v = 0 is the bottom row
-    face: Tensor  # (H, W) int64 index of the triangle in its mesh
+    face_index: Tensor  # (H, W) int64 index of the triangle in its mesh
 
     def visible_mask(self, name: str) -> Tensor:
         """Return where a shape is visible, (H, W) bool."""
-        return self.id == self.names.index(name) + 1
+        return self.id == self.shape_names.index(name) + 1
 
     def make_layers(self, aovs: Sequence[str], mask: str) -> dict[str, Tensor]:
         """Return the channels (H, W) of layers, such as ``normal.X``.
@@ -741,7 +741,7 @@ class Surfaces:
         notes = {name: AOVS[name] for name in aovs}
         if "id" in notes:
             meanings = [
-                f"{index} is {name}" for index, name in enumerate(self.names, 1)
+                f"{index} is {name}" for index, name in enumerate(self.shape_names, 1)
             ]
             notes["id"] += f"; {', '.join(meanings)}"
         return notes

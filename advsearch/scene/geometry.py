@@ -40,7 +40,7 @@ from advsearch.scene.rigged import TIME as TIME
 from advsearch.scene.rigged import find_rig_parameter as find_rig_parameter
 from advsearch.scene.scene_data import SceneData
 from advsearch.scene.scene_data import cache_per_scene as cache_per_scene
-from advsearch.scene.scene_data import object_to_world as object_to_world
+from advsearch.scene.scene_data import compute_object_to_world as object_to_world
 from advsearch.scene.settings import ORBIT_CAMERA, SETTINGS
 from advsearch.scene.skeleton import (
     compute_rotation_entries as compute_rotation_entries,
@@ -122,7 +122,7 @@ def _compute_edge_tangents(
     if model is not None and model.name:
         # the largest rectangle around the axis that is in the image
         return torch.tensor(
-            model.visible_tangents, dtype=torch.float64, device=fov.device
+            model.inner_half_tangents, dtype=torch.float64, device=fov.device
         )
     # half the width and half the height, as fractions of half the larger side
     shape = torch.tensor(
@@ -341,7 +341,7 @@ def project_points(
     if model is not None:
         if "camera.lens" in inputs:
             # A model stores floats, so that there is no derivative by the lens.
-            model = model.with_numbers(inputs["camera.lens"].detach())
+            model = model.with_intrinsics(inputs["camera.lens"].detach())
         positions, is_visible = model.project(points)
         return (positions - 0.5) * image_size, is_visible
     fov = (

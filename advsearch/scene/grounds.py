@@ -266,7 +266,7 @@ class CameraView(NamedTuple):
     """
 
     azimuth: float
-    towards: float
+    view_azimuth: float
     distance: float
     height: float
     lower_angle: float
@@ -296,7 +296,7 @@ def find_valid_range(
     # A camera that moves back by d sees things at a distance r too large by the factor
     # (r + d) / r. The nearest things count in its direction of view (`towards`).
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
-        surroundings.nearest_distance, camera.towards
+        surroundings.nearest_distance, camera.view_azimuth
     )
     # length of the ground in front of the camera that is below the image's lower border
     hidden_ground_distance = math.inf
@@ -423,7 +423,7 @@ def make_camera_view(
     lower_angle = half_height_angle - view_elevation
     return CameraView(
         azimuth=azimuth,
-        towards=view_azimuth,
+        view_azimuth=view_azimuth,
         distance=math.hypot(x, y),
         height=float(z),
         lower_angle=lower_angle,

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.files import MESHES, either
+from advsearch.files import MESHES, join_alternatives
 from advsearch.scene.assets import (
     BoolArray,
     EnvironmentAsset,
@@ -64,7 +64,7 @@ def make_finished_surface(
             finish.metallic,
             finish.clearcoat,
         )
-    face_of_texel = rasterize_charts(mesh, MATERIAL_MAP_SIDE).face
+    face_of_texel = rasterize_charts(mesh, MATERIAL_MAP_SIDE).face_index
     texel_values = face_values[face_of_texel].astype(np.float32)
     surface: dict[str, object] = {
         "type": "principled",
@@ -93,7 +93,7 @@ if TYPE_CHECKING:
 BUNDLED_OBJECT = "bundled object"
 BUNDLED_ENVIRONMENT = "bundled environment"  # source of an environment that is bundled
 MAP_HINT = "A path to an .hdr or .exr file, or to the .yaml file of a place, works too."
-OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
+OBJECT_HINT = f"A path to a file that ends in {join_alternatives(MESHES)} works too."
 
 
 def _get_data_directory() -> Traversable:

@@ -66,13 +66,13 @@ def find_visible_meshes(
         u: (d,) configuration.
         names: the meshes that are considered; None for all.
     """
-    description = renderer.scene.definition[0]
-    surfaces = renderer.surfaces(u)
+    description = renderer.scene.description_and_filter[0]
+    surfaces = renderer.find_surfaces(u)
     with torch.no_grad():
-        inputs = renderer.scene.assembly(renderer.space.inputs(u))
+        inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
     visible = []
     for name in description.meshes if names is None else names:
-        if name not in surfaces.names:
+        if name not in surfaces.shape_names:
             continue
         mask = surfaces.visible_mask(name).numpy()
         if mask.any():
@@ -144,9 +144,9 @@ def _project_faces(
         size: height and width of the image.
     """
     height, width = size
-    description = renderer.scene.definition[0]
+    description = renderer.scene.description_and_filter[0]
     part = description.meshes[name]
-    vertices = renderer.scene.assembly.get_vertices(name, inputs)
+    vertices = renderer.scene.input_assembler.get_vertices(name, inputs)
     default_camera = torch.from_numpy(camera_to_world(description, width / height))
     camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
     # in the camera's coordinates: left, up and ahead

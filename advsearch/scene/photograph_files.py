@@ -338,7 +338,7 @@ def _parse_occluder(file: Path, stated: Mapping[str, Any]) -> str | None:
 # ---- the scene in a photograph
 
 
-def put_into_photograph(
+def make_photograph_scene(
     description: SceneDescription,
     view: PhotographView,
     camera: str | PhotographCameras | None = None,

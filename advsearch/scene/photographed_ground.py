@@ -20,7 +20,7 @@ MIN_RING_RADIUS = 0.01  # radius of the innermost ring of vertices, in camera he
 MAX_RING_RADIUS = 1000.0
 
 
-class Photograph:
+class PhotographedGround:
     """A ground plane with the photographed floor of an equirectangular map.
 
     The object's shadow and reflected light change the plane, as they would change the
@@ -153,10 +153,10 @@ def _make_ring_faces() -> npt.NDArray[np.uint32]:
 
 
 @lru_cache(maxsize=4)
-def get_photograph(
+def get_photographed_ground(
     environment: EnvironmentAsset, height: float, rotation: float
-) -> Photograph:
-    return Photograph(environment.radiance, height, rotation)
+) -> PhotographedGround:
+    return PhotographedGround(environment.radiance, height, rotation)
 
 
 def compute_irradiance(radiance: Tensor) -> Tensor:

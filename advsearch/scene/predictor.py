@@ -55,10 +55,10 @@ class Predictor(ABC):
 
     Attributes:
         path_renderer: the renderer `traced`.
-        non_finite: how many traced values were not finite, and were set to zero.
+        n_non_finite: how many traced values were not finite, and were set to zero.
     """
 
-    non_finite: int = 0
+    n_non_finite: int = 0
 
     def __init__(self, traced: Renderer) -> None:
         self.path_renderer = traced

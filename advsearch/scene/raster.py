@@ -266,12 +266,12 @@ class Charts:
     mesh: Mesh
     # (h, w) index of the face that contains each texel's center. A texel outside of all
     # charts has the face of the nearest covered texel.
-    face: IntArray
+    face_index: IntArray
     # (h, w, 3) barycentric weights of the face's three corners, at least 0, adding up
     # to 1
     weights: Float64Array
     is_covered: BoolArray  # (h, w) whether the texel's center is in a chart
-    distance: Float64Array  # (h, w) texels to the nearest covered texel, which have 0
+    texels_to_covered: Float64Array  # (h, w) texels to the nearest covered texel, which have 0
 
     @property
     def is_readable(self) -> BoolArray:
@@ -279,22 +279,22 @@ class Charts:
 
         Such a texel is in a chart, or at most `BORDER_TEXELS` texels from one.
         """
-        return np.asarray(self.distance <= BORDER_TEXELS)
+        return np.asarray(self.texels_to_covered <= BORDER_TEXELS)
 
     def compute_positions(self) -> Float32Array:
         """Return (h, w, 3) positions in mesh coordinates."""
-        corners = self.mesh.vertices[self.mesh.faces[self.face]]
+        corners = self.mesh.vertices[self.mesh.faces[self.face_index]]
         return np.asarray(
             np.einsum("hwk,hwkc->hwc", self.weights, corners), dtype=np.float32
         )
 
     def compute_normals(self) -> Float32Array:
         """Return unit shading normals (h, w, 3), or face normals where these cancel."""
-        corners = self.mesh.normals[self.mesh.faces[self.face]]
+        corners = self.mesh.normals[self.mesh.faces[self.face_index]]
         normals = np.einsum("hwk,hwkc->hwc", self.weights, corners)
         lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
         unit_normals = normals / np.maximum(lengths, 1e-6)
-        face_normals = _compute_face_normals(self.mesh)[self.face]
+        face_normals = _compute_face_normals(self.mesh)[self.face_index]
         return np.where(lengths > 1e-6, unit_normals, face_normals).astype(np.float32)
 
     def compute_areas(self) -> Float32Array:
@@ -311,7 +311,7 @@ class Charts:
         area_per_texel = np.where(
             doubled_texels > 0.0, doubled_areas / np.maximum(doubled_texels, 1e-12), 0.0
         )
-        areas = np.where(self.is_covered, area_per_texel[self.face], 0.0)
+        areas = np.where(self.is_covered, area_per_texel[self.face_index], 0.0)
         return areas.astype(np.float32)
 
 

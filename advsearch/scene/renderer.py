@@ -30,7 +30,7 @@ from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.pictures import encode_levels
 from advsearch.scene.assembly import IMAGE_INPUTS, Motion, write_central_differences
-from advsearch.scene.backdrop import compose, compute_front
+from advsearch.scene.backdrop import compose_over_photograph, compute_front
 from advsearch.scene.color import to_uint8
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import ImageFormation, InputMapping, Moment, Surfaces
@@ -48,7 +48,7 @@ from advsearch.scene.image_quality import blur_image
 from advsearch.scene.mitsuba_backend.denoise import denoise_image
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.shared_paths import SharedPaths
-from advsearch.scene.rig import Mount
+from advsearch.scene.rig import RigCamera
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.window import Window
 
@@ -103,7 +103,7 @@ class Crop(NamedTuple):
 
     window: Window  # window of the pixels that are rendered
     # radiance (H, W, 3) of the full image; with a backdrop (H, W, 4), with coverage
-    surroundings: Tensor
+    surrounding_image: Tensor
 
 
 # Largest size of a group whose motion of outlines is measured.
@@ -119,14 +119,14 @@ class Renderer:
     Attributes:
         start: (d,) float32 in [0, 1], the configuration that leaves the scene as it is.
         plan: how each coordinate is differentiated; may be replaced.
-        routes: which scene inputs each group of coordinates reaches, by
+        inputs_by_group: which scene inputs each group of coordinates reaches, by
             `control.parameter`.
         crop: part of each image that is rendered; None for all of it.
         shared_paths: object that renders full images in place of the scene; None if the
             scene renders them.
-        renders: number of primal renders so far, those of differences included.
-        gradients: number of adjoint renders so far.
-        non_finite: number of pixels and gradient entries that were NaN or infinite and
+        n_renders: number of primal renders so far, those of differences included.
+        n_gradients: number of adjoint renders so far.
+        n_non_finite: number of pixels and gradient entries that were NaN or infinite and
             were set to zero.
 
     Args:
@@ -172,13 +172,13 @@ class Renderer:
         self.moments = tuple(moments)
         self.root_seed = root_seed
         self._shape = space.start.shape
-        self._source: Source | None = None
+        self._external_render: Source | None = None
         self._predict: Predict | None = None
         self.crop: Crop | None = None
         self.shared_paths: SharedPaths | None = None
-        self.renders = 0
-        self.gradients = 0
-        self.non_finite = 0
+        self.n_renders = 0
+        self.n_gradients = 0
+        self.n_non_finite = 0
         # estimators that the backward pass skips, set by `gradient` for its call
         self._skipped_estimators: frozenset[str] = frozenset()
         groups = space.groups
@@ -188,7 +188,7 @@ class Renderer:
             estimators,
             image_size=max(formation.resolution),
         )
-        self.routes = self._find_reached_inputs(groups)
+        self.inputs_by_group = self._find_reached_inputs(groups)
 
     @property
     def start(self) -> Tensor:
@@ -214,7 +214,7 @@ class Renderer:
         Only an image of one scene through one camera can be predicted from light that
         was collected once.
         """
-        has_several_cameras = bool(self.scene.definition[0].rig)
+        has_several_cameras = bool(self.scene.description_and_filter[0].rig)
         if has_several_cameras:
             return "a picture is made of those of several cameras"
         has_several_moments = bool(self.moments)
@@ -226,7 +226,7 @@ class Renderer:
         self,
         scene: MitsubaScene | None = None,
         *,
-        source: Source | None = None,
+        external_render: Source | None = None,
         predict: Predict | None = None,
         crop: Crop | None = None,
         **formation: Any,
@@ -238,7 +238,7 @@ class Renderer:
 
         Args:
             scene: another scene.
-            source: function of another program, which renders and denoises.
+            external_render: function of another program, which renders and denoises.
             predict: function that predicts radiance (`scene.predictor`). Then the seed
                 and the samples of a call have no effect, and autograd differentiates
                 all coordinates through the scene inputs, for any plan.
@@ -248,7 +248,7 @@ class Renderer:
         other = copy.copy(self)
         other.formation = replace(self.formation, **formation)
         other.scene = scene or self.scene
-        other._source = source or self._source
+        other._external_render = external_render or self._external_render
         other._predict = predict or self._predict
         other.crop = crop or self.crop
         return other
@@ -290,7 +290,7 @@ class Renderer:
             spp: their samples per pixel.
         """
         with torch.no_grad():
-            inputs = self.scene.assembly(self.space.inputs(u))
+            inputs = self.scene.input_assembler(self.space.inputs(u))
             surroundings = self.copy_with().render_radiance(
                 _select_scene_inputs(inputs), seed, spp, "backdrop.color" in inputs
             )
@@ -346,7 +346,7 @@ class Renderer:
         with _leave_inference_mode():
             return self._render_image(masked_u, seed, spp, display=False)
 
-    def render_halves(
+    def render_independent_images(
         self, u: Tensor, seed: int, spp: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two images of a configuration with independent noise.
@@ -365,15 +365,15 @@ class Renderer:
             both.
         """
         with torch.no_grad():
-            inputs = self.scene.assembly(self.space.inputs(u))
-            halves, mean = self.trace_halves(inputs, seed, spp)
+            inputs = self.scene.input_assembler(self.space.inputs(u))
+            halves, mean = self.trace_independent_radiances(inputs, seed, spp)
 
             def finish(radiance: Tensor) -> Tensor:
                 """Return the radiance with exposure and backdrop, before the curve."""
                 return self.finish_image(radiance, inputs, u, display=False)
 
             clean = finish(mean)
-            clean_image = self.formation.display(clean)
+            clean_image = self.formation.map_to_display(clean)
 
             def display_on_tangent(radiance: Tensor) -> Tensor:
                 """Return the image of radiance on the curve's tangent at `clean`.
@@ -382,7 +382,7 @@ class Renderer:
                 the change of radiance, within which the curve is nearly straight.
                 """
                 nearby = torch.lerp(clean, finish(radiance), STRAIGHT_FRACTION)
-                small_change = self.formation.display(nearby) - clean_image
+                small_change = self.formation.map_to_display(nearby) - clean_image
                 change = small_change / STRAIGHT_FRACTION
                 return self.space.apply_to_image(u, clean_image + change)
 
@@ -390,7 +390,7 @@ class Renderer:
             second = display_on_tangent(halves[1])
             return first, second, self.space.apply_to_image(u, clean_image)
 
-    def trace_halves(
+    def trace_independent_radiances(
         self, inputs: Mapping[str, Tensor], seed: int, spp: int
     ) -> tuple[list[Tensor], Tensor]:
         """Trace the radiance of scene inputs twice, with independent noise.
@@ -410,40 +410,40 @@ class Renderer:
         hides_environment = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
         undenoised = self.copy_with(denoiser="none")
-        noise_seeds = [seeds.stream(seed, "traced", half) for half in range(2)]
+        noise_seeds = [seeds.derive_seed(seed, "traced", half) for half in range(2)]
         halves = [
             undenoised.render_radiance(scene_inputs, noise_seed, spp, hides_environment)
             for noise_seed in noise_seeds
         ]
         mean = (halves[0] + halves[1]) / 2.0
         # One render of the guides serves both halves; its seed follows from the first.
-        guide_seed = seeds.stream(self.root_seed, "guides", noise_seeds[0])
+        guide_seed = seeds.derive_seed(self.root_seed, "guides", noise_seeds[0])
         with self.scene.limit_window(self.window):
             albedo, normal = self.scene.render_guides(scene_inputs, guide_seed, spp)
         plane_radiance = self.scene.plane_radiance if hides_environment else None
         if self.crop is None:
             return halves, denoise_image(mean, albedo, normal, plane_radiance)
         # Only the window is noisy: the surroundings were denoised when they were made.
-        window_mean = self.crop.window.select(mean)
+        window_mean = self.crop.window.crop_image(mean)
         clean = denoise_image(window_mean, albedo, normal, plane_radiance)
-        return halves, self.crop.window.paste(clean, self.crop.surroundings)
+        return halves, self.crop.window.paste(clean, self.crop.surrounding_image)
 
     def compute_scene_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the inputs of Mitsuba's scene at a configuration, without a graph."""
-        inputs = self.scene.assembly(self.space.inputs(u))
+        inputs = self.scene.input_assembler(self.space.inputs(u))
         return {
             name: value.detach() for name, value in _select_scene_inputs(inputs).items()
         }
 
-    def mask(self, u: Configuration) -> Tensor:
+    def compute_object_mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the camera sees the object first, (H, W) bool.
 
         The ray through the center of each pixel counts. What controls do to the
         finished image moves nothing in it.
         """
-        return self.surfaces(u).visible_mask(OBJECT)
+        return self.find_surfaces(u).visible_mask(OBJECT)
 
-    def surfaces(
+    def find_surfaces(
         self, u: Configuration, subdivision: int = 1, camera: int = 0
     ) -> Surfaces:
         """Find what the camera sees first through the center of each pixel.
@@ -458,9 +458,9 @@ class Renderer:
         """
         u, _ = self._check_arguments(u, spp=1)
         with torch.no_grad():
-            rig = self.scene.definition[0].rig
+            rig = self.scene.description_and_filter[0].rig
             mount = rig[camera] if rig else None
-            inputs = self.find_front(self._make_camera_inputs(mount, u))
+            inputs = self.replace_photograph_depth(self._make_camera_inputs(mount, u))
             surfaces = self.scene.find_surfaces(
                 _select_scene_inputs(inputs), subdivision
             )
@@ -472,7 +472,7 @@ class Renderer:
                     is_hidden = is_hidden.repeat_interleave(subdivision, dim)
                 surfaces.id[is_hidden] = 0  # no surface
         # The scene is in object sizes.
-        object_size = self.scene.definition[0].size_in_metres
+        object_size = self.scene.description_and_filter[0].size_in_metres
         return replace(
             surfaces,
             depth=surfaces.depth * object_size,
@@ -522,7 +522,7 @@ class Renderer:
         derivative = torch.zeros_like(leaf) if gradient is None else gradient
         if free:
             return value.detach(), derivative
-        noise_seed = seeds.stream(self.root_seed, "differences", seed)
+        noise_seed = seeds.derive_seed(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
 
         def compute_loss(configuration: Tensor) -> Tensor:
@@ -598,14 +598,14 @@ class Renderer:
         Returns:
             (H, W, 3); for a rig of K cameras their images side by side, (H, K W, 3).
         """
-        renders_before = self.renders
+        renders_before = self.n_renders
         images = list[Tensor]()
         # without a rig there is one camera, with no mount
-        for index, mount in enumerate(self.scene.definition[0].rig or (None,)):
+        for index, mount in enumerate(self.scene.description_and_filter[0].rig or (None,)):
             # the first camera has the noise of a scene without a rig
             camera_seed = seed
             if index > 0:
-                camera_seed = seeds.stream(seed, "camera", index)
+                camera_seed = seeds.derive_seed(seed, "camera", index)
             inputs = self._make_camera_inputs(mount, u)
             hides_environment = "backdrop.color" in inputs
             if self.moments:  # an exposure of some time
@@ -620,11 +620,11 @@ class Renderer:
         if len(images) == 1:
             return images[0]
         # Budgets count configurations: all cameras of a rig are one render.
-        self.renders = renders_before + 1
+        self.n_renders = renders_before + 1
         return torch.cat(images, dim=1)
 
     def _make_camera_inputs(
-        self, mount: Mount | None, u: Tensor, space: InputMapping | None = None
+        self, mount: RigCamera | None, u: Tensor, space: InputMapping | None = None
     ) -> dict[str, Tensor]:
         """Return the scene inputs of a configuration for one camera.
 
@@ -640,17 +640,17 @@ class Renderer:
                 # The camera takes its image later than the first one: until then, what
                 # moves has moved on.
                 space = self.space.advance_time(mount.delay)
-        inputs = self.scene.assembly(space.inputs(u))
+        inputs = self.scene.input_assembler(space.inputs(u))
         if mount is None:
             return inputs
-        description = self.scene.definition[0]
+        description = self.scene.description_and_filter[0]
         # The rig is mounted where the camera of the description stands.
         pose, center = _get_camera_pose_and_center(description)
         return mount.make_inputs(inputs, pose, center, description.size_in_metres)
 
     def _render_exposure(
         self,
-        mount: Mount | None,
+        mount: RigCamera | None,
         u: Tensor,
         seed: int,
         spp: int,
@@ -672,14 +672,14 @@ class Renderer:
             hide_environment: hide the environment behind a backdrop.
         """
         is_denoised = self.formation.denoiser == "oidn"
-        renders_before = self.renders
+        renders_before = self.n_renders
         exposed = torch.zeros(())
         guides = torch.zeros(())
         for index, moment in enumerate(self.moments):
             inputs = _select_scene_inputs(
-                self._make_camera_inputs(mount, u, moment.space)
+                self._make_camera_inputs(mount, u, moment.input_mapping)
             )
-            moment_seed = seeds.stream(seed, "moment", index)
+            moment_seed = seeds.derive_seed(seed, "moment", index)
             row_weights = moment.row_fractions[:, None, None]
             samples = max(1, math.ceil(spp * moment.sample_fraction))
             exposed = exposed + row_weights * self.render_radiance(
@@ -687,14 +687,14 @@ class Renderer:
             )
             if is_denoised:
                 with torch.no_grad():
-                    guide_seed = seeds.stream(self.root_seed, "guides", moment_seed)
+                    guide_seed = seeds.derive_seed(self.root_seed, "guides", moment_seed)
                     albedo, normal = self.scene.render_guides(
                         inputs, guide_seed, samples
                     )
                     moment_guides = torch.cat([albedo, normal], dim=-1)
                     guides = guides + row_weights * moment_guides
         # `render_radiance` has counted each moment.
-        self.renders = renders_before + 1
+        self.n_renders = renders_before + 1
         if not is_denoised:
             return exposed
         # Denoising is added as a change without a graph: so the derivative is that of
@@ -737,7 +737,7 @@ class Renderer:
             u: configuration, for the controls that change the finished image.
             display: if False, return the radiance before the tone curve.
         """
-        inputs = self.find_front(inputs)
+        inputs = self.replace_photograph_depth(inputs)
         exposure = inputs.get("camera.exposure")
         if "backdrop.blur" in inputs:
             rendered = blur_image(rendered, float(inputs["backdrop.blur"]))
@@ -753,10 +753,10 @@ class Renderer:
             behind = inputs["backdrop.color"] / self.formation.gain
             coverage_and_plane = rendered[..., 3:7]
             layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
-            radiance = compose(layers, behind, inputs)
+            radiance = compose_over_photograph(layers, behind, inputs)
         if not display:
             return radiance
-        image = self.formation.display(radiance)
+        image = self.formation.map_to_display(radiance)
         if "backdrop.noise" in inputs:
             # Only where the object is visible: the photograph has its own noise.
             coverage = rendered[..., 3:4].detach()
@@ -766,7 +766,7 @@ class Renderer:
         return self.space.apply_to_image(u, image)
 
     @torch.no_grad()
-    def find_front(self, inputs: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def replace_photograph_depth(self, inputs: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
         """Return inputs in which a photograph's depth is replaced by what it hides.
 
         ``backdrop.front`` (H, W, 2), the hidden fractions of object and ground, takes
@@ -820,7 +820,7 @@ class Renderer:
             self, tuple(inputs), seed, spp, hide_environment, denoised, *inputs.values()
         )
         if self.crop is not None:
-            return self.crop.window.paste(radiance, self.crop.surroundings)
+            return self.crop.window.paste(radiance, self.crop.surrounding_image)
         return radiance
 
     def replace_non_finite(self, values: Tensor) -> Tensor:
@@ -828,7 +828,7 @@ class Renderer:
         if bool(torch.isfinite(values.sum())):
             return values
         finite = torch.isfinite(values)
-        self.non_finite += int((~finite).sum())
+        self.n_non_finite += int((~finite).sum())
         return torch.where(finite, values, torch.zeros_like(values))
 
     # ---- differences
@@ -853,7 +853,7 @@ class Renderer:
             seed: seed of the noise.
             spp: samples per pixel, unless the plan has its own number.
         """
-        noise_seed = seeds.stream(self.root_seed, "differences", seed)
+        noise_seed = seeds.derive_seed(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp
         derivative = torch.zeros_like(u)
 
@@ -889,7 +889,7 @@ class Renderer:
                 coordinates += range(group.begin, group.begin + group.size)
         if motion is not None and coordinates:
             speeds = motion.measure_speeds(
-                lambda u: self.scene.assembly(self.space.inputs(u)),
+                lambda u: self.scene.input_assembler(self.space.inputs(u)),
                 self.start,
                 coordinates,
             )
@@ -921,7 +921,7 @@ class Renderer:
         # weights keep the derivatives of an input's entries from cancelling in the sum.
         u = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
         with torch.enable_grad():
-            inputs = self.scene.assembly(self.space.inputs(u))
+            inputs = self.scene.input_assembler(self.space.inputs(u))
             for name, tensor in inputs.items():
                 if not tensor.requires_grad:
                     continue
@@ -1014,14 +1014,14 @@ class _Radiance(torch.autograd.Function):
         ctx.window = renderer.window
         ctx.save_for_backward(*tensors)
         inputs = dict(zip(names, tensors, strict=True))
-        noise_seed = seeds.stream(renderer.root_seed, "primal", seed)
+        noise_seed = seeds.derive_seed(renderer.root_seed, "primal", seed)
         guides: Tensor | None = None
-        if renderer._source is not None:  # another program, which also denoises
-            rendered = renderer._source(inputs, noise_seed, spp)
+        if renderer._external_render is not None:  # another program, which also denoises
+            rendered = renderer._external_render(inputs, noise_seed, spp)
         else:
             image_seeds = {"hidden" if hide else "path": noise_seed}
             if denoised and renderer.formation.denoiser == "oidn":
-                guide_seed = seeds.stream(renderer.root_seed, "guides", seed)
+                guide_seed = seeds.derive_seed(renderer.root_seed, "guides", seed)
                 image_seeds["guides"] = guide_seed
             scene: MitsubaScene | SharedPaths = renderer.scene
             # Shared paths are stored for full images only.
@@ -1042,7 +1042,7 @@ class _Radiance(torch.autograd.Function):
                 plane_radiance=renderer.scene.plane_radiance if hide else None,
                 quick=renderer.formation.quick,
             )
-        renderer.renders += 1
+        renderer.n_renders += 1
         return rendered
 
     @staticmethod
@@ -1055,7 +1055,7 @@ class _Radiance(torch.autograd.Function):
         """
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
-        noise_seed = seeds.stream(renderer.root_seed, "gradient", ctx.seed)
+        noise_seed = seeds.derive_seed(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.replace_non_finite(cotangent)
         gradient_of_input = dict[str, Tensor]()
         # If groups of both estimators reach an input, it is differentiated by the
@@ -1071,7 +1071,7 @@ class _Radiance(torch.autograd.Function):
             gradient_of_input |= renderer.scene.render_material_adjoint(
                 inputs, cotangent[..., :3], noise_seed, ctx.spp, meshes=meshes
             )
-            renderer.gradients += 1
+            renderer.n_gradients += 1
         if interior_names:
             method = "hidden" if ctx.hide else "path"
             with renderer.scene.limit_window(ctx.window):
@@ -1083,7 +1083,7 @@ class _Radiance(torch.autograd.Function):
                     wrt=interior_names,
                     method=method,
                 )
-            renderer.gradients += 1
+            renderer.n_gradients += 1
         for name, gradient in gradient_of_input.items():
             gradient_of_input[name] = renderer.replace_non_finite(gradient)
         # The six arguments of `forward` before the tensors have no gradients.
@@ -1099,7 +1099,7 @@ def _select_reached_inputs(renderer: Renderer, estimator: str) -> frozenset[str]
     """
     reached: frozenset[str] = frozenset()
     for group in renderer.plan.select_groups(estimator):
-        reached |= renderer.routes.get(group.name, frozenset())
+        reached |= renderer.inputs_by_group.get(group.name, frozenset())
     if estimator == "adjoint":
         return reached & renderer.scene.interior_inputs
     return reached

@@ -60,7 +60,7 @@ KALIBR_TRANSFORM = "T_cn_cnm1"  # transform from the previous camera to this one
 
 
 @dataclass(frozen=True, eq=False)
-class Mount:
+class RigCamera:
     """A camera of a rig, relative to the first camera of the rig."""
 
     name: str
@@ -73,7 +73,7 @@ class Mount:
     # Field of view along the larger side, degrees; None for that of the first camera.
     fov: float | None = None
     # Intrinsics and distortion; None for those of the first camera.
-    model: CameraModel | None = None
+    camera_model: CameraModel | None = None
     # Seconds after the first image, along the path of a control.
     delay: float = 0.0
 
@@ -112,14 +112,14 @@ class Mount:
         }
         if self.fov is not None:
             camera_inputs["camera.fov"] = torch.tensor([self.fov])
-        if self.model is not None:
+        if self.camera_model is not None:
             camera_inputs["camera.lens"] = torch.tensor(
-                self.model.numbers, dtype=torch.float32
+                self.camera_model.intrinsics, dtype=torch.float32
             )
         return camera_inputs
 
 
-def read_rig(spec: str) -> tuple[Mount, ...]:
+def read_rig(spec: str) -> tuple[RigCamera, ...]:
     """Read the cameras of a rig.
 
     Args:
@@ -177,14 +177,14 @@ class PhotographCameras:
         path: COLMAP's images.txt with the cameras.txt beside it, or a transforms.json.
         files: files of the photographs, by the names of their entries.
         read_entry: function of the name of an entry that returns its pose and model, as
-            `find` does.
+            `find_pose_and_model` does.
     """
 
     path: str
     files: Mapping[str, str]
     read_entry: Callable[[str], tuple[Float64Array, CameraModel]]
 
-    def find(self, photograph: Path) -> tuple[Float64Array, CameraModel]:
+    def find_pose_and_model(self, photograph: Path) -> tuple[Float64Array, CameraModel]:
         """Return pose and model of the camera that took a photograph, by its file name.
 
         If files in several folders have that name, the folders are compared, too.
@@ -297,7 +297,7 @@ def _count_shared_parts(file: str, photograph: Path) -> int:
     return count
 
 
-def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
+def _check_mounts(spec: str, mounts: Sequence[RigCamera]) -> None:
     """Raise FileFormatError unless cameras of a rig fit together.
 
     There have to be 2 to `MAX_CAMERAS` with different names. The first is the scene's
@@ -319,7 +319,7 @@ def _check_mounts(spec: str, mounts: Sequence[Mount]) -> None:
         )
 
 
-def _read_entry(spec: str, index: int, entry: Any) -> Mount:
+def _read_entry(spec: str, index: int, entry: Any) -> RigCamera:
     """Return the camera of an entry of our own format.
 
     Any of `ENTRY_KEYS` may be missing. A camera without a pose has the pose of the
@@ -361,7 +361,7 @@ def _read_entry(spec: str, index: int, entry: Any) -> Mount:
         raise FileFormatError(
             f"{where}: later: expected 0 to {MAX_DELAY:g} seconds, got {delay:g}"
         )
-    return Mount(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
+    return RigCamera(name=name, pose=pose, azimuth=orbit_angle, fov=fov, delay=delay)
 
 
 def _read_entry_pose(where: str, entry: Mapping[str, Any]) -> Float64Array:
@@ -427,7 +427,7 @@ def _to_rows(value: Any) -> list[list[Any]]:
     return value
 
 
-def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
+def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[RigCamera, ...]:
     """Return the cameras of Kalibr's camchain, the first one first.
 
     Cameras are in the order of their numbers (cam0, cam1). Each but the first states
@@ -461,7 +461,7 @@ def _read_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
     return _make_mounts(spec, names, poses, models)
 
 
-def _read_transforms(path: str, frame_names: str) -> tuple[Mount, ...]:
+def _read_transforms(path: str, frame_names: str) -> tuple[RigCamera, ...]:
     """Return frames of nerfstudio's transforms.json as cameras.
 
     `frame_names` are their indices, with commas.
@@ -570,7 +570,7 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
     return scale
 
 
-def _read_colmap(path: str, image_ids: str) -> tuple[Mount, ...]:
+def _read_colmap(path: str, image_ids: str) -> tuple[RigCamera, ...]:
     """Return the images of COLMAP's images.txt as cameras.
 
     Args:
@@ -695,7 +695,7 @@ def _make_mounts(
     names: Sequence[object],
     poses: Sequence[Float64Array],
     models: Sequence[CameraModel],
-) -> tuple[Mount, ...]:
+) -> tuple[RigCamera, ...]:
     """Return cameras with poses relative to the first.
 
     Args:
@@ -714,7 +714,7 @@ def _make_mounts(
         )
     to_first = np.linalg.inv(poses[0])
     return tuple(
-        Mount(str(name), to_first @ pose, model=model)
+        RigCamera(str(name), to_first @ pose, camera_model=model)
         for name, pose, model in zip(names, poses, models, strict=True)
     )
 

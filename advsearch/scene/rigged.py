@@ -140,7 +140,7 @@ class SkeletonRig:
         )
         # The arrays of all parts are concatenated, then rows are selected for the mesh.
         max_joints = max(part.joints.shape[1] for part in parts)
-        node_starts = np.cumsum([0, *(len(part.nodes) for part in parts)])
+        node_starts = np.cumsum([0, *(len(part.joint_nodes) for part in parts)])
 
         def pad_joints(values: np.ndarray) -> np.ndarray:
             """Pad arrays (V, n) of joints or weights to a common n."""
@@ -161,7 +161,7 @@ class SkeletonRig:
         self._points = torch.from_numpy(points[vertices])
         self._joints = torch.from_numpy(joints[vertices])
         self._weights = torch.from_numpy(weights[vertices])
-        self._nodes = torch.from_numpy(np.concatenate([part.nodes for part in parts]))
+        self._nodes = torch.from_numpy(np.concatenate([part.joint_nodes for part in parts]))
         self._inverse_binds = torch.from_numpy(
             np.concatenate([part.inverse_binds for part in parts])
         )
@@ -222,7 +222,7 @@ class SkeletonRig:
         return tuple(clip.name for clip in self.skeleton.clips)
 
     @cached_property
-    def joints(self) -> dict[str, int]:
+    def node_of_joint(self) -> dict[str, int]:
         """The nodes that move something, by name."""
         moving = with_ancestors(
             self.skeleton.parents, [int(node) for node in self._nodes]
@@ -238,7 +238,7 @@ class SkeletonRig:
     def defaults(self) -> Mapping[str, float]:
         """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
-        angles = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
+        angles = {f"{name}.{axis}": 0.0 for name in self.node_of_joint for axis in AXES}
         # If targets have the same name, the weight of the first is used: it is written
         # last.
         weights = {
@@ -437,7 +437,7 @@ class SkeletonRig:
             if name.rpartition(".")[2] in AXES
         )
         for joint in joints:
-            node = self.joints[joint]
+            node = self.node_of_joint[joint]
             rotation = torch.eye(3, dtype=torch.float64, device=device)
             for axis in AXES:
                 if f"{joint}.{axis}" in number_by_name:

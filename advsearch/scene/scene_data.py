@@ -35,9 +35,9 @@ from advsearch.scene.parts import (
     ScenePart,
     make_mesh_part,
 )
-from advsearch.scene.photographed_ground import Photograph, get_photograph
+from advsearch.scene.photographed_ground import PhotographedGround, get_photographed_ground
 from advsearch.scene.poses import apply_settings, compute_base_vertices, compute_pose
-from advsearch.scene.rig import Mount
+from advsearch.scene.rig import RigCamera
 from advsearch.scene.settings import ORBIT_CAMERA, POSE
 
 OBJECT = "object"  # the name of the mesh under test
@@ -90,7 +90,7 @@ class SceneData:
     camera_model: CameraModel | None = None
     # cameras that take pictures at the same time, this one first; empty where it is
     # alone
-    rig: tuple[Mount, ...] = ()
+    rig: tuple[RigCamera, ...] = ()
     rig_spec: str = ""  # how they were asked for
     # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba
     # shows it
@@ -122,7 +122,7 @@ class SceneData:
             for name, part in self.surrounding_meshes.items()
         }
         object_part = make_mesh_part(
-            OBJECT, self.object, object_to_world(self), self.material
+            OBJECT, self.object, compute_object_to_world(self), self.material
         )
         meshes = {OBJECT: object_part, **around}
         glasses = {
@@ -179,7 +179,7 @@ class SceneData:
         return value
 
     @property
-    def photograph(self) -> Photograph | None:
+    def photograph(self) -> PhotographedGround | None:
         """The ground that shows the environment's photograph; None for another ground.
 
         The setting `ground.kind` decides if it is set. Otherwise a photographed
@@ -202,7 +202,7 @@ class SceneData:
         if not shows_photograph:
             return None
         rotation = self.get_number("environment.rotation")
-        return get_photograph(environment, self.capture_height, rotation)
+        return get_photographed_ground(environment, self.capture_height, rotation)
 
     @property
     def capture_height(self) -> float:
@@ -257,7 +257,7 @@ def cache_per_scene(
     return compute_cached
 
 
-def object_to_world(description: SceneData) -> Float64Array:
+def compute_object_to_world(description: SceneData) -> Float64Array:
     """Return the object's pose (4, 4).
 
     Scale and rotate about the middle of its bounding box, keep it on the ground, shift.

@@ -74,7 +74,7 @@ class Movable:
     skeleton: Skeleton  # skeleton of its file
     node: int  # index of the node that draws it
     vertices: Float64Array  # (V, 3) in the coordinates of its mesh
-    nodes: IntArray  # (J,) nodes of the joints; its own node if it has no skin
+    joint_nodes: IntArray  # (J,) nodes of the joints; its own node if it has no skin
     inverse_binds: Float64Array  # (J, 4, 4) inverse bind matrices
     joints: IntArray  # (V, n) indices into `nodes`
     weights: Float64Array  # (V, n) of the joints; they sum to 1

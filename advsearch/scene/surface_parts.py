@@ -169,7 +169,7 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     Returns:
         The patch of each face (F,), numbered from 0.
     """
-    normals: Float64Array = normalize_vectors(soup.compute_face_vectors())
+    normals: Float64Array = normalize_vectors(soup.compute_area_vectors())
     count = len(normals)
     # The two faces of each shared edge. `find_shared_edges` returns corners, of which
     # each face has three.
@@ -299,12 +299,12 @@ class SurfaceParts:
     Attributes:
         mesh: mesh with texture coordinates of any kind.
         is_unwrapped: whether the map is not that of the mesh's own texture coordinates.
-        corners: (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the
+        face_uvs: (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the
             bottom.
         counts_faces: whether the faces are parts too.
-        count: number of parts: cells, row by row from v = 1, and then the faces.
+        n_parts: number of parts: cells, row by row from v = 1, and then the faces.
         is_covered: (CELLS, CELLS) whether the center of a cell lies in a chart.
-        face: (count,) the face at the center of each part; of a cell outside of all
+        face_of_part: (count,) the face at the center of each part; of a cell outside of all
             charts the nearest one.
         centers: (count, 3) that center, in the mesh's coordinates.
         center_uvs: (count, 2) and its u and v.
@@ -323,14 +323,14 @@ class SurfaceParts:
         self.mesh = mesh
         self._mesh_uvs = mesh.uvs[mesh.faces].astype(np.float64)
         self.is_unwrapped = not _has_unique_uvs(mesh, self._mesh_uvs)
-        self.corners = _unwrap_mesh(mesh) if self.is_unwrapped else self._mesh_uvs
-        charts = _rasterise_map(mesh, self.corners)
+        self.face_uvs = _unwrap_mesh(mesh) if self.is_unwrapped else self._mesh_uvs
+        charts = _rasterise_map(mesh, self.face_uvs)
         self.counts_faces = len(mesh.faces) <= MAX_FACES
         n_face_parts = len(mesh.faces) if self.counts_faces else 0
         faces = np.arange(n_face_parts)  # indices of the faces that are parts
-        self.count = MAP_SIZE * MAP_SIZE + len(faces)
+        self.n_parts = MAP_SIZE * MAP_SIZE + len(faces)
         self.is_covered = charts.is_covered
-        self.face = np.concatenate([charts.face.reshape(-1), faces])
+        self.face_of_part = np.concatenate([charts.face_index.reshape(-1), faces])
         face_centers = mesh.vertices[mesh.faces[faces]].mean(axis=1)
         centers = np.concatenate(
             [charts.compute_positions().reshape(-1, 3), face_centers]
@@ -341,14 +341,14 @@ class SurfaceParts:
         cell_uvs = np.stack(
             [(column + 0.5) / MAP_SIZE, 1.0 - (row + 0.5) / MAP_SIZE], axis=1
         )
-        self.center_uvs = np.concatenate([cell_uvs, self.corners[faces].mean(axis=1)])
+        self.center_uvs = np.concatenate([cell_uvs, self.face_uvs[faces].mean(axis=1)])
 
     @property
     def part_slices(self) -> dict[str, slice]:
         """Which of the parts are cells, and which are faces."""
         kinds = {"cell": slice(0, MAP_SIZE * MAP_SIZE)}
         if self.counts_faces:
-            kinds["face"] = slice(MAP_SIZE * MAP_SIZE, self.count)
+            kinds["face"] = slice(MAP_SIZE * MAP_SIZE, self.n_parts)
         return kinds
 
     def find_cells(self, face: IntArray, uv: Float64Array) -> IntArray:
@@ -370,7 +370,7 @@ class SurfaceParts:
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
-            uv = np.einsum("nk,nkc->nc", weights, self.corners[face])
+            uv = np.einsum("nk,nkc->nc", weights, self.face_uvs[face])
         # v points up, and rows go down
         column_and_row = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * MAP_SIZE)
         column, row = np.clip(column_and_row, 0, MAP_SIZE - 1).astype(np.int64)
@@ -394,7 +394,7 @@ def _unwrap_mesh(mesh: Mesh) -> Float64Array:
     soup = TriangleSoup(
         points=unique_points,
         faces=faces,
-        part_ids=np.zeros(n_faces, np.int64),
+        part_of_face=np.zeros(n_faces, np.int64),
         normals=np.full((n_faces, 3, 3), np.nan),
         uvs=np.full((n_faces, 3, 2), np.nan),
         colors=np.ones((n_faces, 3, 3)),

@@ -41,7 +41,7 @@ class Window(NamedTuple):
         right = min(resolution[1], self.left + self.width + margin)
         return Window(top, left, bottom - top, right - left)
 
-    def select(self, image: Tensor) -> Tensor:
+    def crop_image(self, image: Tensor) -> Tensor:
         """Return the pixels (h, w, ...) of the window in an image (H, W, ...)."""
         rows = slice(self.top, self.top + self.height)
         columns = slice(self.left, self.left + self.width)
@@ -54,7 +54,7 @@ class Window(NamedTuple):
         """
         pasted = image.clone()
         # `select` returns a view, through which `pasted` is written.
-        self.select(pasted)[...] = pixels
+        self.crop_image(pasted)[...] = pixels
         return pasted
 
     def pad(self, pixels: Tensor, resolution: tuple[int, int]) -> Tensor:
@@ -66,8 +66,8 @@ class Window(NamedTuple):
         right = resolution[1] - self.left - self.width
         return functional.pad(pixels, (0, 0, self.left, right, self.top, bottom))
 
-    def is_outside(self, resolution: tuple[int, int]) -> Tensor:
+    def make_outside_mask(self, resolution: tuple[int, int]) -> Tensor:
         """Return which pixels of an image are outside of the window, (H, W) bool."""
         outside = torch.ones(resolution, dtype=torch.bool)
-        self.select(outside)[...] = False  # a view, as in `paste`
+        self.crop_image(outside)[...] = False  # a view, as in `paste`
         return outside

@@ -446,7 +446,7 @@ class Config(BaseModel):
         try:
             # This first configuration only serves to find its powers.
             left_out = [
-                power for power in cls(**data).powers if power.name not in overrides
+                power for power in cls(**data).settings_with_effects if power.name not in overrides
             ]
             for power in left_out:
                 # The file may use the name of the setting or of its field.
@@ -459,7 +459,7 @@ class Config(BaseModel):
         return config
 
     @property
-    def powers(self) -> tuple[OmittedSetting, ...]:
+    def settings_with_effects(self) -> tuple[OmittedSetting, ...]:
         """The settings whose values have an effect outside of the run, with the effect.
 
         An example is an address to which images are sent (`trust.powers`). They have
@@ -482,7 +482,7 @@ class Config(BaseModel):
         return tuple(powers)
 
     @property
-    def left_out(self) -> tuple[OmittedSetting, ...]:
+    def omitted_settings(self) -> tuple[OmittedSetting, ...]:
         """The settings of the file that were not taken over, since they do more than
         change what happens in the run.
         """
@@ -505,7 +505,7 @@ class Config(BaseModel):
             and setting.name not in RUN_LOCATION
         }
 
-    def check_powers(self, where: str) -> None:
+    def check_no_effects(self, where: str) -> None:
         """Check that no setting has an effect outside of the run (`powers`).
 
         This is for files of which the user cannot confirm single settings, such as
@@ -518,8 +518,8 @@ class Config(BaseModel):
             InputError: a setting has one, such as an address to connect to; the message
                 names the first one.
         """
-        if self.powers:
-            setting = self.powers[0]
+        if self.settings_with_effects:
+            setting = self.settings_with_effects[0]
             raise InputError(
                 f"{where}: {setting.name}: {setting.effect}, which such a file can't "
                 "ask for; leave it out"
@@ -570,7 +570,7 @@ class Config(BaseModel):
         copy._python_only_parts = tuple(parts)
         return copy
 
-    def python_object(self, role: str, name: str) -> Any:
+    def get_python_object(self, role: str, name: str) -> Any:
         """Return the object that a Python caller passed for a name in these settings;
         None if there is only the name.
 
@@ -621,7 +621,7 @@ class Config(BaseModel):
         return getattr(self, "run", None), getattr(self, "overwrite", False)
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         """The words from which a run without a stated place is named."""
         return (self.command,)
 

@@ -21,7 +21,7 @@ from advsearch.options import (
     TASK_SEPARATOR,
     Outcome,
     check_options,
-    check_takes,
+    check_takes_arguments,
     describe_value,
 )
 from advsearch.registry import Registry, get_class
@@ -143,7 +143,7 @@ def make_function_task(function: Callable[[Any, Facts], Tensor]) -> FunctionTask
         InputError: it takes other arguments.
     """
     name = getattr(function, "__name__", type(function).__name__)
-    check_takes(f"task {name}", function, "output", "truth")
+    check_takes_arguments(f"task {name}", function, "output", "truth")
     task_class: Any = type(name, (FunctionTask,), {"name": name})
     task: FunctionTask = task_class(function=function)
     return task

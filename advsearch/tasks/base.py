@@ -19,7 +19,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from advsearch.copies import hand_copies
+from advsearch.copies import copy_method_arguments
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
@@ -172,25 +172,25 @@ class Facts:
         object: name of the object, for messages.
         label: right label, as the setting `label` states it. None without that.
         object_label: label that the object's file states. None if it states none.
-        describe_values: function that returns the values of the configuration by
+        compute_numbers: function that returns the values of the configuration by
             parameter ("pose.yaw"), in the units of a run's rows.
         compute_sight: function that computes what is visible in the image, see `mask`
             and `depth`. None if the facts are those of a scene without a configuration.
         facts_of_thing: facts of each evaluated thing by name, the object first. Empty
             if only one thing is evaluated.
-        others: facts of every other thing in the scene, including the object if another
+        facts_of_others: facts of every other thing in the scene, including the object if another
             thing is evaluated.
-        views: facts for the image of each camera of a rig. Empty for a single camera.
+        facts_of_views: facts for the image of each camera of a rig. Empty for a single camera.
     """
 
     object: str
     label: str | None = None
     object_label: str | None = None
-    describe_values: Callable[[], Mapping[str, float]] = dict
+    compute_numbers: Callable[[], Mapping[str, float]] = dict
     compute_sight: Callable[[], Sight] | None = None
     facts_of_thing: Mapping[str, Facts] = field(default_factory=dict)
-    others: tuple[Facts, ...] = ()
-    views: tuple[Facts, ...] = ()
+    facts_of_others: tuple[Facts, ...] = ()
+    facts_of_views: tuple[Facts, ...] = ()
     gives_copies: ClassVar[bool] = True
 
     @cached_property
@@ -262,7 +262,7 @@ class Facts:
     @cached_property
     def numbers(self) -> Mapping[str, float]:
         """The values of the configuration by parameter, both varied and fixed ones."""
-        return MappingProxyType(dict(self.describe_values()))
+        return MappingProxyType(dict(self.compute_numbers()))
 
     def get_number(self, name: str) -> float:
         """Return the value of a parameter in this configuration.
@@ -325,7 +325,7 @@ class Task(ABC):
         """Make methods of a user's class get copies of their arguments.
 
         So a method may change its arguments in place without changing the search.
-        Classes of this package are not changed (`hand_copies`).
+        Classes of this package are not changed (`copy_method_arguments`).
         """
         super().__init_subclass__(**keywords)
         # the methods that get outputs or the truth
@@ -344,7 +344,7 @@ class Task(ABC):
         )
         method_names = [method.__name__ for method in receive_copies]
         all_arguments = slice(None)
-        hand_copies(cls, **dict.fromkeys(method_names, all_arguments))
+        copy_method_arguments(cls, **dict.fromkeys(method_names, all_arguments))
 
     def check_numbers(
         self, fits: Callable[[float], bool], expected: str, *names: str
@@ -435,7 +435,7 @@ class Task(ABC):
         return self
 
     @property
-    def ambiguities(self) -> str:
+    def ambiguity_message(self) -> str:
         """Message about an option that the user must state before outputs can be read.
 
         It is empty if nothing is missing.
@@ -443,12 +443,12 @@ class Task(ABC):
         return ""
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def output_remarks(self) -> tuple[str, ...]:
         """Sentences for the user about how outputs are read."""
         return ()
 
     @property
-    def reader(self) -> Callable[[Any, int], Output] | None:
+    def output_reader(self) -> Callable[[Any, int], Output] | None:
         """Function that reads the outputs of the models; None if they are logits."""
         return None if self.reads_logits else self.read
 
@@ -549,7 +549,7 @@ class Task(ABC):
         return self.name
 
     @property
-    def goal(self) -> str:
+    def success_description(self) -> str:
         """What counts as success, in words."""
         if self.target is not None:
             return "a target answer"

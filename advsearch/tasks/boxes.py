@@ -128,14 +128,14 @@ class DetectionTruth:
         labels: indices of the right classes.
         box: the smallest box around the visible part of the object, x0, y0, x1, y1 in
             pixels; None if it is out of view.
-        size: (height, width) of the image in pixels.
-        others: boxes around the visible parts of other things of these classes.
+        image_size: (height, width) of the image in pixels.
+        other_boxes: boxes around the visible parts of other things of these classes.
     """
 
     labels: Labels
     box: tuple[int, int, int, int] | None
-    size: tuple[int, int]
-    others: tuple[tuple[int, int, int, int], ...] = ()
+    image_size: tuple[int, int]
+    other_boxes: tuple[tuple[int, int, int, int], ...] = ()
 
     @property
     def box_fractions(self) -> Tensor | None:
@@ -144,7 +144,7 @@ class DetectionTruth:
 
     def to_fractions(self, box: tuple[int, int, int, int]) -> Tensor:
         """Convert a box in pixels to fractions of width and height, (4,)."""
-        height, width = self.size
+        height, width = self.image_size
         return torch.tensor(box) / torch.tensor([width, height, width, height])
 
 
@@ -155,7 +155,7 @@ def compute_iou_with_truth(detections: Detections, truth: DetectionTruth) -> Ten
     return compute_iou(boxes, truth.box_fractions.to(boxes))
 
 
-def suppress(detections: Detections, min_score: float, iou: float) -> Detections:
+def suppress_overlapping_boxes(detections: Detections, min_score: float, iou: float) -> Detections:
     """Set the scores of suppressed boxes to 0, class by class.
 
     The choice of boxes is not differentiable, but the scores that remain are. Boxes
@@ -253,16 +253,16 @@ def are_invalid(boxes: Tensor) -> Tensor:
     return (boxes == boxes[:, :1]).all(dim=1) | ~boxes.isfinite().all(dim=1)
 
 
-def are_counted(detections: Detections) -> Tensor:
+def are_counted_boxes(detections: Detections) -> Tensor:
     """Return which rows count as boxes, (D,) bool.
 
     A row counts if it has a valid box and any number over 0 that is or may be a score.
     """
-    has_number = (get_box_numbers(detections) > 0.0).any(dim=1)
+    has_number = (get_possible_scores(detections) > 0.0).any(dim=1)
     return ~are_invalid(detections["boxes"]) & has_number
 
 
-def get_box_numbers(detections: Detections) -> Tensor:
+def get_possible_scores(detections: Detections) -> Tensor:
     """Return the numbers of each box that are or may be scores, detached, (D, K).
 
     K is the number of classes, 1 for boxes with labels, or 2 if it is unknown which of
@@ -275,7 +275,7 @@ def get_box_numbers(detections: Detections) -> Tensor:
     return values if values.ndim == 2 else values[:, None]
 
 
-def format_option(options: str) -> str:
+def format_detection_option(options: str) -> str:
     """Return options of detection as messages name settings."""
     return f"`task='detection={{{options}}}'`"
 
@@ -315,12 +315,12 @@ class BoxFormat:
     """The format of a box: the meaning of its four numbers.
 
     Attributes:
-        form: one of `FORMS`.
+        box_layout: one of `FORMS`.
         unit: one of `UNITS`.
         input_size: (height, width) of the model's input, in pixels.
     """
 
-    form: str
+    box_layout: str
     unit: str
     input_size: tuple[int, int]
 
@@ -329,7 +329,7 @@ class BoxFormat:
         differentiable.
         """
         height, width = self.input_size if self.unit == "pixels" else (1, 1)
-        return to_corners(boxes, self.form) / boxes.new_tensor([width, height] * 2)
+        return to_corners(boxes, self.box_layout) / boxes.new_tensor([width, height] * 2)
 
     def find_faults(self, boxes: Tensor) -> dict[str, Tensor]:
         """Find which of boxes (D, 4) are implausible in this format.
@@ -410,16 +410,16 @@ class BoxFormat:
 
     def _count_different_options(self, other: BoxFormat) -> int:
         """Count the options in which another format differs from this one."""
-        return (other.form != self.form) + (other.unit != self.unit)
+        return (other.box_layout != self.box_layout) + (other.unit != self.unit)
 
     def format_change_to(self, other: BoxFormat) -> str:
         """Return the options that select another format, such as ``boxes: xywh``."""
         options = []
-        if other.form != self.form:
-            options.append(f"boxes: {other.form}")
+        if other.box_layout != self.box_layout:
+            options.append(f"boxes: {other.box_layout}")
         if other.unit != self.unit:
             options.append(f"unit: {other.unit}")
-        return format_option(", ".join(options))
+        return format_detection_option(", ".join(options))
 
     def suggest_better_format(
         self, boxes: Tensor, true_box: Tensor, min_iou: float
@@ -456,12 +456,12 @@ def select_best_boxes(images: Sequence[Detections]) -> Tensor:
     """Return the boxes with the best scores of each image, in the format of the
     output, (D, 4).
 
-    Invalid boxes and those without a score over 0 are left out (`are_counted`).
+    Invalid boxes and those without a score over 0 are left out (`are_counted_boxes`).
     """
     boxes_of_images = []
     for detections in images:
-        rows = are_counted(detections).nonzero().flatten()
-        numbers = get_box_numbers(detections)
+        rows = are_counted_boxes(detections).nonzero().flatten()
+        numbers = get_possible_scores(detections)
         # Without classes there are no scores, and `amax` would fail: the sum is 0.
         has_scores = numbers.shape[1] > 0
         best_score = numbers.amax(dim=1) if has_scores else numbers.sum(dim=1)

@@ -29,7 +29,7 @@ class ClassTask(Task):
 
     Attributes:
         labels: name of each class, or a placeholder such as "class 0".
-        named: whether the labels are names, and no placeholders.
+        has_class_names: whether the labels are names, and no placeholders.
         target: indices of the classes that the search seeks. None for any wrong class.
 
     Raises:
@@ -37,7 +37,7 @@ class ClassTask(Task):
     """
 
     labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
-    named: bool = field(default=True, metadata=FROM_RUN)
+    has_class_names: bool = field(default=True, metadata=FROM_RUN)
     target: Labels | None = field(default=None, metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
@@ -76,7 +76,7 @@ class ClassTask(Task):
             except InputError as error:
                 raise InputError(f"target: {error}") from None
         return replace(
-            self, labels=labels, named=named, target=target_classes, minimise=minimise
+            self, labels=labels, has_class_names=named, target=target_classes, minimise=minimise
         )
 
     def _check_output_kind(self, model: Model) -> None:
@@ -145,7 +145,7 @@ class ClassTask(Task):
                 f"label: expected the right labels for {facts.object}, got none"
             )
         try:
-            right_classes = find_label_set(text, self.labels, named=self.named).indices
+            right_classes = find_label_set(text, self.labels, named=self.has_class_names).indices
         except InputError as error:
             if facts.label is not None:  # from the user
                 raise InputError(f"label: {error}") from None
@@ -165,12 +165,12 @@ class ClassTask(Task):
         self.find_right_classes(facts)
 
     @cached_property
-    def nothing_classes(self) -> Labels:
+    def background_classes(self) -> Labels:
         """Indices of classes that stand for no object, such as "background".
 
         They do not count as predictions, unless they are targets.
         """
-        if not self.named:
+        if not self.has_class_names:
             return ()
         targets = self.target or ()
         return tuple(
@@ -217,7 +217,7 @@ class Classification(ClassTask):
             output: logits (N, classes).
             truth: indices of the right classes; empty if they are unknown.
         """
-        excluded = set(self.nothing_classes) - set(truth)
+        excluded = set(self.background_classes) - set(truth)
         n_classes = output.shape[1]
         n_right = max(1, len(truth))  # if the truth is unknown, at least one is right
         n_other_wrong_classes = n_classes - n_right - len(excluded)

@@ -70,7 +70,7 @@ class Command(Task):
     names: Any = ()
     units: Any = ()
     # The clean action, (A,).
-    clean: Tensor | None = field(
+    clean_action: Tensor | None = field(
         default=None, compare=False, repr=False, metadata=tasks.FROM_RUN
     )
 
@@ -232,7 +232,7 @@ class Command(Task):
 
     @property
     def calibrates(self) -> bool:
-        return self.clean is None
+        return self.clean_action is None
 
     def after_calibration(self, output: Tensor, truth: Tensor | None) -> Command:
         """Store the clean action, with which all other actions are compared.
@@ -255,7 +255,7 @@ class Command(Task):
             )
         if self.target is not None:
             self._check_target(clean_action)
-        return replace(self, clean=clean_action)
+        return replace(self, clean_action=clean_action)
 
     def _check_target(self, clean_action: Tensor) -> None:
         """Check that a target action fits the clean action (A,).
@@ -279,11 +279,11 @@ class Command(Task):
             )
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def output_remarks(self) -> tuple[str, ...]:
         """State the clean action and its envelope, once they are known."""
-        if self.clean is None:
+        if self.clean_action is None:
             return ()
-        clean_action = self.clean.tolist()
+        clean_action = self.clean_action.tolist()
         envelope = list(self.envelope)
         if len(envelope) == 1:  # the same for all elements
             envelope = envelope * len(clean_action)
@@ -295,7 +295,7 @@ class Command(Task):
         )
 
     @property
-    def goal(self) -> str:
+    def success_description(self) -> str:
         if self.target is not None:
             return "a target action"
         return "an action outside the envelope of the clean one"
@@ -309,7 +309,7 @@ class Command(Task):
 
     def truth(self, facts: tasks.Facts) -> Tensor | None:
         self.check(facts)
-        return self.clean
+        return self.clean_action
 
     def truth_names(self, truth: Tensor | None) -> tuple[str, ...]:
         return () if truth is None else (self._format_action(truth.tolist()),)

@@ -68,13 +68,13 @@ class DepthTruth:
 
     Attributes:
         mask: (H, W) bool, the pixels in which the object is visible.
-        z: (H, W) z-depth of the visible surfaces, infinite where there is none; in
+        z_depth: (H, W) z-depth of the visible surfaces, infinite where there is none; in
             metres, or in object sizes if `size_in_metres` is None.
         size_in_metres: size of the object's longest side; None if it is unknown.
     """
 
     mask: Tensor
-    z: Tensor
+    z_depth: Tensor
     size_in_metres: float | None = None
 
     @property
@@ -85,7 +85,7 @@ class DepthTruth:
     @cached_property
     def outside_object(self) -> Tensor:
         """The pixels outside the object at a finite distance, (H, W) bool."""
-        return self.z.isfinite() & ~self.mask
+        return self.z_depth.isfinite() & ~self.mask
 
     @cached_property
     def determines_scale(self) -> bool:
@@ -93,7 +93,7 @@ class DepthTruth:
 
         There must be enough of them, and their distances must differ enough.
         """
-        distances = self.z[self.outside_object]
+        distances = self.z_depth[self.outside_object]
         if len(distances) < MIN_FIT_PIXELS:
             return False
         return float(distances.max()) >= MIN_DISTANCE_RATIO * float(distances.min())
@@ -103,7 +103,7 @@ class DepthTruth:
         """The pixels on which scale and shift are fitted, (H, W) bool: those outside
         the object, or all if those do not determine them.
         """
-        return self.outside_object if self.determines_scale else self.z.isfinite()
+        return self.outside_object if self.determines_scale else self.z_depth.isfinite()
 
     @cached_property
     def background_disparity(self) -> Tensor:
@@ -116,7 +116,7 @@ class DepthTruth:
         is unknown.
         """
         width = self.mask.shape[1]
-        disparity = self.z.reciprocal()
+        disparity = self.z_depth.reciprocal()
         column = torch.arange(width).expand(self.mask.shape)
         left = self._find_left_neighbors(column)
         right = self._find_right_neighbors(column)
@@ -189,7 +189,7 @@ class Depth(Task):
     # Which of `KINDS` the network states.
     resolved_kind: str = field(default="", metadata=tasks.FROM_RUN)
     # What the user has to state before predictions can be judged.
-    missing: str = field(default="", metadata=tasks.FROM_RUN)
+    missing_option_message: str = field(default="", metadata=tasks.FROM_RUN)
 
     def __post_init__(self) -> None:
         """Check that all options are within their limits."""
@@ -281,7 +281,7 @@ class Depth(Task):
         """
         kind = self._get_kind(output[0])
         missing = self._describe_missing_option(kind, truth)
-        return replace(self, resolved_kind=kind, missing=missing)
+        return replace(self, resolved_kind=kind, missing_option_message=missing)
 
     def _get_kind(self, depth_map: DepthMap) -> str:
         """Return the kind of the values of a map, one of `KINDS`.
@@ -327,11 +327,11 @@ class Depth(Task):
         )
 
     @property
-    def ambiguities(self) -> str:
-        return self.missing
+    def ambiguity_message(self) -> str:
+        return self.missing_option_message
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def output_remarks(self) -> tuple[str, ...]:
         """Return a sentence about the meaning of the model's numbers, once it is known.
 
         For example "The model's numbers are read as metric depth: the distance in
@@ -458,7 +458,7 @@ class Depth(Task):
         """
         predicted, is_inverse = self._align_to_truth(depth_map, truth)
         mask = truth.mask.to(predicted.device)
-        z = truth.z.to(predicted.device)
+        z = truth.z_depth.to(predicted.device)
         # of predicted to true, both z-depth or both its inverse
         if is_inverse:
             # divided by the true inverse, 1 / z
@@ -500,7 +500,7 @@ class Depth(Task):
                 scene_size = truth.size_in_metres or 1.0
                 scale = scene_size / self.size
             return values * scale, False
-        z = truth.z.to(values.device)
+        z = truth.z_depth.to(values.device)
         fit_mask = truth.fit_mask.to(values.device)
         if kind == DISPARITY:
             return _fit_scale_and_shift(values, z.reciprocal(), fit_mask), True
@@ -522,7 +522,7 @@ class Depth(Task):
             truth: truth of the image.
         """
         mask = truth.mask
-        disparity = truth.z[mask].reciprocal().to(log_factors)
+        disparity = truth.z_depth[mask].reciprocal().to(log_factors)
         behind = truth.background_disparity[mask].to(log_factors)
         is_known = behind.isfinite()
         true_relief = (disparity - behind)[is_known]
@@ -571,7 +571,7 @@ class Depth(Task):
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
         results: list[tasks.PredictionWithPayload] = []
         # a geometric mean, like that of the factors
-        distance = float(truth.z[truth.mask].double().log().mean().exp())
+        distance = float(truth.z_depth[truth.mask].double().log().mean().exp())
         for depth_map, margin in zip(output, margins, strict=True):
             log_factors = self._compute_log_factors(depth_map, truth)
             mean_log_factor = float(log_factors.mean())
@@ -622,7 +622,7 @@ class Depth(Task):
         has the pixels with a right distance and the predicted disparity.
         """
         true_mark = tasks.Mark(
-            "disparity", true=True, mask=truth.mask, map=truth.z.reciprocal()
+            "disparity", true=True, mask=truth.mask, map=truth.z_depth.reciprocal()
         )
         marks_of_images = []
         for depth_map in output:

@@ -37,13 +37,13 @@ from advsearch.tasks.boxes import (
     compute_iou,
     compute_iou_with_truth,
     compute_log_odds,
-    format_option,
-    get_box_numbers,
+    format_detection_option,
+    get_possible_scores,
     infer_unit,
     list_boxes,
     max_or_zero,
     select_best_boxes,
-    suppress,
+    suppress_overlapping_boxes,
 )
 from advsearch.tasks.classification import MISSED_PREFIX, ClassTask, Labels
 from advsearch.tasks.detector_outputs import (
@@ -86,14 +86,14 @@ class ObjectMatch:
     Attributes:
         outcome: outcome, such as found or missed. None if the object is out of view and
             nothing is detected.
-        index: class of the deciding box, or the first right class if there is none.
+        class_index: class of the deciding box, or the first right class if there is none.
         score: score of the deciding box; None if it is not finite.
         iou: intersection over union of that box with the true one; None if there is
             no such box, or no true one.
     """
 
     outcome: Outcome | None
-    index: int
+    class_index: int
     score: float | None = None
     iou: float | None = None
 
@@ -138,7 +138,7 @@ class Detection(ClassTask):
             `DECLARED_FORMAT_ATTRIBUTE`.
         fills_with_nan: whether the model fills unused rows of its output with NaN. Then
             an output with nothing but such rows means that nothing is detected.
-        doubts: reason why the boxes may be read wrongly, for a message; "" if there is
+        format_doubts: reason why the boxes may be read wrongly, for a message; "" if there is
             none.
 
     Raises:
@@ -163,7 +163,7 @@ class Detection(ClassTask):
     ignores_masks: bool = field(default=False, metadata=FROM_RUN)
     has_declared_format: bool = field(default=False, metadata=FROM_RUN)
     fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
-    doubts: str = field(default="", metadata=FROM_RUN)
+    format_doubts: str = field(default="", metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
         """Check that all options are within their limits and fit each other."""
@@ -267,13 +267,13 @@ class Detection(ClassTask):
             right_boxes = task._find_boxes_of_classes(output, truth.labels)
             if len(right_boxes):
                 doubts = task._compare_with_truth(right_boxes, truth.box_fractions)
-                return replace(task, doubts=doubts)
+                return replace(task, format_doubts=format_doubts)
         boxes = select_best_boxes(output)
         box_format = task._box_format
         doubts = box_format.describe_fault(boxes)
-        if doubts:
+        if format_doubts:
             doubts += box_format.suggest_plausible_formats(boxes)
-        return replace(task, doubts=doubts)
+        return replace(task, format_doubts=doubts)
 
     def _compare_with_truth(self, boxes: Tensor, true_box: Tensor) -> str:
         """Return doubts about the format of boxes of the right classes; "" if none.
@@ -347,11 +347,11 @@ class Detection(ClassTask):
         """
         stated_order = self._stated_network_order
         has_logits = any("logits" in detections for detections in output)
-        is_last_nothing = self.named and is_nothing_name(self.labels[-1])
+        is_last_nothing = self.has_class_names and is_nothing_name(self.labels[-1])
         if not stated_order and has_logits and is_last_nothing:
             stated_order = SOFTMAX_QUERIES
         # Only names show the number of classes; it counts a last one for nothing, too.
-        n_classes = len(self.labels) if self.named else None
+        n_classes = len(self.labels) if self.has_class_names else None
         try:
             return outputs.infer_order(output, n_classes, stated_order)
         except ValueError as error:
@@ -399,7 +399,7 @@ class Detection(ClassTask):
         return output
 
     @property
-    def ambiguities(self) -> str:
+    def ambiguity_message(self) -> str:
         """Return a message with the option that the user has to state; "" for none.
 
         An option has to be stated if no output of the model shows its value.
@@ -413,14 +413,14 @@ class Detection(ClassTask):
             return (
                 "unit: expected the unit of the model's boxes, and it finds no boxes in "
                 "noise and in the clean scene that show it; set "
-                f"{format_option('unit: fractions')} or "
-                f"{format_option('unit: pixels')}, and `boxes` too unless they are x0, "
+                f"{format_detection_option('unit: fractions')} or "
+                f"{format_detection_option('unit: pixels')}, and `boxes` too unless they are x0, "
                 "y0, x1, y1"
             )
         return ""
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def output_remarks(self) -> tuple[str, ...]:
         """Return sentences about how the model's output is read.
 
         They report the order that was inferred, if the user states none, masks that are
@@ -429,7 +429,7 @@ class Detection(ClassTask):
         remarks = []
         is_order_inferred = not self.order and bool(self.inferred_order)
         # the option that states the inferred order
-        order_option = format_option(f"order: {self.inferred_order}")
+        order_option = format_detection_option(f"order: {self.inferred_order}")
         if not self.order and self.head_shape:
             remarks.append(
                 f"The detector's output of {self.head_shape} is read as a YOLO's: "
@@ -448,8 +448,8 @@ class Detection(ClassTask):
                 "Scores and classes of the detector's boxes are distinguished by their "
                 f"values: they are read as {order_option}."
             )
-        if self.doubts:
-            remarks.append(f"The detector's boxes may be read wrongly: {self.doubts}.")
+        if self.format_doubts:
+            remarks.append(f"The detector's boxes may be read wrongly: {self.format_doubts}.")
         return tuple(remarks)
 
     @property
@@ -489,7 +489,7 @@ class Detection(ClassTask):
         height, width = facts.mask.shape
         right_classes = self.find_right_classes(facts)
         other_boxes = []
-        for other in facts.others:
+        for other in facts.facts_of_others:
             if self._has_class(other, right_classes) and other.box is not None:
                 other_boxes.append(other.box)
         return DetectionTruth(
@@ -675,7 +675,7 @@ class Detection(ClassTask):
             scores = self._clear_nothing_classes(detections)
             resolved = {**detections, "boxes": boxes, "scores": scores}
             is_finite = boxes.detach().isfinite().all(dim=1)
-            has_low_scores = (get_box_numbers(resolved) < self._min_score).all(dim=1)
+            has_low_scores = (get_possible_scores(resolved) < self._min_score).all(dim=1)
             is_used = is_finite | ~has_low_scores
             if not bool(is_used.all()):
                 resolved = {
@@ -689,7 +689,7 @@ class Detection(ClassTask):
     def _clear_nothing_classes(self, detections: Detections) -> Tensor:
         """Return the scores of an image, with 0 for classes that stand for nothing."""
         scores = detections["scores"]
-        classes = torch.tensor(self.nothing_classes, dtype=torch.long)
+        classes = torch.tensor(self.background_classes, dtype=torch.long)
         classes = classes.to(scores.device)
         if "labels" in detections:
             is_nothing = torch.isin(detections["labels"], classes)
@@ -720,7 +720,7 @@ class Detection(ClassTask):
 
     def _suppress(self, detections: Detections) -> Detections:
         """Apply non-maximum suppression with the options of the task."""
-        return suppress(detections, self._min_score, self.suppression)
+        return suppress_overlapping_boxes(detections, self._min_score, self.suppression)
 
     def _is_elsewhere(self, detections: Detections, truth: DetectionTruth) -> Tensor:
         """Return which boxes are elsewhere than the object, (D,) bool.
@@ -760,7 +760,7 @@ class Detection(ClassTask):
         assert true_box is not None
         is_on_object = self._are_on(boxes, true_box.to(boxes))
         object_overlap = compute_iou_with_truth(detections, truth)
-        for other_box in truth.others:
+        for other_box in truth.other_boxes:
             other_overlap = compute_iou(boxes, truth.to_fractions(other_box).to(boxes))
             is_on_object = is_on_object & (object_overlap >= other_overlap)
         return is_on_object
@@ -773,7 +773,7 @@ class Detection(ClassTask):
         on an object.
         """
         boxes = detections["boxes"]
-        true_boxes = list(truth.others)
+        true_boxes = list(truth.other_boxes)
         if truth.box is not None:
             true_boxes.insert(0, truth.box)
         is_on_nothing = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
@@ -887,7 +887,7 @@ class Detection(ClassTask):
             }
             if match.outcome is not None:
                 payload[OUTCOME] = match.outcome.value
-                payload["class"] = self.get_class_name(match.index)
+                payload["class"] = self.get_class_name(match.class_index)
                 payload["iou"] = None if match.iou is None else round(match.iou, 3)
             results.append((self._describe_match(match, truth), payload))
         return results
@@ -899,7 +899,7 @@ class Detection(ClassTask):
 
         Each has its corners in pixels, the name of its class, and its score.
         """
-        height, width = truth.size
+        height, width = truth.image_size
         scale = [width, height] * 2  # of x0, y0, x1, y1
         boxes: list[JsonValue] = []
         for box, label, score in list_boxes(
@@ -953,7 +953,7 @@ class Detection(ClassTask):
             return self._match_best_box(
                 Outcome.PHANTOM, detections, right_score, is_on_nothing, truth
             )
-        return ObjectMatch(outcome=None, index=truth.labels[0])
+        return ObjectMatch(outcome=None, class_index=truth.labels[0])
 
     def _match_visible_object(
         self, detections: Detections, truth: DetectionTruth
@@ -1023,14 +1023,14 @@ class Detection(ClassTask):
         If the object is out of view, that is the prediction, whatever is detected. But
         with the goal "create" a detected phantom is the prediction.
         """
-        class_name = self.get_class_name(match.index)
+        class_name = self.get_class_name(match.class_index)
         is_out_of_view = truth.box is None and self.seek != "create"
         if match.outcome is None or is_out_of_view:
             return Prediction(OUT_OF_VIEW)
         if match.outcome in LABELS:
             label = LABELS[match.outcome].format(class_name)
             return Prediction(label, None, match.score)
-        return Prediction(class_name, match.index, match.score)
+        return Prediction(class_name, match.class_index, match.score)
 
     def marks(
         self, output: Sequence[Detections], truth: DetectionTruth
@@ -1054,7 +1054,7 @@ class Detection(ClassTask):
         """Return a mark for each box of an image with a score of at least `confidence`."""
         if self._is_broken(detections):
             return []
-        height, width = truth.size
+        height, width = truth.image_size
         marks = []
         for (x0, y0, x1, y1), label, score in list_boxes(
             detections, MAX_STORED_BOXES, self.confidence, self.suppression

@@ -32,7 +32,7 @@ from torch import Tensor
 
 from advsearch.models.labels import list_sets_of_size
 from advsearch.models.model import list_tensors
-from advsearch.tasks.boxes import Detections, are_counted, are_invalid, format_option
+from advsearch.tasks.boxes import Detections, are_counted_boxes, are_invalid, format_detection_option
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, "
@@ -121,7 +121,7 @@ WORDS = {
 """Substrings that identify a component whose name is not in `NAMES`."""
 
 ORDER_ADVICE = (
-    f"say {' or '.join(format_option(f'order: {order}') for order in ORDERS)}"
+    f"say {' or '.join(format_detection_option(f'order: {order}') for order in ORDERS)}"
 )
 """Advice of messages if scores and classes cannot be distinguished."""
 
@@ -736,7 +736,7 @@ def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
         return
     advice = ""
     if not has_labels:
-        options = " or ".join(format_option(f"order: {order}") for order in QUERIES)
+        options = " or ".join(format_detection_option(f"order: {order}") for order in QUERIES)
         advice = f", or set {options}"
     raise ValueError(
         "expected scores that are probabilities in [0, 1]; apply a sigmoid or a "
@@ -835,7 +835,7 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
     """
     pairs = detections["score_or_label"]
     if not order:
-        has_values = are_counted(detections) | pairs.isnan().any(dim=1)
+        has_values = are_counted_boxes(detections) | pairs.isnan().any(dim=1)
         if bool(has_values.any()):
             raise ValueError(
                 "the output does not show which of a box's two numbers is its score; "
@@ -962,7 +962,7 @@ def _infer_grid_order(grids: Sequence[Detections], classes: int, head: str) -> s
         raise ValueError("the numbers of different pictures have different orders")
     if len(orders) > 1:
         options = " or ".join(
-            format_option(f"order: {name}") for name in sorted(orders)
+            format_detection_option(f"order: {name}") for name in sorted(orders)
         )
         raise ValueError(
             f"the output does not show the order of its numbers; set {options}"
@@ -1038,12 +1038,12 @@ def _infer_order_without_labels(columns: Sequence[Tensor], classes: int | None) 
 def _collect_pairs(detections_of_images: Sequence[Detections]) -> list[Tensor]:
     """Return the pairs "score_or_label" (K, 2) of each image that has such pairs.
 
-    Only finite pairs of boxes that count (`are_counted`) are returned.
+    Only finite pairs of boxes that count (`are_counted_boxes`) are returned.
     """
     pairs_of_images = []
     for detections in detections_of_images:
         if "score_or_label" in detections:
-            pairs = detections["score_or_label"][are_counted(detections)]
+            pairs = detections["score_or_label"][are_counted_boxes(detections)]
             is_finite = pairs.isfinite().all(dim=1)
             pairs_of_images.append(pairs[is_finite].detach())
     return pairs_of_images

@@ -44,7 +44,7 @@ class Rig(tasks.JointTask):
     task: Any = "classification"
     rule: str = RULES[0]
     # task of each image, for the model
-    part: Any = field(default=None, metadata=tasks.FROM_RUN)
+    image_task: Any = field(default=None, metadata=tasks.FROM_RUN)
     # number of cameras
     cameras: int = field(default=1, metadata=tasks.FROM_RUN)
 
@@ -61,17 +61,17 @@ class Rig(tasks.JointTask):
             )
 
     @property
-    def judges(self) -> tuple[Any, ...]:
-        return (self.part,)
+    def member_tasks(self) -> tuple[Any, ...]:
+        return (self.image_task,)
 
     @property
     def single_image_task(self) -> Task:
-        task: Task = self.part
+        task: Task = self.image_task
         return task
 
     @property
     def title(self) -> str:
-        return f"{self.name} of {self.part.title if self.part else self.task}"
+        return f"{self.name} of {self.image_task.title if self.image_task else self.task}"
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
@@ -92,7 +92,7 @@ class Rig(tasks.JointTask):
                 "task rig: expected a rig, got one camera; set `camera=rig.yaml`"
             )
         # The task of an image does not depend on the number of cameras.
-        part = self.part.on(replace(model, cameras=1), target=target, minimise=minimise)
+        part = self.image_task.on(replace(model, cameras=1), target=target, minimise=minimise)
         if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
             raise InputError(
                 f"task rig: task {part.name} judges one output for all pictures; use a "
@@ -101,17 +101,17 @@ class Rig(tasks.JointTask):
             )
         return replace(
             self,
-            part=part,
+            image_task=part,
             cameras=model.cameras,
             target=part.target,
             minimise=minimise,
         )
 
     def with_objective(self, objective: str) -> Rig:
-        return replace(self, part=self.part.with_objective(objective))
+        return replace(self, image_task=self.image_task.with_objective(objective))
 
     def check(self, facts: tasks.Facts) -> None:
-        self.part.check(facts)
+        self.image_task.check(facts)
 
     def read(self, returned: Any, count: int) -> Any:
         return returned
@@ -123,18 +123,18 @@ class Rig(tasks.JointTask):
         first_rig = output[0]
         first_output = first_rig[0]
         first_truth = None if truth is None else truth[0]
-        part = self.part.after_calibration(first_output, first_truth)
-        return replace(self, part=part)
+        part = self.image_task.after_calibration(first_output, first_truth)
+        return replace(self, image_task=part)
 
     def truth(self, facts: tasks.Facts) -> tasks.Truths:
         """Return the truth of each image."""
         # without views, all cameras have the same facts
-        views = facts.views or (facts,) * self.cameras
-        return tuple(self.part.truth(view) for view in views)
+        views = facts.facts_of_views or (facts,) * self.cameras
+        return tuple(self.image_task.truth(view) for view in views)
 
     def loss(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
         """Combine the losses of the images by the rule, (N,)."""
-        return self._combine(self._map_images(self.part.loss, output, truth))
+        return self._combine(self._map_images(self.image_task.loss, output, truth))
 
     def score(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
         """Combine the scores of the images by the rule, (N,).
@@ -142,7 +142,7 @@ class Rig(tasks.JointTask):
         With a target, the rig is a success if it reaches the target by the rule, e.g. in
         any of its images. With `minimise` it is a success if it is right by the rule.
         """
-        scores = self._map_images(self.part.score, output, truth)
+        scores = self._map_images(self.image_task.score, output, truth)
         if self.target is not None or self.minimise:
             # Such a score is minus a loss: that of the target, or that of the truth. The
             # rule combines losses, so the sign is changed before and after it.
@@ -203,7 +203,7 @@ class Rig(tasks.JointTask):
         for image_outputs in output:
             predictions = []
             for image_output in image_outputs:
-                (image_predictions,) = self.part.predictions(image_output)
+                (image_predictions,) = self.image_task.predictions(image_output)
                 predictions.append(image_predictions[0])
             predictions_of_rigs.append((tasks.join_predictions(predictions),))
         return predictions_of_rigs
@@ -224,7 +224,7 @@ class Rig(tasks.JointTask):
         rig_judgements = []
         for image_outputs, margin, score in zip(output, margins, scores, strict=True):
             judgements = [
-                self.part.judge(image_output, image_truth)[0]
+                self.image_task.judge(image_output, image_truth)[0]
                 for image_output, image_truth in zip(image_outputs, truth, strict=True)
             ]
             # The rule may ignore an image with NaN, but the rig's judgement is NaN then.
@@ -287,7 +287,7 @@ class Rig(tasks.JointTask):
         """
         marks_of_rigs = []
         for image_outputs in output:
-            marks = self.part.marks(image_outputs[0], truth[0])[0]
+            marks = self.image_task.marks(image_outputs[0], truth[0])[0]
             marks_of_rigs.append(
                 [
                     replace(mark, mask=self._pad_to_rig(mark.mask))

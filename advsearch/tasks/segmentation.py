@@ -223,7 +223,7 @@ class Segmentation(tasks.ClassTask):
         n_classes = len(logits)
         n_pixels = logits[0].numel()
         counts = class_of_pixel.bincount(minlength=n_classes)
-        counts[list(self.nothing_classes)] = 0
+        counts[list(self.background_classes)] = 0
         top_counts, top_classes = counts.topk(min(count, n_classes))
         predictions = tuple(
             tasks.Prediction(
@@ -324,7 +324,7 @@ class Segmentation(tasks.ClassTask):
         is_candidate = is_right_class if is_right else ~is_right_class
         # Other classes come last with a count of -1, even after classes without pixels.
         top_class = int(counts.masked_fill(~is_candidate, -1).argmax())
-        if is_right or top_class not in self.nothing_classes:
+        if is_right or top_class not in self.background_classes:
             prediction = tasks.Prediction(
                 self.get_class_name(top_class), top_class, accuracy
             )

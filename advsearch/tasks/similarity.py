@@ -40,7 +40,7 @@ class Gallery:
         paths: path of each image, relative to the folder.
         features: (R, D), of length 1.
         embedder: the network that embedded the images, and its preprocessing.
-        head: linear head of the method "linear": weights (names, D) and biases
+        linear_head: linear head of the method "linear": weights (names, D) and biases
             (names,). None for other methods.
     """
 
@@ -49,7 +49,7 @@ class Gallery:
     paths: tuple[str, ...]
     features: Tensor
     embedder: tuple[Any, ...] = field(repr=False)
-    head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
+    linear_head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
 
     def compute_cosines(self, features: Tensor) -> Tensor:
         """Compute the cosines (N, R) between features (N, D) of length 1 and each
@@ -104,7 +104,7 @@ def embed_gallery(folder: str, model: Model, *, linear: bool) -> Gallery:
         paths=tuple(path.relative_to(root).as_posix() for path in paths),
         features=features,
         embedder=(model.module, model.preprocessing),
-        head=fit_linear_head(features, name_index) if linear else None,
+        linear_head=fit_linear_head(features, name_index) if linear else None,
     )
 
 
@@ -315,7 +315,7 @@ class Similarity(tasks.Classification):
         default=None, compare=False, repr=False, metadata=tasks.FROM_RUN
     )
     # (D,), of length 1
-    clean: Tensor | None = field(
+    clean_features: Tensor | None = field(
         default=None, compare=False, repr=False, metadata=tasks.FROM_RUN
     )
 
@@ -411,7 +411,7 @@ class Similarity(tasks.Classification):
 
     @property
     def calibrates(self) -> bool:
-        return not self.references and self.clean is None
+        return not self.references and self.clean_features is None
 
     def after_calibration(
         self, output: Tensor, truth: tasks.Labels | None
@@ -421,7 +421,7 @@ class Similarity(tasks.Classification):
         if not self.calibrates:
             return self
         features = functional.normalize(output.detach().float(), dim=1)
-        return replace(self, clean=features[0])
+        return replace(self, clean_features=features[0])
 
     def read(self, returned: Any, count: int) -> Tensor:
         """Read features (count, D) from what a network returned.
@@ -461,8 +461,8 @@ class Similarity(tasks.Classification):
         if self.gallery is None:
             return self._compute_threshold_logits(features)
         if self.method == "linear":
-            assert self.gallery.head is not None
-            weights, biases = self.gallery.head
+            assert self.gallery.linear_head is not None
+            weights, biases = self.gallery.linear_head
             return functional.linear(
                 features, weights.to(features), biases.to(features)
             )
@@ -487,12 +487,12 @@ class Similarity(tasks.Classification):
         Raises:
             InputError: there is no clean image, or no threshold.
         """
-        if self.clean is None or self.threshold is None:
+        if self.clean_features is None or self.threshold is None:
             raise InputError(
                 "task similarity: expected references, or a clean picture before "
                 "other pictures"
             )
-        cosine = features @ self.clean.to(features)
+        cosine = features @ self.clean_features.to(features)
         threshold = torch.full_like(cosine, self.threshold)
         return torch.stack([cosine, threshold], dim=1) / TEMPERATURE
 
@@ -513,8 +513,8 @@ class Similarity(tasks.Classification):
                 logits = self.as_logits(output, truth)
                 payloads = _rank_references(self.gallery, features, logits, truth)
             else:
-                assert self.clean is not None
-                cosines = (features @ self.clean.to(features)).tolist()
+                assert self.clean_features is not None
+                cosines = (features @ self.clean_features.to(features)).tolist()
                 payloads = [{"cosine": round(cosine, 4)} for cosine in cosines]
         return [
             replace(

@@ -85,7 +85,7 @@ def split_by_image(returned: list[Any], count: int) -> list[Outputs]:
     ]
 
 
-def split_by_model(outputs: Sequence[Outputs]) -> list[Any]:
+def regroup_by_model(outputs: Sequence[Outputs]) -> list[Any]:
     """Regroup the outputs of N images from image by image to model by model."""
     return [join_outputs(model_outputs) for model_outputs in zip(*outputs, strict=True)]
 
@@ -95,7 +95,7 @@ Truths = tuple[Truth, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class JointTask(Task):
-    """Base class for tasks that are made of other tasks, the `judges`.
+    """Base class for tasks that are made of other tasks, the `member_tasks`.
 
     There is a judge for each of its truths, in their order, or a single judge for all
     truths.
@@ -105,31 +105,31 @@ class JointTask(Task):
 
     @property
     @abstractmethod
-    def judges(self) -> tuple[Any, ...]:
+    def member_tasks(self) -> tuple[Any, ...]:
         """The tasks, on their models."""
 
     @property
     def calibrates(self) -> bool:
-        return any(judge.calibrates for judge in self.judges)
+        return any(judge.calibrates for judge in self.member_tasks)
 
     @property
-    def ambiguities(self) -> str:
+    def ambiguity_message(self) -> str:
         return "; ".join(
-            judge.ambiguities for judge in self.judges if judge.ambiguities
+            judge.ambiguities for judge in self.member_tasks if judge.ambiguities
         )
 
     @property
-    def remarks(self) -> tuple[str, ...]:
-        return _distinct(judge.remarks for judge in self.judges)
+    def output_remarks(self) -> tuple[str, ...]:
+        return _distinct(judge.remarks for judge in self.member_tasks)
 
     @property
     def target_names(self) -> tuple[str, ...]:
-        return _distinct(judge.target_names for judge in self.judges)
+        return _distinct(judge.target_names for judge in self.member_tasks)
 
     def truth_names(self, truth: Any) -> tuple[str, ...]:
         truths = truth.values() if isinstance(truth, Mapping) else truth
         # A single judge is repeated for all truths; otherwise each truth has its own.
-        judged_truths = zip(cycle(self.judges), truths, strict=False)
+        judged_truths = zip(cycle(self.member_tasks), truths, strict=False)
         return _distinct(judge.truth_names(value) for judge, value in judged_truths)
 
 
@@ -173,7 +173,7 @@ class EnsembleTask(JointTask):
     tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)
 
     @property
-    def judges(self) -> tuple[Task, ...]:
+    def member_tasks(self) -> tuple[Task, ...]:
         return self.tasks
 
     @property
@@ -251,17 +251,17 @@ class EnsembleTask(JointTask):
         tasks = tuple(
             task.after_calibration(model_output, task_truth)
             for task, model_output, task_truth in zip(
-                self.tasks, split_by_model(output), truths, strict=True
+                self.tasks, regroup_by_model(output), truths, strict=True
             )
         )
         return replace(self, tasks=tasks)
 
     @property
-    def ambiguities(self) -> str:
+    def ambiguity_message(self) -> str:
         texts = []
         for model, task in zip(self.models, self.tasks, strict=True):
-            if task.ambiguities:
-                texts.append(f"{model.name}: {task.ambiguities}")
+            if task.ambiguity_message:
+                texts.append(f"{model.name}: {task.ambiguity_message}")
         return "; ".join(texts)
 
     def truth(self, facts: Facts) -> Truths:
@@ -290,7 +290,7 @@ class EnsembleTask(JointTask):
         predictions_of_models = [
             task.predictions(model_output)
             for task, model_output in zip(
-                self.tasks, split_by_model(output), strict=True
+                self.tasks, regroup_by_model(output), strict=True
             )
         ]
         return [
@@ -362,7 +362,7 @@ class EnsembleTask(JointTask):
         self, output: Sequence[Outputs], truth: Truths
     ) -> list[tuple[Any, Any, Any]]:
         """Return each task with the output of its model and its truth."""
-        return list(zip(self.tasks, split_by_model(output), truth, strict=True))
+        return list(zip(self.tasks, regroup_by_model(output), truth, strict=True))
 
 
 # ---- a task for every thing in an image ----
@@ -379,26 +379,26 @@ class EachThingTask(JointTask):
 
     name = "each thing"
 
-    part: Task  # the task for a single thing, bound to its model
+    thing_task: Task  # the task for a single thing, bound to its model
 
     @property
-    def judges(self) -> tuple[Task, ...]:
-        return (self.part,)
+    def member_tasks(self) -> tuple[Task, ...]:
+        return (self.thing_task,)
 
     def after_calibration(
         self, output: Output, truth: TruthByThing | None
     ) -> EachThingTask:
         """Calibrate the task with the truth of the first thing, which is the object."""
         first_truth = None if truth is None else next(iter(truth.values()))
-        return replace(self, part=self.part.after_calibration(output, first_truth))
+        return replace(self, thing_task=self.thing_task.after_calibration(output, first_truth))
 
     def check(self, facts: Facts) -> None:
         for thing in facts.facts_of_thing.values():
-            self.part.check(thing)
+            self.thing_task.check(thing)
 
     def truth(self, facts: Facts) -> TruthByThing:
         return {
-            name: self.part.truth(thing) for name, thing in facts.facts_of_thing.items()
+            name: self.thing_task.truth(thing) for name, thing in facts.facts_of_thing.items()
         }
 
     def loss(self, output: Output, truth: TruthByThing) -> Tensor:
@@ -419,14 +419,14 @@ class EachThingTask(JointTask):
         self, method: str, output: Output, truth: TruthByThing
     ) -> Tensor:
         """Compute the largest value of a method of the task over the things, (N,)."""
-        function = getattr(self.part, method)
+        function = getattr(self.thing_task, method)
         values = [function(output, thing_truth) for thing_truth in truth.values()]
         return torch.stack(values).amax(dim=0)
 
     def predictions(
         self, output: Output, count: int = 1
     ) -> list[tuple[Prediction, ...]]:
-        return self.part.predictions(output, count)
+        return self.thing_task.predictions(output, count)
 
     def describe(
         self, output: Output, truth: TruthByThing, margins: Sequence[float]
@@ -443,7 +443,7 @@ class EachThingTask(JointTask):
             margins: not used; the margin of each thing is computed here.
         """
         judgements_of_things = [
-            self.part.judge(output, thing_truth) for thing_truth in truth.values()
+            self.thing_task.judge(output, thing_truth) for thing_truth in truth.values()
         ]
         results: list[PredictionWithPayload] = []
         for image_judgements in zip(*judgements_of_things, strict=True):
@@ -472,7 +472,7 @@ class EachThingTask(JointTask):
         They are the true marks of all things, and the predicted ones once.
         """
         marks_of_things = [
-            self.part.marks(output, thing_truth) for thing_truth in truth.values()
+            self.thing_task.marks(output, thing_truth) for thing_truth in truth.values()
         ]
         marks_of_images = []
         for image_marks in zip(*marks_of_things, strict=True):

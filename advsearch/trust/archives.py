@@ -32,7 +32,7 @@ from advsearch.errors import FileFormatError
 from advsearch.trust.foreign_code import get_first_line
 from advsearch.trust.stored_files import make_size_error, parse_json, scale_limit
 
-LARGEST = 16 << 30  # maximum bytes of a model file, packed and unpacked
+MAX_ARCHIVE_BYTES = 16 << 30  # maximum bytes of a model file, packed and unpacked
 # maximum bytes of a member that describes the network: JSON, source code or a pickle
 LARGEST_TEXT = 64 << 20
 # maximum ratio of unpacked to packed bytes; torch itself does not compress
@@ -59,7 +59,7 @@ class Archive:
     def __contains__(self, name: str) -> bool:
         return name in self.members
 
-    def read(self, name: str, limit: int = LARGEST) -> bytes:
+    def read_member(self, name: str, limit: int = MAX_ARCHIVE_BYTES) -> bytes:
         """Return the content of a member.
 
         Raises:
@@ -96,7 +96,7 @@ class Archive:
             FileFormatError: the member is missing, too large, corrupt, or not JSON.
         """
         try:
-            return parse_json(self.read(name, LARGEST_TEXT))
+            return parse_json(self.read_member(name, LARGEST_TEXT))
         except ValueError as error:
             raise make_archive_error(
                 self.path, f"expected JSON in {name!r}, got {get_first_line(error)}"
@@ -156,10 +156,10 @@ def _check_unpacked_size(path: Path, unpacked: int, size: int) -> None:
         FileFormatError: they are more than the limit, or more than the largest ratio to
             the archive's size allows.
     """
-    if unpacked > scale_limit(LARGEST):
+    if unpacked > scale_limit(MAX_ARCHIVE_BYTES):
         raise make_size_error(
             path,
-            f"a model of at most {scale_limit(LARGEST):,} bytes unpacked",
+            f"a model of at most {scale_limit(MAX_ARCHIVE_BYTES):,} bytes unpacked",
             f"{unpacked:,}",
         )
     elif unpacked > scale_limit(LARGEST_RATIO) * size + SLACK:
@@ -243,7 +243,7 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
     writer = torch._C.PyTorchFileWriter(buffer)
     writer.set_min_version(version)
     for name in (*code, *pickles, *tensors):
-        content = code[name] if name in code else archive.read(name)
+        content = code[name] if name in code else archive.read_member(name)
         writer.write_record(name, content, len(content))
     writer.write_end_of_file()
     buffer.seek(0)
@@ -264,7 +264,7 @@ def _read_code(archive: Archive) -> dict[str, bytes]:
         for name in archive.members
         if name.startswith("code/") and name.endswith(".py")
     ]
-    code = {name: archive.read(name, LARGEST_CODE) for name in scripts}
+    code = {name: archive.read_member(name, LARGEST_CODE) for name in scripts}
     if sum(map(len, code.values())) > LARGEST_CODE:
         raise make_archive_error(
             archive.path, f"has more than {LARGEST_CODE:,} bytes of source code"
@@ -285,7 +285,7 @@ def _read_version(archive: Archive) -> int:
     """
     # torch writes the version under one of two names.
     name = "version" if "version" in archive else ".data/version"
-    version = archive.read(name, 100).decode("ascii", "replace").strip()
+    version = archive.read_member(name, 100).decode("ascii", "replace").strip()
     if not re.fullmatch("[0-9]{1,3}", version):
         raise make_archive_error(
             archive.path, f"expected a version number in {name!r}, got {version[:20]!r}"
@@ -391,7 +391,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
         FileFormatError: the pickle is corrupt, nested too deeply, creates native
             objects, or names a tensor whose data is not complete.
     """
-    reader = _Unpickler(archive.read(name, LARGEST_PICKLE))
+    reader = _Unpickler(archive.read_member(name, LARGEST_PICKLE))
     try:
         value = reader.load()
     except Exception as error:  # a corrupt pickle raises errors of many types

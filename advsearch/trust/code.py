@@ -64,7 +64,7 @@ def allowed_code() -> tuple[str, ...]:
     return tuple(sorted(_ALLOWED))
 
 
-def allow_named(settings: Mapping[str, Any]) -> None:
+def allow_code_in_settings(settings: Mapping[str, Any]) -> None:
     """Allow the code that the user names in settings, on the command line or in Python.
 
     Models, controls and metrics may name code. Settings from a file are never passed to
@@ -140,7 +140,7 @@ def allow_code_of_call(function: Function) -> Function:
         # Arguments that do not fit the signature raise TypeError here; the call below
         # raises a better one.
         with suppress(TypeError):
-            allow_named(signature.bind(*args, **keywords).arguments)
+            allow_code_in_settings(signature.bind(*args, **keywords).arguments)
         return function(*args, **keywords)
 
     return wrapper  # type: ignore[return-value]

@@ -98,7 +98,7 @@ def _strip_comments(statement: str) -> str:
     return re.sub("[ \n]+", " ", without_comments).strip(" ")
 
 
-def protect(db: sqlite3.Connection) -> None:
+def set_defensive_options(db: sqlite3.Connection) -> None:
     """Set the options of SQLite that are recommended for a database of somebody else.
 
     Its schema may not call functions and may not be changed, each page is checked when
@@ -181,7 +181,7 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     except sqlite3.OperationalError:
         db.close()
         db = sqlite3.connect(f"{address}?immutable=1", uri=True)
-    protect(db)
+    set_defensive_options(db)
     return db
 
 

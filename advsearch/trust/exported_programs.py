@@ -78,7 +78,7 @@ def is_symbol(text: str) -> bool:
     return _SYMBOL.fullmatch(text) is not None
 
 
-def problem(text: object) -> str:
+def find_expression_problem(text: object) -> str:
     """Return what is wrong with an expression over sizes of tensors; "" for nothing.
 
     A file of torch.export holds such expressions, for instance "2*s0 + 1", and torch
@@ -378,7 +378,7 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
             pickle_name = names[f"{folder}model.pt"]
             if pickle_name in archive:
                 _check_pickle(archive, pickle_name)
-                writer.write_bytes(f"{folder}model.pt", archive.read(pickle_name))
+                writer.write_bytes(f"{folder}model.pt", archive.read_member(pickle_name))
             else:
                 config = f"{folder}model_{kind}_config.json"
                 _copy_tensors(archive, writer, folder, config)
@@ -448,7 +448,7 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
                 f"{member[:80]!r} is empty, but should hold a tensor of {shape[:8]}",
             )
         if member not in copied:
-            writer.write_bytes(member, archive.read(member))
+            writer.write_bytes(member, archive.read_member(member))
             copied.add(member)
     writer.write_bytes(config, json.dumps({"config": table}).encode())
 
@@ -659,14 +659,14 @@ _TEXT_CHECKS: dict[str, Callable[[str], str]] = {
         ("tensor_values", "sym_int_values", "sym_float_values", "sym_bool_values"),
         _find_identifier_problem,
     ),
-    "expr_str": problem,
+    "expr_str": find_expression_problem,
     "target": _find_operator_problem,
     "as_operator": _find_operator_problem,
     "in_spec": _find_tree_problem,
     "out_spec": _find_tree_problem,
     "as_string": _find_argument_problem,
     "as_strings": _find_argument_problem,
-    "range_constraints": lambda text: "" if is_symbol(text) else problem(text),
+    "range_constraints": lambda text: "" if is_symbol(text) else find_expression_problem(text),
 }
 
 
@@ -688,7 +688,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
     Raises:
         FileFormatError: the member is another file, or imports something else.
     """
-    data = archive.read(name)
+    data = archive.read_member(name)
     if not data:
         return
     refusal = make_archive_error(
@@ -703,7 +703,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
     if "data.pkl" not in inner:
         raise refusal
     try:
-        steps = list(pickletools.genops(inner.read("data.pkl", LARGEST_TEXT)))
+        steps = list(pickletools.genops(inner.read_member("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
         raise refusal from None
     for step, argument, _ in steps:

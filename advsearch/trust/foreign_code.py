@@ -43,7 +43,7 @@ _TRIAL = (
 Result = TypeVar("Result")
 
 
-class TimedOut(Exception):
+class ForeignCodeTimeoutError(Exception):
     """The time is up; the message states the limit and how to raise it."""
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ def run_within_limits(
             stop()
             # The thread gets some time to end; its result is not used.
             thread.join(GRACE)
-        raise TimedOut
+        raise ForeignCodeTimeoutError
     return outcome.result()
 
 
@@ -113,14 +113,14 @@ def try_torchscript(archive: io.BytesIO) -> str:
             cwd=SUBPROCESS_DIRECTORY,
         )
     except subprocess.TimeoutExpired:
-        return str(TimedOut())
+        return str(ForeignCodeTimeoutError())
     if process.returncode < 0:  # minus the number of the signal that ended it
         return f"torch crashed while loading it (signal {-process.returncode})"
     return ""
 
 
 @dataclass(frozen=True)
-class Switches:
+class TorchState:
     """The state of torch's switches.
 
     Attributes:
@@ -139,7 +139,7 @@ class Switches:
     anomalies: bool = False
 
     @classmethod
-    def read_current(cls) -> Switches:
+    def read_current(cls) -> TorchState:
         """Return the current state of torch's switches."""
         return cls(
             dtype=torch.get_default_dtype(),
@@ -163,15 +163,15 @@ class Switches:
             torch.set_default_device(None if self.device.type == "cpu" else self.device)
 
 
-PLAIN = Switches()
+DEFAULT_TORCH_STATE = TorchState()
 
-# states of the switches before each `use_plain_switches` block, the outermost first
-_outside: list[Switches] = []
+# states of the switches before each `use_default_torch_state` block, the outermost first
+_outside: list[TorchState] = []
 
 
 @contextmanager
-def use_plain_switches() -> Iterator[None]:
-    """Set torch's global switches to their defaults (`PLAIN`) inside the block.
+def use_default_torch_state() -> Iterator[None]:
+    """Set torch's global switches to their defaults (`DEFAULT_TORCH_STATE`) inside the block.
 
     `torch.inference_mode` is switched off, too. All are restored afterwards. So our own
     computations depend neither on the caller's switches nor on those that foreign code
@@ -181,48 +181,48 @@ def use_plain_switches() -> Iterator[None]:
     if torch.is_inference_mode_enabled():
         leaves_inference_mode = torch.inference_mode(False)
     with leaves_inference_mode:
-        before = Switches.read_current()
-        # `find_code_switches` reads the switches from before the outermost block.
+        before = TorchState.read_current()
+        # `find_expected_torch_state` reads the switches from before the outermost block.
         _outside.append(before)
-        if before != PLAIN:
-            PLAIN.apply()
+        if before != DEFAULT_TORCH_STATE:
+            DEFAULT_TORCH_STATE.apply()
         try:
             yield
         finally:
             _outside.pop()
-            if Switches.read_current() != before:
+            if TorchState.read_current() != before:
                 before.apply()
 
 
-def find_code_switches() -> Switches:
-    """Return the switches that the code of a network expects, and set `PLAIN` again.
+def find_expected_torch_state() -> TorchState:
+    """Return the switches that the code of a network expects, and set `DEFAULT_TORCH_STATE` again.
 
-    Call it inside `use_plain_switches`, after the code was loaded. If loading the code
+    Call it inside `use_default_torch_state`, after the code was loaded. If loading the code
     has set switches, such as the default dtype, the network expects these. Otherwise it
-    expects those from before the outermost `use_plain_switches`.
+    expects those from before the outermost `use_default_torch_state`.
     """
-    current = Switches.read_current()
-    if current == PLAIN:  # loading the code has set no switches
-        return _outside[0] if _outside else PLAIN
-    PLAIN.apply()
+    current = TorchState.read_current()
+    if current == DEFAULT_TORCH_STATE:  # loading the code has set no switches
+        return _outside[0] if _outside else DEFAULT_TORCH_STATE
+    DEFAULT_TORCH_STATE.apply()
     return current
 
 
-def call_with_switches(module: nn.Module, switches: Switches) -> None:
-    """Make a module create its new tensors with the dtype and device of `switches`.
+def use_torch_state_in_calls(module: nn.Module, torch_state: TorchState) -> None:
+    """Make a module create its new tensors with the dtype and device of `torch_state`.
 
     Hooks set the two before each call of the module, and restore those of the caller
     after it. No hooks are added if both are the defaults.
     """
-    if (switches.dtype, switches.device) == (PLAIN.dtype, PLAIN.device):
+    if (torch_state.dtype, torch_state.device) == (DEFAULT_TORCH_STATE.dtype, DEFAULT_TORCH_STATE.device):
         return
     # A stack of the callers' switches, since a module may call itself.
-    before: list[Switches] = []
+    before: list[TorchState] = []
 
     def enter(*_: Any) -> None:
         """Set the switches of the module before a call."""
-        before.append(Switches.read_current())
-        switches.apply_to_new_tensors()
+        before.append(TorchState.read_current())
+        torch_state.apply_to_new_tensors()
 
     def leave(*_: Any) -> None:
         """Restore the switches of the caller after a call."""

@@ -52,21 +52,21 @@ def _list_spellings(name: str) -> list[str]:
     return [spelling for spelling in dict.fromkeys(spellings) if spelling]
 
 
-class References:
+class ReferencedFiles:
     """Read the files that a mesh file names.
 
     Attributes:
-        refused: files that were not read, by their normalized name (`normalize_name`),
+        refusal_by_name: files that were not read, by their normalized name (`normalize_name`),
             and the reason: `MISSING`, `OUTSIDE` or another clause.
     """
 
     def __init__(self, path: Path) -> None:
-        self.refused: dict[str, str] = {}
+        self.refusal_by_name: dict[str, str] = {}
         self._folder = os.path.realpath(path.parent)
         self._contents: dict[str, bytes] = {}
         self._size = 0
 
-    def get(self, name: str) -> bytes:
+    def read_file(self, name: str) -> bytes:
         """Return the content of a file that a mesh file names.
 
         The name is tried as written, and then as other systems or folders may spell it
@@ -75,13 +75,13 @@ class References:
         Raises:
             FileNotFoundError: the file is missing or must not be read.
         """
-        content = self.find(name)
+        content = self.read_or_explain(name)
         if isinstance(content, bytes):
             return content
-        self.refused[normalize_name(name)] = content
+        self.refusal_by_name[normalize_name(name)] = content
         raise FileNotFoundError(name)
 
-    def find(self, name: str) -> bytes | str:
+    def read_or_explain(self, name: str) -> bytes | str:
         """Return the content of a file that a mesh file names, or why it is not read.
 
         The reason is a text; unlike `get`, this method does not store it in `refused`.

@@ -56,7 +56,7 @@ def check_request(
     path: str,
     headers: Message,
     scheme: str,
-    named: str,
+    listen_host: str,
     port: int,
     token: str | None,
 ) -> None:
@@ -71,7 +71,7 @@ def check_request(
         path: requested path with its query.
         headers: headers of the request.
         scheme: scheme of the server, "http" or "https".
-        named: host at which the user made the server listen.
+        listen_host: host at which the user made the server listen.
         port: port at which it listens.
         token: secret that the query or a cookie must contain; None for a server that
             only this machine can reach.
@@ -84,7 +84,7 @@ def check_request(
             HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long"
         )
     host = headers.get("Host", "")
-    if not _is_server_address(host, named, port, token):
+    if not _is_server_address(host, listen_host, port, token):
         raise RequestRejected(
             HTTPStatus.FORBIDDEN,
             "this is not the address of the server; open the address that it printed",

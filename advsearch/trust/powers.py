@@ -107,7 +107,7 @@ class OmittedSetting(NamedTuple):
     default: Any
 
     @property
-    def how_to_set(self) -> str:
+    def advice(self) -> str:
         """How the user sets the value of the file, and how to use the default instead.
 
         Both are texts to type on the command line, after the name of a file or a run.

@@ -37,7 +37,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
 
     def construct_yaml_int(self, node: yaml.Node) -> int:
         """Return an integer; raise a YAMLError if it has too many digits."""
-        error = _problem(node, f"a number of more than {DIGITS} digits")
+        error = _make_yaml_error(node, f"a number of more than {DIGITS} digits")
         # In binary, a number has up to 3.3 times as many digits as in decimal. The
         # length is checked first because converting a long text takes long.
         if len(node.value) > 4 * DIGITS:
@@ -88,7 +88,7 @@ def parse_yaml(text: str) -> Any:
     except RecursionError:
         raise ValueError(f"lists or mappings nested deeper than {DEPTH}") from None
     except yaml.MarkedYAMLError as error:
-        # Our own errors (`_problem`) have a note. Other errors come from PyYAML.
+        # Our own errors (`_make_yaml_error`) have a note. Other errors come from PyYAML.
         got = error.note or f"other text ({error.problem or error.context})"
         mark = error.problem_mark or error.context_mark
         if mark is not None:
@@ -133,13 +133,13 @@ def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
             repeats a name, or has too many values.
     """
     if node.tag not in _PLAIN:
-        raise _problem(node, f"the tag {node.tag[:40]!r}, which no setting has")
+        raise _make_yaml_error(node, f"the tag {node.tag[:40]!r}, which no setting has")
     if isinstance(node, yaml.ScalarNode):
         return 1
     # A node that is still being counted contains an alias of itself.
     contains_itself = counts.get(id(node)) == _UNFINISHED
     if depth >= DEPTH or contains_itself:
-        raise _problem(node, f"lists or mappings nested deeper than {DEPTH}")
+        raise _make_yaml_error(node, f"lists or mappings nested deeper than {DEPTH}")
     if isinstance(node, yaml.MappingNode):
         _check_names(node)
     if id(node) not in counts:
@@ -152,7 +152,7 @@ def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
         for child in children:
             total += _count_checked(child, depth + 1, counts)
             if total > MAX_VALUES:
-                raise _problem(node, f"more than {MAX_VALUES:,} values")
+                raise _make_yaml_error(node, f"more than {MAX_VALUES:,} values")
         counts[id(node)] = total
     return counts[id(node)]
 
@@ -166,11 +166,11 @@ def _check_names(node: yaml.MappingNode) -> None:
     names = set[str]()
     for name, _ in node.value:
         if isinstance(name, yaml.ScalarNode) and name.value in names:
-            raise _problem(name, f"the name {name.value[:60]!r} twice")
+            raise _make_yaml_error(name, f"the name {name.value[:60]!r} twice")
         names.add(str(name.value))
 
 
-def _problem(node: yaml.Node, what: str) -> yaml.YAMLError:
+def _make_yaml_error(node: yaml.Node, what: str) -> yaml.YAMLError:
     """Return the error for a node that is not allowed; the message is `what`."""
     return yaml.constructor.ConstructorError(
         None, None, what, node.start_mark, note=what

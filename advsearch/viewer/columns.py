@@ -46,12 +46,12 @@ class Boxes:
         values: `VALUES_PER_BOX` uint16 values for each box, one box after the other:
             x0, y0, x1 and y1 in units of 1 / `BOX_STEPS` of a pixel, the index of the
             name, and the score in units of 1/10000 (`NO_PROBABILITY` for true boxes).
-        ends: for each row, the number of boxes in this row and all rows before.
+        cumulative_counts: for each row, the number of boxes in this row and all rows before.
         names: index of each name of a class or an object.
     """
 
     values: array[int] = field(default_factory=lambda: array("H"))
-    ends: array[int] = field(default_factory=lambda: array("L"))
+    cumulative_counts: array[int] = field(default_factory=lambda: array("L"))
     names: dict[str, int] = field(default_factory=dict)
 
     def add(self, payload: Mapping[str, Any]) -> None:
@@ -151,7 +151,7 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
         corners = dict(zip(CORNERS, values, strict=True))
     # Every row gets an entry, also one without boxes.
     n_boxes_so_far = len(boxes.values) // VALUES_PER_BOX
-    boxes.ends.append(n_boxes_so_far)
+    boxes.cumulative_counts.append(n_boxes_so_far)
     return corners
 
 
@@ -314,10 +314,10 @@ def _box_columns(rows: pd.DataFrame) -> dict[str, Any]:
     if boxes is not None and boxes.values:
         # Pandas copies the attribute to selections of rows, to which the boxes do not
         # belong.
-        are_of_these_rows = len(boxes.ends) == len(rows)
+        are_of_these_rows = len(boxes.cumulative_counts) == len(rows)
         if are_of_these_rows:
             columns["others"] = np.asarray(boxes.values, np.uint16)
-            columns["others end"] = np.asarray(boxes.ends, np.uint32)
+            columns["others end"] = np.asarray(boxes.cumulative_counts, np.uint32)
     return columns
 
 

@@ -123,7 +123,7 @@ def has_other_scripts(page: bytes) -> bool:
     return pages.has_other_scripts(page, _script_digests())
 
 
-def served_policy(*, is_trusted: bool) -> str:
+def make_security_policy(*, is_trusted: bool) -> str:
     """Return the `Content-Security-Policy` that a server sends: only `SCRIPTS` run."""
     return pages.make_served_policy(_script_digests(), is_generated=is_trusted)
 
@@ -201,7 +201,7 @@ def _list_html(lines: Sequence[str], css: str) -> Html | None:
     return make_element("ul", *(make_element("li", line) for line in lines), class_=css)
 
 
-def subject_html(*parts: tuple[str, str]) -> Html:
+def make_subject_html(*parts: tuple[str, str]) -> Html:
     """Return the subject of a run as HTML, such as "model resnet50, object mug".
 
     Args:

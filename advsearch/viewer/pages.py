@@ -115,10 +115,10 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
         content += [make_element("p", text) for text in part.text if text]
         alt = " ".join(part.text) or part.title
         content.append(_embed_figure(run, part.figure, alt))
-    if part.rows and part.heads:
+    if part.rows and part.column_heads:
         links = document.link_parts(run, part.parts)
         content.append(
-            document.make_table(part.heads, part.rows, links, part.shares, part.bars)
+            document.make_table(part.column_heads, part.rows, links, part.cell_fractions, part.bars)
         )
     elif part.rows:  # names and values
         content.append(document.facts_table({row[0]: row[1] for row in part.rows}))
@@ -191,7 +191,7 @@ def _embed_figure(run: Path, name: str, alt: str) -> Html | None:
     )
 
 
-def make_end(run: Path, result: Result, view: ShownResult) -> Html:
+def make_page_end(run: Path, result: Result, view: ShownResult) -> Html:
     """Return the end of a page: cost and conditions, commands, and all settings.
 
     The commands resume a run that was stopped, and repeat a run.
@@ -341,21 +341,21 @@ def make_view_page(
     if not has_chosen_images:  # then all images of the run are displayed
         content += _embed_all_images(run, view)
     for part in view.sections:
-        is_for_page = part.only in ("", "page")  # and not for texts alone
+        is_for_page = part.only_medium in ("", "page")  # and not for texts alone
         if is_for_page and not part.is_empty:
             content.append(make_part(run, part, view.statement))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
     subjects = views.list_subjects(result, view)
-    # `subject_html` takes pairs of a prefix and a name; here there is no prefix
+    # `make_subject_html` takes pairs of a prefix and a name; here there is no prefix
     eyebrow = join_html(
         result.command,
         "; " if subjects else None,
-        document.subject_html(*(("", name) for name in subjects)),
+        document.make_subject_html(*(("", name) for name in subjects)),
     )
     return document.make_document(
         f"{run.name}, {result.command}",
         document.make_header(eyebrow, view.statement, views.list_remarks(result, view)),
-        make_element("main", *content, make_end(run, result, view)),
+        make_element("main", *content, make_page_end(run, result, view)),
         data=data,
         scripts=scripts,
         footer=f"run {run.name}. This page needs no other file.",

@@ -69,7 +69,7 @@ from advsearch.viewer.document import (
     make_document,
     make_scrollable,
     quote_name,
-    served_policy,
+    make_security_policy,
 )
 from advsearch.viewer.thumbnails import (
     find_thumbnails,
@@ -546,7 +546,7 @@ class Dashboard(HTTPServer):
 
 
 Query = Mapping[str, list[str]]
-UNTRUSTED_POLICY = served_policy(is_trusted=False)
+UNTRUSTED_POLICY = make_security_policy(is_trusted=False)
 
 
 class Response(NamedTuple):
@@ -870,7 +870,7 @@ def _serve_page(
     data = page.encode("utf-8", "replace")  # names of files may be no text
     if home:
         data = _add_navigation(data, home, above)
-    return Response(HTML, data, served_policy(is_trusted=True))
+    return Response(HTML, data, make_security_policy(is_trusted=True))
 
 
 def _serve_stored_page(

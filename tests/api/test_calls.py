@@ -11,7 +11,7 @@ from torch import nn
 
 import advsearch
 from advsearch import losses
-from advsearch.controls import NumberControl, Parameter, compose
+from advsearch.controls import NumberControl, Parameter, compose_space
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 
@@ -61,6 +61,6 @@ class Sets(NumberControl):
 def test_inputs_of_ones_own_control_that_cannot_be_are_refused(made: Any, message: str) -> None:
     control = Sets(amount=[0, 1])
     control.made = made
-    space = compose((control,), load_scene("mug").description)
+    space = compose_space((control,), load_scene("mug").description)
     with pytest.raises(InputError, match=f"`controls` sets: .*{message}"):
         space.inputs(space.start)

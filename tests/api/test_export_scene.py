@@ -55,7 +55,7 @@ def test_stock_mitsuba_renders_the_adversarial_scene(
         assert other.mean() == pytest.approx(ours.mean(), rel=0.01)
         one, two, shown = (linear_to_srgb(np.float32(np.clip(gain * found, 0, 1))) for found in (ours, again, other))
         assert np.abs(one - shown).mean() < 1.2 * np.abs(one - two).mean()
-        np.testing.assert_allclose(one, renderer.formation.display(torch.from_numpy(ours)).numpy(), atol=1e-5)
+        np.testing.assert_allclose(one, renderer.formation.map_to_display(torch.from_numpy(ours)).numpy(), atol=1e-5)
 
 
 def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

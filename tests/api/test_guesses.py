@@ -34,7 +34,7 @@ def test_u_may_be_an_array_or_a_batch(scene: advsearch.Scene) -> None:
     whole = render(render.start, spp=1)
     for u in (render.start.numpy(), render.start.double(), render.start.tolist()):
         assert torch.equal(render(u, spp=1), whole)
-    assert torch.equal(render.mask(render.start.numpy()), render.mask(render.start))
+    assert torch.equal(render.compute_object_mask(render.start.numpy()), render.compute_object_mask(render.start))
     several = torch.tensor([[0.5], [0.75]], requires_grad=True)
     pictures = render(several, spp=1)
     assert pictures.shape == (2, 8, 8, 3) and torch.equal(pictures[1], render(several[1], spp=1))
@@ -56,7 +56,7 @@ def test_a_function_is_a_task(scene: advsearch.Scene) -> None:
         seen.append(truth)
         return (output[:, 0] - 0.4 - truth.get_number("pose.yaw") / 100.0).abs() - 0.2
 
-    network = advsearch.load_model(Level(), input_size=16, read=make_task(judge).reader)
+    network = advsearch.load_model(Level(), input_size=16, read=make_task(judge).output_reader)
     shown = advsearch.render(scene, network, task=judge, controls={"pose": {"yaw": 0}}, spp=4)
     level = float(shown.views[0].predictions[0].label)
     assert 0.2 < level < 0.6 and shown.task == "judge"

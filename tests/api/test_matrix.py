@@ -13,7 +13,7 @@ from advsearch.questions.attack.summary import MatrixResult
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification
-from advsearch.tasks.together import EnsembleTask, join_models, split_by_model
+from advsearch.tasks.together import EnsembleTask, join_models, regroup_by_model
 from small_models import easy, hard
 
 BOTH = "small_models:easy,small_models:hard"
@@ -72,7 +72,7 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     monkeypatch.setattr(Retrials, "_render", stopped)
     first = carried_out(tmp_path / "run")
     assert first.ending == "interrupted" and first.is_unfinished
-    again = attack.run(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
+    again = attack.run(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed_directory=tmp_path / "run")
     assert isinstance(again, MatrixResult) and again.ending == "done"
     assert [row.tested for row in again.table] == [row.tested for row in whole.table]
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"
@@ -83,7 +83,7 @@ def test_an_ensemble_answers_as_its_models_do() -> None:
     pictures = torch.rand((3, 32, 32, 3), generator=torch.Generator().manual_seed(0))
     both = join_models(models)
     assert both.input_size == (32, 32) and both.differentiable and len(both(pictures)) == 3
-    for own, output in zip(models, split_by_model(both(pictures)), strict=True):
+    for own, output in zip(models, regroup_by_model(both(pictures)), strict=True):
         assert torch.equal(output, own(pictures))
 
 

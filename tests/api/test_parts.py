@@ -38,11 +38,11 @@ class Backwards:
 
     def __init__(self, work: WorkerTask, lost: str) -> None:
         self.call, self.lost = parts.make_chain_worker(work.settings), lost
-        assert work.function == "advsearch.questions.attack.studies:make_chain_worker"
+        assert work.function_path == "advsearch.questions.attack.studies:make_chain_worker"
 
     def compute(self, ranges: Iterable[range]) -> Iterator[BatchResult]:
         for one in reversed(list(ranges)):
-            yield BatchResult(one, None if self.lost else self.call(one), "elsewhere", lost=self.lost)
+            yield BatchResult(one, None if self.lost else self.call(one), "elsewhere", failure_reason=self.lost)
 
 
 def elsewhere(monkeypatch: pytest.MonkeyPatch, lost: str = "") -> None:

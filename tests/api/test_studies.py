@@ -87,6 +87,6 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
         run_and_save(curve, RunContext(config))
     assert Path("runs/study/parts/00-mug/summary.json").is_file()
     monkeypatch.setattr(studies, "attack_once", carry_out)
-    summary = run_and_save(curve, RunContext(config, resumed=Path("runs/study")))
+    summary = run_and_save(curve, RunContext(config, resumed_directory=Path("runs/study")))
     assert [row.object for row in summary.table] == ["mug", "bowl", "vase", "pan"]
     assert len(asked) == 4, "two before the stop, two after it"

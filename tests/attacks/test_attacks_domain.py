@@ -114,12 +114,12 @@ def test_a_periodic_block_wraps_around() -> None:
 
 
 def test_a_discrete_choice_is_sampled_at_the_middle_of_its_options_and_has_no_uphill() -> None:
-    domain = Domain(torch.tensor([0.5, 0.4]), (Block(1, options=3), Block(1)))
+    domain = Domain(torch.tensor([0.5, 0.4]), (Block(1, n_options=3), Block(1)))
     values = domain.sample(generator(), 3000)[:, 0]
     options, counts = values.unique(return_counts=True)
     assert torch.allclose(options, torch.tensor([1 / 6, 0.5, 5 / 6]))
     assert int(counts.min()) > 900
-    assert domain.steepest(domain.start, torch.ones(2)).tolist() == [0.0, 0.5]
+    assert domain.compute_steepest_step(domain.start, torch.ones(2)).tolist() == [0.0, 0.5]
     u = torch.tensor([0.4, 0.4])
     assert torch.equal(domain.project(u), u)  # nothing snaps
     assert domain.project(torch.tensor([1.4, 0.4]))[0] == 1.0
@@ -132,8 +132,8 @@ def test_the_last_option_ends_at_one() -> None:
 
 
 def test_a_reach_shortens_the_step_in_a_box() -> None:
-    domain = Domain(torch.full((4,), 0.5), (Block(4, reach=0.03),))
-    assert float(domain.steepest(domain.start, torch.ones(4)).norm()) == pytest.approx(0.03)
+    domain = Domain(torch.full((4,), 0.5), (Block(4, unit_step_length=0.03),))
+    assert float(domain.compute_steepest_step(domain.start, torch.ones(4)).norm()) == pytest.approx(0.03)
 
 
 @pytest.mark.parametrize("extreme", [False, True])
@@ -152,8 +152,8 @@ def test_samples_lie_inside_and_repeat_with_the_seed(norm: str, extreme: bool) -
 def test_extreme_samples_sit_at_the_extremes() -> None:
     start = torch.rand(400, generator=generator(5))
     corner = (linf := ball("linf", 0.2, start)).sample(generator(), extreme=True)[0]
-    assert bool(((corner == linf.lower) | (corner == linf.upper)).all())
-    assert 120 < int((corner == linf.upper).sum()) < 280  # signs are balanced
+    assert bool(((corner == linf.lower_bounds) | (corner == linf.upper_bounds)).all())
+    assert 120 < int((corner == linf.upper_bounds).sum()) < 280  # signs are balanced
     surface = ball("l2", 0.7, start).sample(generator(), extreme=True)[0]
     assert float((surface - start).norm()) == pytest.approx(0.7, rel=1e-5)
 
@@ -187,7 +187,7 @@ def test_contains_knows_outside_nan_and_wrong_shapes() -> None:
 def test_the_steepest_step_beats_random_steps_of_its_length(norm: str) -> None:
     domain = Domain(torch.full((6,), 0.5), (Block(6, norm, None if norm == "box" else 0.1),))  # type: ignore[arg-type]
     gradient = torch.randn(6, generator=generator())
-    step = domain.steepest(domain.start, gradient)
+    step = domain.compute_steepest_step(domain.start, gradient)
     radius = domain.blocks[0].radius
     order = math.inf if norm == "linf" else 2
     assert float(torch.linalg.vector_norm(step, ord=order)) == pytest.approx(radius, rel=1e-5)
@@ -199,15 +199,15 @@ def test_the_steepest_step_beats_random_steps_of_its_length(norm: str) -> None:
 def test_the_steepest_step_survives_zero_huge_and_tiny_gradients() -> None:
     for norm in ("linf", "l2"):
         domain = ball(norm, 0.1, torch.full((3,), 0.5))
-        assert torch.equal(domain.steepest(domain.start, torch.zeros(3)), torch.zeros(3))
+        assert torch.equal(domain.compute_steepest_step(domain.start, torch.zeros(3)), torch.zeros(3))
         for scale in (1e38, 1e-37):
-            step = domain.steepest(domain.start, torch.tensor([scale, 0.0, 0.0]))
+            step = domain.compute_steepest_step(domain.start, torch.tensor([scale, 0.0, 0.0]))
             assert torch.allclose(step, torch.tensor([0.1, 0.0, 0.0]))
 
 
 def test_a_box_step_does_not_push_against_a_bound() -> None:
     domain = Domain(torch.tensor([1.0, 0.5]), (Block(2),))
-    step = domain.steepest(domain.start, torch.tensor([100.0, 1.0]))
+    step = domain.compute_steepest_step(domain.start, torch.tensor([100.0, 1.0]))
     assert step[0] == 0.0
     assert float(step[1]) == pytest.approx(domain.blocks[0].radius)
 
@@ -227,12 +227,12 @@ def test_a_bad_epsilon_names_the_flag(norm: str, epsilon: float | None) -> None:
         (lambda: Block(3, "box", 0.1), "has bounds and no norm budget; leave `epsilon` out"),
         (lambda: Block(3, low=0.5, high=0.5), r"expected 0 <= low < high <= 1, got \[0.5, 0.5\]"),
         (lambda: Block(3, "linf", 0.1, periodic=True), "a periodic block cannot have a norm budget"),
-        (lambda: Block(2, options=3), "expected a discrete choice to have at least one option, size 1, norm 'box'"),
-        (lambda: Block(1, options=-1), "expected a discrete choice to have at least one option"),
-        (lambda: Block(1, periodic=True, options=3), "expected a discrete choice"),
-        (lambda: Block(1, high=0.5, options=3), "expected a discrete choice"),
-        (lambda: Block(2, "linf", 0.1, reach=0.1), "expected a reach over 0 and norm 'box', got 0.1 and 'linf'"),
-        (lambda: Block(2, reach=0.0), "expected a reach over 0 and norm 'box', got 0.0"),
+        (lambda: Block(2, n_options=3), "expected a discrete choice to have at least one option, size 1, norm 'box'"),
+        (lambda: Block(1, n_options=-1), "expected a discrete choice to have at least one option"),
+        (lambda: Block(1, periodic=True, n_options=3), "expected a discrete choice"),
+        (lambda: Block(1, high=0.5, n_options=3), "expected a discrete choice"),
+        (lambda: Block(2, "linf", 0.1, unit_step_length=0.1), "expected a reach over 0 and norm 'box', got 0.1 and 'linf'"),
+        (lambda: Block(2, unit_step_length=0.0), "expected a reach over 0 and norm 'box', got 0.0"),
         (lambda: Domain(torch.zeros(2), (Block(2),), gradient_cost=-1), "gradient_cost: expected at least 0, got -1"),
         (lambda: Domain(torch.zeros(3), (Block(2),)), r"expected shape \(2,\), the sum of the blocks, got \(3,\)"),
         (lambda: Domain(torch.tensor([0.0, 1.5]), (Block(2),)), r"expected values in \[0.0, 1.0\], got 0 to 1.5"),

@@ -58,8 +58,8 @@ def differentiable(
     at = query.u.detach().double().requires_grad_()
     objective = value(at)
     (slope,) = torch.autograd.grad(objective, at)
-    factor = math.nan if query.index in broken else 1.0
-    shown = disturb(slope.float(), query.index) * factor if query.gradient else None
+    factor = math.nan if query.row_index in broken else 1.0
+    shown = disturb(slope.float(), query.row_index) * factor if query.gradient else None
     number = float(objective.detach()) * factor
     return Evaluation(number, shown, number > 0.0, cost=query.samples)
 
@@ -170,7 +170,7 @@ def test_what_a_search_claims_of_random_predictions_is_never_verified(rate: floa
 
         def trial(query: Query, run: int = run) -> Evaluation:
             # the picture decides, so another configuration gives another answer
-            value = margin(seeds.stream(run, f"trial {query.u.tolist()}", query.seed))
+            value = margin(seeds.derive_seed(run, f"trial {query.u.tolist()}", query.seed))
             return Evaluation.from_judgement(
                 Judgement(value, -value, value <= 0.0, Prediction("wrong" if value > 0.0 else "right"))
             )
@@ -298,7 +298,7 @@ def test_an_angle_that_goes_round_in_small_steps_does_not_drift_and_no_two_steps
         exact = (exact + step) % 1.0
     drift = abs(float(u) - exact)
     assert min(drift, 1.0 - drift) <= 1e-3
-    assert len({seeds.stream(0, "search", index) for index in range(LONG)}) >= LONG - 1
+    assert len({seeds.derive_seed(0, "search", index) for index in range(LONG)}) >= LONG - 1
 
 
 Value = Callable[[Tensor], Tensor]
@@ -327,7 +327,7 @@ class Toy:
         slope = None
         if query.gradient:
             (exact,) = torch.autograd.grad(value, at)
-            slope = self.disturb(exact.float(), query.index)
+            slope = self.disturb(exact.float(), query.row_index)
         return Evaluation(float(value.detach()), slope, False, cost=query.samples)
 
     def search(self, policy: str, steps: int, seed: int = 0) -> tuple[SearchResult, Tensor]:

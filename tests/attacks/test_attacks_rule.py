@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from advsearch.attacks import Block, Domain, Ending, Evaluation, Trials, verify
-from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
+from advsearch.attacks import Block, Domain, Ending, Evaluation, TrialCounts, verify
+from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, VerificationRule
 from advsearch.tasks import Judgement, Prediction
 
 DOMAIN = Domain(torch.zeros(1), (Block(1),))
@@ -14,9 +14,9 @@ def trials(values: list[tuple[float, bool]]) -> list[Judgement]:
     return [Judgement(score, -score, right, Prediction("")) for score, right in values]
 
 
-def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
+def run(rule: VerificationRule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
     result = verify(
-        lambda queries: [Evaluation.from_judgement(trials(found)[one.index]) for one in queries],
+        lambda queries: [Evaluation.from_judgement(trials(found)[one.row_index]) for one in queries],
         DOMAIN,
         DOMAIN.start,
         claim=Ending.BUDGET_SPENT,
@@ -26,7 +26,7 @@ def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bo
         clean=trials(clean),
         rule=rule,
     )
-    return result.ending, result.adversarial_counts.successes, result.adversarial_counts.trials
+    return result.ending, result.adversarial_counts.n_successes, result.adversarial_counts.n_trials
 
 
 def test_over_conditions_those_count_in_which_the_clean_scene_is_right() -> None:
@@ -53,7 +53,7 @@ def test_easier_means_right_and_surer_than_the_clean_scene() -> None:
 
 
 def test_no_trial_is_no_proof() -> None:
-    assert OVER_CONDITIONS.decide_ending(Ending.BUDGET_SPENT, Trials(10, 20, 1), Trials(0, 1, 1)) is Ending.BUDGET_SPENT
+    assert OVER_CONDITIONS.decide_ending(Ending.BUDGET_SPENT, TrialCounts(10, 20, 1), TrialCounts(0, 1, 1)) is Ending.BUDGET_SPENT
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.candidates import Candidate, add_candidate, select_contenders
 from advsearch.interrupts import INTERRUPTS
-from advsearch.seeds import stream
+from advsearch.seeds import derive_seed
 
 DOMAIN = Domain(torch.full((3,), 0.5), (Block(3, "linf", 0.2),))
 
@@ -63,7 +63,7 @@ def at(value: float) -> Tensor:
     return torch.full((3,), 0.5 + value)
 
 
-INDEX = {stream(0, "search", index): index for index in range(3000)}
+INDEX = {derive_seed(0, "search", index): index for index in range(3000)}
 """Which of a search's seeds one is."""
 
 
@@ -100,7 +100,7 @@ def test_every_evaluation_has_its_own_seed_and_ranking_shares_new_ones() -> None
     other = search(
         sampled([]), DOMAIN, Script((at(0.0),)), steps=1, seed=0, candidates=0, kind="baseline", render_seed=7
     )
-    assert [r.seed for r in other.history] == [stream(7, "baseline", 0)]
+    assert [r.seed for r in other.history] == [derive_seed(7, "baseline", 0)]
 
 
 def test_a_lucky_render_loses_to_a_candidate_that_keeps_its_promise() -> None:
@@ -243,7 +243,7 @@ def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
 
     def evaluate(query: Query) -> Evaluation:
         value = torch.tensor([math.nan, 1.0, -math.inf]) if query.gradient else None
-        return Evaluation(0.5, value, True, non_finite=1)
+        return Evaluation(0.5, value, True, n_non_finite=1)
 
     result = search(
         partial(map, evaluate),
@@ -269,7 +269,7 @@ def interrupt_at(number: int, error: type[BaseException] = KeyboardInterrupt) ->
     def value(u: Tensor, index: int) -> float:
         calls.append(index)
         if len(calls) == number:
-            INTERRUPTS.count += 1
+            INTERRUPTS.n_received += 1
             raise error
         return float(u[0] - 0.5)
 

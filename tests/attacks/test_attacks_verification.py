@@ -20,7 +20,7 @@ from advsearch.attacks import (
     Evaluation,
     Query,
     Random,
-    Trials,
+    TrialCounts,
     choose_spp,
     clopper_pearson,
     run_trials,
@@ -28,12 +28,12 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.trials import MarginsOf, count_max_samples, derive_trial_seed
-from advsearch.attacks.verification import EASIER, MIN_RATE, OVER_CONDITIONS, OVER_LOOKS, TRIAL_LOOKS, WORST_CASE, Rule
+from advsearch.attacks.verification import EASIER, MIN_RATE, OVER_CONDITIONS, OVER_LOOKS, TRIAL_LOOKS, WORST_CASE, VerificationRule
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import MIN_TRIALS
 from advsearch.questions.region.boxes import GrownBox
 from advsearch.questions.region.result import MIN_SAMPLES
-from advsearch.seeds import stream
+from advsearch.seeds import derive_seed
 from advsearch.statistics.paired import paired_difference
 from advsearch.tasks import Judgement, Prediction
 
@@ -81,7 +81,7 @@ def test_impossible_counts_are_refused(arguments: tuple[float, ...], message: st
 
 
 def test_trials_have_a_rate_and_its_interval() -> None:
-    trials = Trials(20, 20, 64)
+    trials = TrialCounts(20, 20, 64)
     assert trials.rate == 1.0 and trials.interval == pytest.approx((0.8316, 1.0), abs=1e-4)
 
 
@@ -131,7 +131,7 @@ def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
 
 def test_what_half_of_the_renders_do_not_settle_all_of_them_may() -> None:
     """Margins around 1.6 that scatter by 0.5: too wide an interval for four renders, not for eight."""
-    turns = {stream(2, "sample count", k): k for k in range(8)}
+    turns = {derive_seed(2, "sample count", k): k for k in range(8)}
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
         return [1.6 + 0.5 * (-1.0) ** turns[seed] for seed in seeds]
@@ -158,7 +158,7 @@ def test_a_single_render_on_the_other_side_asks_for_more_samples() -> None:
     """A trial may come out like that one: not all trials of this rung would be a success."""
 
     def margins(spp: int, seeds: Sequence[int]) -> list[float]:
-        stray = stream(0, "sample count", 2)
+        stray = derive_seed(0, "sample count", 2)
         return [-0.05 if seed == stray and spp == 16 else 1.0 for seed in seeds]
 
     choice = choose_spp({"it": margins}, seed=0, ladder=(4, 16, 64, 256))
@@ -247,24 +247,24 @@ def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
 
 
 def test_nineteen_of_twenty_are_needed() -> None:
-    assert [WORST_CASE.count_needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
+    assert [WORST_CASE.count_needed_successes(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
 
 
 @pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS, EASIER])
-def test_the_fewest_trials_are_those_whose_interval_excludes_a_claim_that_mostly_fails(rule: Rule) -> None:
+def test_the_fewest_trials_are_those_whose_interval_excludes_a_claim_that_mostly_fails(rule: VerificationRule) -> None:
     assert rule.min_trials == MIN_TRIALS
     assert clopper_pearson(rule.min_trials - 1, rule.min_trials - 1)[0] < MIN_RATE
     for trials in range(rule.min_trials, 300):
-        assert clopper_pearson(rule.count_needed(trials), trials)[0] >= MIN_RATE
+        assert clopper_pearson(rule.count_needed_successes(trials), trials)[0] >= MIN_RATE
 
 
 @pytest.mark.parametrize("trials", range(1, 6))
 def test_too_few_trials_find_nothing_even_if_all_succeed(trials: int) -> None:
     render = noisy(-3.0, 3.0, 0.1)
     result = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=trials)
-    assert (result.adversarial_counts.successes, result.clean_counts.successes) == (trials, trials)
+    assert (result.adversarial_counts.n_successes, result.clean_counts.n_successes) == (trials, trials)
     assert result.ending is Ending.NOT_VERIFIED
-    assert f"A success in {trials} of {trials} trials, 6 are needed" in result.reason
+    assert f"A success in {trials} of {trials} trials, 6 are needed" in result.counts_sentence
     enough = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=MIN_TRIALS)
     assert enough.ending is Ending.FOUND
 
@@ -273,14 +273,14 @@ def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_tr
     """Right in 5 of 10: those 5 may all succeed, and say nothing yet."""
 
     def render(query: Query) -> Evaluation:
-        order = [stream(0, "verification", number) for number in range(10)]
+        order = [derive_seed(0, "verification", number) for number in range(10)]
         hard = order.index(query.seed) % 2 == 1
         return judged(1.0 if hard or not torch.equal(query.u, DOMAIN.start) else -1.0)
 
     result = verify(
         partial(map, render), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=10, rule=OVER_CONDITIONS
     )
-    assert (result.adversarial_counts.successes, result.adversarial_counts.trials) == (5, 5)
+    assert (result.adversarial_counts.n_successes, result.adversarial_counts.n_trials) == (5, 5)
     assert result.ending is Ending.NOT_VERIFIED
 
 
@@ -321,30 +321,30 @@ def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_di
     ],
 )  # fmt: skip
 def test_the_verdict(search_ending: Ending, clean: int, adversarial: int, expected: Ending) -> None:
-    assert WORST_CASE.decide_ending(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
+    assert WORST_CASE.decide_ending(search_ending, TrialCounts(clean, 20, 64), TrialCounts(adversarial, 20, 64)) is expected
 
 
 def test_a_real_success_is_verified() -> None:
     result = verify(noisy(-3.0, 3.0, 0.3), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
     assert result.ending is Ending.FOUND
-    assert (result.clean_counts.successes, result.adversarial_counts.successes, result.renders) == (20, 20, 40)
+    assert (result.clean_counts.n_successes, result.adversarial_counts.n_successes, result.renders) == (20, 20, 40)
     assert result.adversarial_counts.spp == 64
-    assert "A success in 20 of 20 trials, 19 are needed; clean right in 20 of 20." in result.reason
+    assert "A success in 20 of 20 trials, 19 are needed; clean right in 20 of 20." in result.counts_sentence
 
 
 def test_a_success_counts_only_where_the_clean_one_is_right() -> None:
     """The clean margin is noise around zero: whatever the answer does, half of its trials prove nothing."""
     result = verify(noisy(-0.1, 5.0, 1.0), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
     assert all(trial.success for trial in result.adversarial_trials)
-    assert result.adversarial_counts.successes == result.clean_counts.successes < 19
+    assert result.adversarial_counts.n_successes == result.clean_counts.n_successes < 19
     assert result.ending in (Ending.NOT_VERIFIED, Ending.ALREADY_WRONG)
 
 
 def test_a_start_that_is_wrong_already_is_no_find() -> None:
     result = verify(noisy(2.0, 5.0, 0.1), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
     assert result.ending is Ending.ALREADY_WRONG
-    assert result.adversarial_counts.successes == 0
-    assert result.ending.explanation in result.reason
+    assert result.adversarial_counts.n_successes == 0
+    assert result.ending.explanation in result.counts_sentence
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -360,7 +360,7 @@ def test_a_lucky_claim_is_not_verified(seed: int) -> None:
 
 def test_the_configuration_is_projected_again() -> None:
     result = verify(noisy(-3.0, 3.0, 0.1), DOMAIN, DOMAIN.start + 0.4, claim=Ending.FOUND, spp=1, seed=0)
-    assert torch.equal(result.u, DOMAIN.upper)
+    assert torch.equal(result.u, DOMAIN.upper_bounds)
     beyond = verify(noisy(-3.0, -1.0, 0.0), DOMAIN, DOMAIN.start + 0.4, claim=Ending.FOUND, spp=1, seed=0)
     assert beyond.ending is Ending.NOT_VERIFIED
 
@@ -384,7 +384,7 @@ def test_both_groups_get_the_same_fresh_seeds_and_the_control_can_be_shared() ->
 
 def scripted(successes: str) -> Evaluate:
     """Trials of an answer that go as they are told, "1" a success; the clean one is right, but where "-" is told."""
-    told = {stream(0, "verification", number): what for number, what in enumerate(successes)}
+    told = {derive_seed(0, "verification", number): what for number, what in enumerate(successes)}
 
     def render(query: Query) -> Evaluation:
         clean = torch.equal(query.u, DOMAIN.start)
@@ -395,7 +395,7 @@ def scripted(successes: str) -> Evaluate:
 
 @pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS])
 @pytest.mark.parametrize("seed", range(40))
-def test_curtailed_trials_end_with_the_verdict_of_all(rule: Rule, seed: int) -> None:
+def test_curtailed_trials_end_with_the_verdict_of_all(rule: VerificationRule, seed: int) -> None:
     rng = np.random.default_rng(seed)
     share = rng.choice([0.0, 0.5, 0.85, 0.95])
     told = "".join(rng.choice(["1", "0", "-"], p=[share, 0.9 * (1 - share), 0.1 * (1 - share)], size=20))
@@ -420,7 +420,7 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
 
     found = verify(evaluate, DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
     assert made == ["control"] * 20 + ["verification"] * 2, "what nobody asks for any more is not made"
-    assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (
+    assert (found.adversarial_counts.n_successes, found.adversarial_counts.n_trials, found.ending) == (
         0,
         2,
         Ending.BUDGET_SPENT,
@@ -439,8 +439,8 @@ def test_a_curtailed_configuration_that_never_succeeds_is_tried_twice() -> None:
 def test_trials_that_nobody_counted_end_with_the_verdict(told: str, made: tuple[int, int], ending: Ending) -> None:
     """Told are trials of the answer: successes, failures, and "-" where the clean scene is wrong."""
     found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=TRIAL_LOOKS)
-    assert (found.adversarial_counts.successes, found.adversarial_counts.trials) == made
-    assert (found.ending, found.stopped) == (ending, "decided")
+    assert (found.adversarial_counts.n_successes, found.adversarial_counts.n_trials) == made
+    assert (found.ending, found.stop_reason) == (ending, "decided")
     clean = 23 if made[1] > 14 else 14
     assert (len(found.clean_trials), found.renders) == (clean, clean + made[1])
 
@@ -461,7 +461,7 @@ def test_trials_over_conditions_end_with_the_verdict(
     """As above; those count in which the clean scene is right."""
     rule = OVER_CONDITIONS
     found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
-    assert (found.adversarial_counts.successes, found.adversarial_counts.trials, found.ending) == (*made, ending)
+    assert (found.adversarial_counts.n_successes, found.adversarial_counts.n_trials, found.ending) == (*made, ending)
     assert len(found.clean_trials) == clean
     assert found.adversarial_counts.interval[0] < clopper_pearson(*made)[0], "it allows for all looks"
 
@@ -472,7 +472,7 @@ def test_a_configuration_over_conditions_goes_on_where_a_control_group_of_anothe
     first = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=OVER_LOOKS, rule=rule)
     again = partial(verify, scripted("1" * 200), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, rule=rule)
     found = again(trials=OVER_LOOKS, clean=first.clean_trials)
-    assert (found.adversarial_counts.trials, len(found.clean_trials), found.renders) == (30, 60, 30)
+    assert (found.adversarial_counts.n_trials, len(found.clean_trials), found.renders) == (30, 60, 30)
 
 
 @pytest.mark.parametrize("counting", [29, 45, 101, 200])
@@ -490,12 +490,12 @@ def test_intervals_over_conditions_cover_as_often_as_they_say(counting: int) -> 
 def test_trials_that_were_asked_for_are_all_made() -> None:
     for told in ("0" * 20, "1" * 20):
         found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=20)
-        assert (found.adversarial_counts.trials, found.clean_counts.trials, found.stopped) == (20, 20, "asked for")
+        assert (found.adversarial_counts.n_trials, found.clean_counts.n_trials, found.stop_reason) == (20, 20, "asked for")
 
 
 @pytest.mark.medium
 @pytest.mark.parametrize(("trials", "rule"), [(20, WORST_CASE), (6, WORST_CASE), (200, OVER_CONDITIONS)])
-def test_the_interval_of_curtailed_trials_covers_as_often_as_it_says(trials: int, rule: Rule) -> None:
+def test_the_interval_of_curtailed_trials_covers_as_often_as_it_says(trials: int, rule: VerificationRule) -> None:
     """Exactly, by the probability of every outcome: the failure too many comes at trial n, or never."""
     failures = rule.count_allowed_failures(trials) + 1
     for rate in np.linspace(0.005, 0.995, 199):
@@ -513,7 +513,7 @@ def test_the_trials_of_a_group_are_asked_at_once() -> None:
     asked: list[list[tuple[object, ...]]] = []
 
     def evaluate(queries: Sequence[Query]) -> list[Evaluation]:
-        asked.append([(one.kind, one.index, one.spp, one.phase, one.with_image) for one in queries])
+        asked.append([(one.kind, one.row_index, one.spp, one.phase, one.includes_image) for one in queries])
         return list(noisy(-1.0, 1.0, 0.0)(queries))
 
     verify(evaluate, DOMAIN, WORST, claim=Ending.FOUND, spp=4, seed=0, trials=3, kind="baseline", n_images=1)
@@ -524,7 +524,7 @@ def test_the_trials_of_a_group_are_asked_at_once() -> None:
 def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
     nothing = partial(map, lambda query: judged(math.nan))
     result = verify(nothing, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4)
-    assert (result.clean_counts.successes, result.adversarial_counts.successes) == (0, 0)
+    assert (result.clean_counts.n_successes, result.adversarial_counts.n_successes) == (0, 0)
     assert result.ending is not Ending.FOUND
 
 

@@ -49,9 +49,9 @@ def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(
 
     bracket = find_smallest_change(found, lambda u, _: value(u) > 0.0, domain)
     assert bracket.u is not None and bracket.is_closed
-    assert scale_domain(domain, bracket.high).contains(bracket.u) and value(bracket.u) > 0.0
-    assert share <= bracket.high <= RATIO * share  # the closed form
-    assert bracket.low <= share
+    assert scale_domain(domain, bracket.smallest_passing_scale).contains(bracket.u) and value(bracket.u) > 0.0
+    assert share <= bracket.smallest_passing_scale <= RATIO * share  # the closed form
+    assert bracket.largest_failing_scale <= share
     assert bracket.searches <= 12
 
 
@@ -64,9 +64,9 @@ def test_an_end_that_passed_by_luck_moves_out_until_it_passes_again() -> None:
     edge = shrink_towards_start(domain, domain.start + 0.4 * weights.sign(), 0.5)
     lucky = Bracket(0.48, 0.5, edge, 3, 10)
     sure = confirm_bracket(lucky, lambda u, _: margin(u) > 0.02 * -bias, domain)
-    assert 0.5 < sure.high <= 0.5 * RATIO and sure.u is not None and margin(sure.u) > 0.0
-    assert scale_domain(domain, sure.high).contains(sure.u)
-    assert confirm_bracket(lucky, lambda u, _: True, domain).high == 0.5
+    assert 0.5 < sure.smallest_passing_scale <= 0.5 * RATIO and sure.u is not None and margin(sure.u) > 0.0
+    assert scale_domain(domain, sure.smallest_passing_scale).contains(sure.u)
+    assert confirm_bracket(lucky, lambda u, _: True, domain).smallest_passing_scale == 0.5
     nothing = Bracket(1.0, math.inf, None, 1, 1)
     assert confirm_bracket(nothing, lambda u, _: False, domain) is nothing
 

@@ -79,7 +79,7 @@ def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
     assert (area > 0.0).all(), "a chart is mirrored or folded"
     assert 0.3 < area.sum() < 1.0, "much of the atlas is empty, or charts overlap"
 
-    texels = OBJECTS[name].texels // 2  # half of the canonical size: charts must stay apart there too
+    texels = OBJECTS[name].atlas_size // 2  # half of the canonical size: charts must stay apart there too
     count = np.ceil(4 * area * texels**2).astype(np.int64) + 3
     face = np.repeat(np.arange(len(uv)), count)
     rng = np.random.default_rng(0)

@@ -26,7 +26,7 @@ from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
-from advsearch.trust.code import allow_named, allowed_code, restrict_allowed_code
+from advsearch.trust.code import allow_code_in_settings, allowed_code, restrict_allowed_code
 from samples import make_attacked
 from stored_sweeps import make_sweep
 
@@ -232,7 +232,7 @@ def test_the_dashboard_imports_nothing_for_a_photograph() -> None:
     ],
 )
 def test_what_is_named_in_settings(given: dict[str, object], names: tuple[str, ...]) -> None:
-    allow_named(given)
+    allow_code_in_settings(given)
     assert allowed_code() == names
 
 

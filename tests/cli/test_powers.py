@@ -84,16 +84,16 @@ def test_a_file_alone_asks_in_vain(command: str, name: str) -> None:
     kind, given = CONFIGS[command], {name: POWERS[name]}
     file = written(command, **given, **({"run": "there"} if name == "overwrite" else {}))
     made = kind.from_yaml(file)
-    left = {one.name: one.value for one in made.left_out}
+    left = {one.name: one.value for one in made.omitted_settings}
     field = next(one.field for one in settings(kind) if one.name == name)
     default = next(one.default for one in settings(kind) if one.name == name)
     assert left == given and getattr(made, field) == default
     typed = kind.from_yaml(file, given)
-    assert getattr(typed, field) == POWERS[name] and not typed.left_out
-    assert not kind.from_yaml(file, {name: default}).left_out
+    assert getattr(typed, field) == POWERS[name] and not typed.omitted_settings
+    assert not kind.from_yaml(file, {name: default}).omitted_settings
     if name in HARMLESS:
         plain = kind.from_yaml(written(command, **{name: HARMLESS[name]}))
-        assert getattr(plain, field) == HARMLESS[name] and not plain.left_out
+        assert getattr(plain, field) == HARMLESS[name] and not plain.omitted_settings
 
 
 @pytest.mark.parametrize(("command", "name"), CASES)

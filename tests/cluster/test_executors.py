@@ -53,13 +53,13 @@ def own_workers() -> list[Any]:
 def test_processes_of_this_machine_are_killed_and_nothing_is_lost(capfd: pytest.CaptureFixture[str]) -> None:
     """They listen nowhere, Ctrl-C in a terminal passes by them, and a number of which each dies is said."""
     work = WorkerTask("cluster_work:squares", {"seconds": 0.01, "deadly": [301], "prints": True})
-    with open_workers(work, workers=2, cluster=None, tell=print) as executor:
+    with open_workers(work, workers=2, cluster=None, report_message=print) as executor:
         assert executor is not None
         seen: dict[int, Any] = {}
         lost: dict[int, str] = {}
         for count, done in enumerate(executor.compute(pieces(400))):
             seen |= dict.fromkeys(done.items, done.value)
-            lost |= {done.items[0]: done.lost} if done.lost else {}
+            lost |= {done.items[0]: done.failure_reason} if done.failure_reason else {}
             if count == 20:
                 workers = own_workers()
                 assert len(workers) == 2 and not [c for one in workers for c in one.net_connections()]
@@ -98,7 +98,7 @@ def test_a_worker_has_no_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.syspath_prepend(str(tmp_path))
     asks = "from advsearch.cluster.local import LocalExecutor\nLocalExecutor(2)\n"
     (tmp_path / "asking.py").write_text(asks)
-    with open_workers(WorkerTask("asking:work", {}), workers=1, cluster=None, tell=print) as executor:
+    with open_workers(WorkerTask("asking:work", {}), workers=1, cluster=None, report_message=print) as executor:
         assert executor is not None
         with pytest.raises(ClusterError, match="asks for workers"):
             list(executor.compute(pieces(4)))
@@ -178,7 +178,7 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path, monkeypatch: pytes
     added.write_text("7")
     work = WorkerTask("cluster_work:squares", {"seconds": 0.01, "file": str(added)}, ("file",))
     with ExitStack() as later, started(*worker), started(*scheduler) as first:
-        with open_workers(work, workers=None, cluster=f"tcp://127.0.0.1:{port}", tell=told.append) as executor:
+        with open_workers(work, workers=None, cluster=f"tcp://127.0.0.1:{port}", report_message=told.append) as executor:
             check(executor, 40, added=7)
             assert executor is not None
             results = executor.compute(pieces(200))
@@ -356,7 +356,7 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("advsearch.cluster.dask_executor.RECONNECT_SECONDS", 10_000.0)
     begun = time.monotonic()
     with pytest.raises(ClusterError, match="no scheduler"):
-        with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://127.0.0.1:9", tell=lambda text: None):
+        with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://127.0.0.1:9", report_message=lambda text: None):
             pass
     assert time.monotonic() - begun < 1_000.0  # and not `RECONNECT`
 
@@ -401,5 +401,5 @@ def test_a_cluster_is_an_address_a_file_or_this_machine(tmp_path: Path) -> None:
 def test_without_dask_the_message_is_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match="Dask"):
-        with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://a:1", tell=lambda text: None):
+        with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://a:1", report_message=lambda text: None):
             pass

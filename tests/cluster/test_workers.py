@@ -32,7 +32,7 @@ def run_all(pool: Simulated, count: int = COUNT, tell: Callable[[str], None] = l
     results = list(SimulatedWorkers(pool, tell).compute(ranges(count)))
     numbers = [number for result in results for number in result.items]
     assert sorted(numbers) == list(range(count)), "none is lost, and none comes twice"
-    assert all(result.value == list(result.items) for result in results if not result.lost)
+    assert all(result.value == list(result.items) for result in results if not result.failure_reason)
     return results
 
 
@@ -74,7 +74,7 @@ def test_kills_at_any_time_change_nothing(seed: int) -> None:
         pool.at(pool.now + chance.expovariate(1 / 15.0), strike)
 
     pool.at(1.0, strike)
-    assert not [result for result in run_all(pool) if result.lost]
+    assert not [result for result in run_all(pool) if result.failure_reason]
 
 
 def test_a_killed_worker_costs_its_range_again_and_nothing_else() -> None:
@@ -89,7 +89,7 @@ def test_a_number_of_which_every_worker_dies_is_found_and_said() -> None:
     """And no other."""
     pool = Simulated(kill={37, 212}, lag=0.1)
     pool.add(2)
-    lost = {result.items[0]: result.lost for result in run_all(pool) if result.lost}
+    lost = {result.items[0]: result.failure_reason for result in run_all(pool) if result.failure_reason}
     assert lost == {37: "no answer: 3 workers died of it", 212: "no answer: 3 workers died of it"}
 
 
@@ -99,7 +99,7 @@ def test_what_is_left_waits_for_a_worker_that_is_not_ready(deadly: int) -> None:
     pool = Simulated(kill={deadly}, load=36.0, again=8.0, lag=0.6)
     pool.add(2)
     results = SimulatedWorkers(pool).compute(range(first, first + 2) for first in range(0, 400, 2))
-    lost = {number: result.lost for result in results for number in result.items}
+    lost = {number: result.failure_reason for result in results for number in result.items}
     assert len(lost) == 400 and [number for number, reason in lost.items() if reason] == [deadly]
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.contents import FILL_LIMIT, INGREDIENTS, ContentsControl, find_interior
+from advsearch.controls.contents import FILL_LIMIT, INGREDIENTS, ContentsControl, find_vessel
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.library import load_object
@@ -41,7 +41,7 @@ def cup(outer: float = 0.5, inner: float = 0.4, floor: float = 0.1, bottom: bool
 
 
 def test_the_inside_of_a_turned_cup_is_that_of_its_profile() -> None:
-    found = find_interior(cup())
+    found = find_vessel(cup())
     assert found is not None
     np.testing.assert_allclose(found.axis, 0.0, atol=0.005)
     assert float(found.heights[0]) == pytest.approx(0.1, abs=1e-6)
@@ -53,7 +53,7 @@ def test_the_inside_of_a_turned_cup_is_that_of_its_profile() -> None:
 def test_the_liquid_stays_inside_the_vessel(name: str) -> None:
     """Level rays from the axis at the surface's height are not stopped before the surface ends, and soon after."""
     asset = load_object(name)
-    found = find_interior(asset)
+    found = find_vessel(asset)
     assert found is not None
     filled = bound(load_description(name), level=[0, 1])
     for level in (0.3, 0.77):
@@ -73,7 +73,7 @@ def surface(filled: ContentsControl, level: float) -> np.ndarray:
 
 
 def test_the_level_runs_from_the_floor_to_the_brim(scene: SceneDescription) -> None:
-    found = find_interior(scene.object)
+    found = find_vessel(scene.object)
     assert found is not None
     filled = bound(scene, level=[0, 1])
     heights = [surface(filled, level) for level in (0.0, 0.5, 1.0)]

@@ -16,7 +16,7 @@ from advsearch.controls.occlusion.silhouettes import Passage, compute_center_axe
 from advsearch.controls.pose import PoseControl
 from advsearch.scene.camera_model import make_bundled_models, make_pinhole
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.geometry import Frame, camera_to_world, object_to_world
+from advsearch.scene.geometry import Frame, camera_to_world, compute_object_to_world
 from advsearch.scene.mitsuba_backend.parts import translate_part
 from advsearch.scene.mitsuba_backend.variant import import_mitsuba
 from advsearch.scene.parts import MeshPart
@@ -30,7 +30,7 @@ def hidden(scene: SceneDescription, **settings: Any) -> Placement:
     """The placement at the upper end of the coverage's range."""
     control = OcclusionControl(**{"coverage": [0, 0.9], **settings})
     bound = control.bind(control.prepare(scene))
-    return bound.find_placement(bound.values(torch.ones_like(bound.start)), {})
+    return bound.find_placement(bound.compute_values(torch.ones_like(bound.start)), {})
 
 
 def test_a_square_is_rasterised_without_gaps_or_excess() -> None:
@@ -72,7 +72,7 @@ def test_a_card_across_a_card_hides_what_geometry_says() -> None:
     assert sweep.find_angle(1.0, 0.5) < math.atan(0.06)
 
 
-FOLDING = make_pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))
+FOLDING = make_pinhole(60.0, 1.0).with_intrinsics(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11]))
 SEEN = {
     "pinhole": (make_pinhole(35.0, 1.0), {}),
     "wide picture": (make_pinhole(35.0, 2.0), {}),
@@ -100,7 +100,7 @@ def test_primary_rays_find_the_same_share(through: str, which: str) -> None:
         torch.stack(torch.meshgrid(along, along, indexing="xy"), dim=-1).reshape(-1, 2)
     )
     rays = (directions[inside > 0.0].numpy() * (-1.0, -1.0, 1.0)) @ camera[:3, :3].T
-    pose = object_to_world(scene)
+    pose = compute_object_to_world(scene)
     object_hit = met(MeshPart("object", scene.object.mesh, scene.object.base_color, to_world=pose), camera[:3, 3], rays)
     cover_hit = met(MeshPart("cover", occluder.mesh, occluder.base_color, to_world=matrix), camera[:3, 3], rays)
     assert float((object_hit & cover_hit).sum()) / float(object_hit.sum()) == pytest.approx(0.3, abs=ACCURACY)
@@ -138,7 +138,7 @@ def test_it_follows_the_camera_and_the_pose_whatever_the_order(scene: SceneDescr
     forward = inputs["camera.to_world"][:3, 2]
     assert float(seat @ forward) / float(seat.norm()) > 0.9
     assert space.describe(u)["occlusion.hidden"]["value"] == pytest.approx(0.4, abs=ACCURACY)
-    unmoved = space.controls[0].find_placement(space.controls[0].values(u[:1]), {})  # type: ignore[attr-defined]
+    unmoved = space.controls[0].find_placement(space.controls[0].compute_values(u[:1]), {})  # type: ignore[attr-defined]
     assert abs(unmoved.distance - float(space.describe(u)["occlusion.true_distance"]["value"])) > 1e-3
 
 

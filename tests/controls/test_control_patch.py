@@ -50,7 +50,7 @@ def covered(control: PatchControl, side: int = 32) -> np.ndarray:
 def test_texels_know_their_place_on_every_object(name: str) -> None:
     mesh = load_object(name).mesh
     charts = rasterize_charts(mesh, side := 512)
-    uvs = np.einsum("hwk,hwkc->hwc", charts.weights, mesh.uvs[mesh.faces[charts.face]])
+    uvs = np.einsum("hwk,hwkc->hwc", charts.weights, mesh.uvs[mesh.faces[charts.face_index]])
     rows, columns = np.mgrid[:side, :side]
     wanted = np.stack([(columns + 0.5) / side, 1.0 - (rows + 0.5) / side], axis=-1)
     np.testing.assert_allclose(side * uvs[charts.is_covered], side * wanted[charts.is_covered], atol=0.01)

@@ -18,7 +18,7 @@ from advsearch.controls.path.pose_files import SENSOR_AXES, WORLD_TO_Z_UP
 from advsearch.engine.rendering import make_sight
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.geometry import camera_to_world, compute_center, object_to_world
+from advsearch.scene.geometry import camera_to_world, compute_center, compute_object_to_world
 from advsearch.tasks import Facts
 
 WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
@@ -51,7 +51,7 @@ def test_a_frame_of_each_path_is_the_scene_as_it_is_and_others_are_not(
     scene: SceneDescription, path: str, moves: str
 ) -> None:
     control = bound(scene, path=path, moves=moves)
-    own = torch.from_numpy((camera_to_world if moves == "camera" else object_to_world)(scene)).float()
+    own = torch.from_numpy((camera_to_world if moves == "camera" else compute_object_to_world)(scene)).float()
     assert float(control.start) == CLEAN_TIME_FRACTION[path]
     torch.testing.assert_close(placed(control, float(control.start)), own, atol=1e-5, rtol=0)
     assert float((placed(control, 0.3) - own).abs().max()) > 0.1
@@ -76,7 +76,7 @@ def test_both_move_as_each_does_alone_and_the_camera_looks_at_the_object(scene: 
     first, second = path.split("+")
     camera, thing = bound(scene, path=first), bound(scene, path=second, moves="object")
     center = torch.cat([torch.from_numpy(compute_center(scene)).float(), torch.ones(1)])
-    base = torch.from_numpy(object_to_world(scene)).float()
+    base = torch.from_numpy(compute_object_to_world(scene)).float()
     for share in (0.0, 0.3, 0.8):
         poses = both.inputs(torch.tensor([share]))
         assert set(poses) == {"camera.to_world", "object.to_world"}
@@ -125,7 +125,7 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
         "0,6,0,0,0,0,0,0,1,0,0\n1,4,0,0,0,0,0,0,-0.5,0,180\n"
     )
     one = advsearch.load_scene("mug").renderer({"path": {"path": str(file)}}, resolution=64, denoise="none")
-    scene = one.scene.definition[0]
+    scene = one.scene.description_and_filter[0]
     vertices = torch.from_numpy(scene.object.mesh.vertices).double()
     places = torch.cat([vertices, torch.ones(len(vertices), 1, dtype=torch.float64)], dim=1)
     for share in (0.0, 0.8):
@@ -133,7 +133,7 @@ def test_the_box_of_each_frame_is_where_both_have_moved_to(tmp_path: Path) -> No
         seen = torch.linalg.inv(poses["camera.to_world"]) @ poses["object.to_world"] @ places.T
         focal = 32.0 / math.tan(math.radians(scene.get_number("camera.fov") / 2.0))
         flat = 32.0 - focal * (seen[:2] / seen[2]).T
-        box = Facts("mug", compute_sight=partial(make_sight, one.surfaces(torch.tensor([share])))).box
+        box = Facts("mug", compute_sight=partial(make_sight, one.find_surfaces(torch.tensor([share])))).box
         assert box == pytest.approx((*flat.amin(dim=0).tolist(), *flat.amax(dim=0).tolist()), abs=1.2)
 
 
@@ -208,7 +208,7 @@ def test_headings_go_the_shorter_way_round(
 
 def _turned(scene: SceneDescription, control: Control, share: float) -> tuple[Tensor, Tensor]:
     """Sine and cosine of how far the object is turned."""
-    turn = placed(control, share)[:3, :3] @ torch.linalg.inv(torch.from_numpy(object_to_world(scene)).float()[:3, :3])
+    turn = placed(control, share)[:3, :3] @ torch.linalg.inv(torch.from_numpy(compute_object_to_world(scene)).float()[:3, :3])
     return turn[1, 0], turn[0, 0]
 
 
@@ -216,7 +216,7 @@ def test_of_several_paths_each_configuration_has_one_as_it_is_alone(scene: Scene
     (tmp_path / "way.csv").write_text(WAY)
     names = ["approach", "orbit+pass", str(tmp_path / "way.csv")]
     several = bound(scene, path=",".join(names))
-    assert [slot.parameter.name for slot in several.slots] == ["time", "way"] and several.start.shape == (2,)
+    assert [slot.parameter.name for slot in several.parameter_slots] == ["time", "way"] and several.start.shape == (2,)
     assert several.describe(several.start)["path.way"] == {"value": "approach", "unit": "name"}
     for number, name in enumerate(names):
         alone = bound(scene, path=name, **({} if number == 2 else {"seconds": 4.0}))

@@ -45,7 +45,7 @@ def space_of(renderer: Renderer) -> Space:
 
 def raw(renderer: Renderer, u: Tensor, spp: int) -> Tensor:
     """Radiance (H, W, 3) without the denoiser, at one seed."""
-    return renderer.scene.render_radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, spp)
+    return renderer.scene.render_radiance(renderer.scene.input_assembler(renderer.space.inputs(u)), 1, spp)
 
 
 def smooth(renderer: Renderer, seed: int) -> Tensor:
@@ -60,7 +60,7 @@ def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
         "mug", DARK, setting_values={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
     )
     control = ProjectorControl(
-        elevation=89, distance=3 * scene.size_in_metres, fov=20, lumens=5, ambient=50, resolution=4
+        elevation=89, distance=3 * scene.size_in_metres, fov=20, lumens=5, ambient_lux=50, resolution=4
     )
     prepared = control.prepare(scene)
     bound = control.bind(prepared)
@@ -87,8 +87,8 @@ def test_lux_are_those_of_the_place_where_it_has_a_unit() -> None:
     }
     dusk, studio = (space.controls[0] for space in lit.values())
     assert isinstance(dusk, ProjectorControl) and isinstance(studio, ProjectorControl)
-    assert dusk.ambient is not None and 5.0 < dusk.ambient < 50.0  # civil dusk
-    assert studio.ambient == DEFAULT_AMBIENT_LUX
+    assert dusk.ambient_lux is not None and 5.0 < dusk.ambient_lux < 50.0  # civil dusk
+    assert studio.ambient_lux == DEFAULT_AMBIENT_LUX
     assert any("lux" in note for note in lit["studio"].list_notes(studio.scene))
     assert not any("lux" in note for note in lit["avenue-dusk"].list_notes(dusk.scene))
 
@@ -108,7 +108,7 @@ def test_the_picture_without_light_is_that_without_a_projector_and_all_others_ar
 def test_the_adjoint_is_the_difference() -> None:
     renderer = renderer_of()
     scene, generator = renderer.scene, torch.Generator().manual_seed(2)
-    inputs = renderer.scene.assembly(renderer.space.inputs(0.5 + 0.0 * renderer.start))
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(0.5 + 0.0 * renderer.start))
     change = torch.rand(inputs["projector.pattern"].shape, generator=generator)
     weight = torch.randn(SIDE, SIDE, 3, generator=generator)
     (gradient,) = scene.render_adjoint(inputs, weight, 3, 16, wrt=["projector.pattern"]).values()
@@ -124,7 +124,7 @@ def test_derivatives_along_smooth_patterns_are_those_of_differences(object: str,
     scene, u = renderer.scene, renderer.start
     weight = torch.randn(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(4))
     weight = nn.functional.avg_pool2d(weight.permute(2, 0, 1)[None], 5, 1, 2)[0].permute(1, 2, 0)
-    inputs = scene.assembly(renderer.space.inputs(u))
+    inputs = scene.input_assembler(renderer.space.inputs(u))
     pattern = inputs["projector.pattern"]
     ours, theirs = [], []
     for number in range(6):
@@ -168,7 +168,7 @@ def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_p
     assert torch.equal(torch.from_numpy(read_png(file)), pattern)
     (thrown,) = space_of(renderer).controls
     assert isinstance(thrown, ProjectorControl)
-    lumens = next(one for one in thrown.slots if one.parameter.name == "lumens").parameter.default
+    lumens = next(one for one in thrown.parameter_slots if one.parameter.name == "lumens").parameter.default
     again = advsearch.load_scene("mug").renderer(
         [make_control("projector", {"picture": str(file), "lumens": [0, lumens]})], resolution=SIDE
     )

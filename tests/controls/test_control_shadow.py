@@ -35,8 +35,8 @@ def test_it_takes_light_away_and_the_camera_sees_no_card() -> None:
     renderer = renderer_of(size=[0, 1])
     low, high = (renderer.radiance(torch.tensor([u]), seed=1, spp=256) for u in (0.0, 0.6))
     assert float(high.mean()) < 0.97 * float(low.mean())
-    seen = renderer.surfaces(torch.tensor([0.6]))
-    assert not bool((seen.id == seen.names.index("shadow") + 1).any())
+    seen = renderer.find_surfaces(torch.tensor([0.6]))
+    assert not bool((seen.id == seen.shape_names.index("shadow") + 1).any())
 
 
 @pytest.mark.parametrize("azimuth", [0, 40, 120, 220, 300])
@@ -44,8 +44,8 @@ def test_it_takes_light_away_and_the_camera_sees_no_card() -> None:
 def test_it_is_out_of_sight_from_wherever_it_stands_or_put_away(azimuth: float, size: float) -> None:
     renderer = renderer_of(side=24, size=size, azimuth=azimuth, elevation=30, x=[-1, 1])
     for u in (0.0, 0.5, 1.0):
-        seen = renderer.surfaces(torch.tensor([u]))
-        assert not bool((seen.id == seen.names.index("shadow") + 1).any())
+        seen = renderer.find_surfaces(torch.tensor([u]))
+        assert not bool((seen.id == seen.shape_names.index("shadow") + 1).any())
     told = space_of(renderer).describe(torch.tensor([0.5]))["shadow.true_distance"]["value"]
     assert isinstance(told, float) and (told == 0.0 or told >= 2.0)
 

@@ -139,13 +139,13 @@ def test_the_adjoint_of_turbidity_agrees_with_differences(scene: SceneDescriptio
     mitsuba_scene = MitsubaScene(prepared, (32, 32))
     weights = torch.linspace(0.0, 1.0, 32)[:, None, None].expand(32, 32, 3).contiguous()
     u = torch.tensor([0.55], requires_grad=True)
-    inputs = mitsuba_scene.assembly(bound.inputs(u))
+    inputs = mitsuba_scene.input_assembler(bound.inputs(u))
     found = mitsuba_scene.render_adjoint({name: one.detach() for name, one in inputs.items()}, weights, 1, 128)
     sum((inputs[name] * one).sum() for name, one in found.items()).backward()  # type: ignore[union-attr]
     above, below = (
         float(
             (
-                mitsuba_scene.render_radiance(mitsuba_scene.assembly(bound.inputs(torch.tensor([at]))), 2, 256)
+                mitsuba_scene.render_radiance(mitsuba_scene.input_assembler(bound.inputs(torch.tensor([at]))), 2, 256)
                 * weights
             ).sum()
         )

@@ -31,19 +31,19 @@ def spot_of(renderer: Renderer) -> SpotControl:
 
 def raw(renderer: Renderer, u: Tensor) -> Tensor:
     """Radiance (H, W, 3) without the denoiser, at one seed."""
-    return renderer.scene.render_radiance(renderer.scene.assembly(renderer.space.inputs(u)), 1, 16)
+    return renderer.scene.render_radiance(renderer.scene.input_assembler(renderer.space.inputs(u)), 1, 16)
 
 
 @pytest.mark.medium
 def test_it_has_all_its_lumens_and_half_of_them_within_its_width() -> None:
     control = spot_of(renderer_of(width=0.3, x=0.1, lumens=[0, 10]))
-    thrown = control.project_light(control.values(torch.ones(1)))
+    thrown = control.compute_projected_image(control.compute_values(torch.ones(1)))
     assert float(thrown.mean()) == pytest.approx(1.0, rel=1e-3)  # white of as many lumens has 1 everywhere
     half = float(thrown.max()) / 2.0
-    far = float(control.values(torch.ones(1))["distance"]) / control.scene.size_in_metres
-    wide = float((thrown[..., 0] > half).float().mean()) * control.part.area * far**2
+    far = float(control.compute_values(torch.ones(1))["distance"]) / control.scene.size_in_metres
+    wide = float((thrown[..., 0] > half).float().mean()) * control.projector_part.area * far**2
     assert wide == pytest.approx(math.pi * 0.15**2, rel=0.1)  # where it has half of its brightness, too
-    assert float(thrown.detach().sum(dim=(0, 2)).argmax()) > control.part.sides[1] / 2  # to the right
+    assert float(thrown.detach().sum(dim=(0, 2)).argmax()) > control.projector_part.sides[1] / 2  # to the right
 
 
 @pytest.mark.medium
@@ -52,7 +52,7 @@ def test_the_adjoint_is_the_difference() -> None:
     assert {group.estimator for group in renderer.plan.groups} == {"adjoint"}
     weight = torch.randn(SIDE, SIDE, 3, generator=torch.Generator().manual_seed(2))
     u = THERE.clone().requires_grad_()
-    inputs = renderer.scene.assembly(renderer.space.inputs(u))
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
     (gradient,) = renderer.scene.render_adjoint(
         {name: one.detach() for name, one in inputs.items()}, weight, 1, 16, wrt=["spot.pattern"]
     ).values()

@@ -38,11 +38,11 @@ def test_no_configuration_in_the_budget_leaves_the_ball(scene: SceneDescription,
     for step in range(4):
         direction = torch.rand(bound.start.shape, generator=generator) - 0.5
         direction = direction.sign() if step % 2 else direction
-        if bound.budget.epsilon is None:
+        if bound.largest_group_budget.epsilon is None:
             u = 0.5 + 0.5 * direction.sign()
         else:
             length = direction.norm() if norm == "l2" else direction.abs().max()
-            u = (bound.start + bound.budget.epsilon * direction / length).clamp(0.0, 1.0)
+            u = (bound.start + bound.largest_group_budget.epsilon * direction / length).clamp(0.0, 1.0)
         change = texels(bound, u) - texels(bound, bound.start)
         reached = float(change.norm()) if norm == "l2" and form == "waves" else float(change.abs().max())
         assert 0.01 < reached <= 0.2 + EIGHT_BIT
@@ -81,7 +81,7 @@ def test_a_palette_repaints_what_resembles_its_colour() -> None:
     painter = make_palette_painter(image, colors, Budget("linf", 0.5))
     u = colors.clone()
     u[red] = torch.tensor([0.3, 0.7, 0.2])
-    painted = painter.texels(u.reshape(-1))
+    painted = painter.paint_texels(u.reshape(-1))
     assert float((painted[4, 2] - torch.tensor([0.3, 0.7, 0.2])).abs().max()) < 0.1
     assert float((painted[4, 6] - image[4, 6]).abs().max()) < 0.1
     assert float(painted[0, 0, 0]) < float(painted[4, 2, 0])  # the shade is still darker than the rest

@@ -10,7 +10,7 @@ import torch
 import advsearch
 from advsearch.controls import Space, make_control, make_space
 from advsearch.errors import InputError
-from advsearch.scene.assembly import Assembly
+from advsearch.scene.assembly import InputAssembler
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.geometry import compute_footprint, is_overlapping
 
@@ -50,7 +50,7 @@ def space_of(scene: SceneDescription, settings: dict[str, Any] | None = None, **
 def vertices(space: Space, u: torch.Tensor, name: str) -> np.ndarray:
     """Where a mesh is, metres."""
     assert space.scene is not None
-    assembly = Assembly(space.scene)
+    assembly = InputAssembler(space.scene)
     placed = assembly(space.inputs(u)).get(f"{name}.vertices")
     placed = assembly.meshes[name].transform_mesh(None, None)[0] if placed is None else placed
     return np.asarray(placed.double().numpy()) * space.scene.size_in_metres
@@ -73,7 +73,7 @@ def test_at_its_start_all_stands_where_it_was_put(scene: SceneDescription) -> No
         f"{thing}.{parameter}" for thing in ("chair", "stop-sign", "car") for parameter in ("x", "y", "heading")
     ]
     for name in scene.things:
-        before = Assembly(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.size_in_metres
+        before = InputAssembler(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.size_in_metres
         np.testing.assert_allclose(vertices(space, space.start, name), before, atol=CLOSE)
 
 
@@ -123,7 +123,7 @@ def test_what_is_away_is_neither_seen_nor_in_the_way_and_throws_no_shadow() -> N
         render = loaded.renderer(chosen, resolution=48, denoise="none")
         with torch.no_grad():
             pictures += [render(torch.tensor([share]), 0, 64) for share in ((0.25, 0.75) if control else (0.5,))]
-            seen = [set(render.surfaces(torch.tensor([share])).names) for share in (0.25, 0.75)]
+            seen = [set(render.find_surfaces(torch.tensor([share])).shape_names) for share in (0.25, 0.75)]
     there, away, without = pictures
     assert 8.0 * float((away - without).abs().mean()) < float((there - without).abs().mean())  # the rest is noise
     assert "chair" not in seen[0]

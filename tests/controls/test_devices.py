@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls import CONTROLS, compose, make_control
+from advsearch.controls import CONTROLS, compose_space, make_control
 from advsearch.controls.corruption import CORRUPTION_NAMES
 from conftest import ROOT
 from elsewhere import ELSEWHERE, Away, elsewhere
@@ -51,7 +51,7 @@ def test_what_a_control_gives_lies_where_the_searchs_numbers_do(kind: str, given
     scene = advsearch.load_scene("person" if kind == "body" else "mug", things=beside).description
     if kind == "backdrop":
         scene = load_photographed_box().description
-    space = compose((make_control(kind, given),), scene)
+    space = compose_space((make_control(kind, given),), scene)
     u = (0.25 * space.start + 0.5).clamp(0.0, 1.0)
     image = torch.full((8, 8, 3), 0.5)
     expected, seen = space.inputs(u), space.apply_to_image(u, image)

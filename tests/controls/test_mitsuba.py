@@ -38,7 +38,7 @@ def test_the_picture_is_that_of_the_scene_with_the_value(box: advsearch.Scene, t
     controls = {f"mitsuba:{RED}": [0.2, 0.4], f"mitsuba:{GLOW}": [4, 6]}
     renderer = box.renderer(controls, resolution=SIZE, denoise="none")
     middle = torch.full_like(renderer.start, 0.5)
-    inputs = renderer.scene.assembly(renderer.space.inputs(middle))
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(middle))
     found = renderer.scene.render_radiance(inputs, 1, 36).numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
     write_scene(renderer.scene, inputs, tmp_path / "again.xml", "")

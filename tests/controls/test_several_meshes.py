@@ -6,7 +6,7 @@ import pytest
 from advsearch.controls import CONTROLS, Space, make_control, make_space
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
-from advsearch.scene.assembly import Assembly
+from advsearch.scene.assembly import InputAssembler
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.parts import MeshPart
@@ -32,7 +32,7 @@ def scene() -> SceneDescription:
 def places(scene: SceneDescription, space: Space | None = None) -> np.ndarray:
     """Where the post's vertices are: in the clean scene, or at the start of a space."""
     if space is not None:
-        vertices = Assembly(space.scene or scene)(space.inputs(space.start))["post.vertices"]
+        vertices = InputAssembler(space.scene or scene)(space.inputs(space.start))["post.vertices"]
         return np.asarray(vertices.double().numpy())
     part = scene.meshes["post"]
     return np.asarray(part.mesh.vertices @ part.to_world[:3, :3].T + part.to_world[:3, 3])

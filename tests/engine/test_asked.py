@@ -92,4 +92,4 @@ def test_the_derivative_is_that_of_the_picture_and_that_of_what_was_asked_for(sc
     expected = at.grad + (1.0 + 0.1 * float(yaw.detach())) * picture.gradient
     assert found.objective == pytest.approx(float(value.detach()), rel=1e-5)
     assert torch.allclose(found.gradient, expected, rtol=1e-3, atol=1e-5)
-    assert made.plan.select_groups("secant") and made.plan.select_groups("adjoint"), "both ways"
+    assert made.gradient_plan.select_groups("secant") and made.gradient_plan.select_groups("adjoint"), "both ways"

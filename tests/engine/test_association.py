@@ -33,7 +33,7 @@ def test_the_statistic_is_that_of_the_likelihood_ratio() -> None:
 def test_wrong_predictions_are_shared_out_to_the_last() -> None:
     counts = PartCounts(2, 9, 4, seed=1)
     for number in range(9):
-        counts.add(np.array([0] if number % 3 else [0, 1]), number < 4)
+        counts.add_image(np.array([0] if number % 3 else [0, 1]), number < 4)
     assert counts.visible_counts.tolist() == [9, 3] and counts.wrong_counts.tolist() == [4, 2]
     assert (counts.permuted_counts[:, 0] == 4).all() and len(counts.permuted_counts) == N_PERMUTATIONS
     assert counts.permuted_counts[:, 1].mean() == pytest.approx(4 * 3 / 9, abs=0.2)
@@ -47,7 +47,7 @@ def test_nothing_is_told_where_nothing_is_but_what_is_there() -> None:
         counts = PartCounts(60, 40, int(wrong.sum()), seed=trial)
         angle, width = random.random(40), 0.4
         for picture, failed in zip(angle, wrong, strict=True):  # neighbours are seen together
-            counts.add(np.flatnonzero((np.arange(60) / 60 - picture) % 1.0 < width), bool(failed))
+            counts.add_image(np.flatnonzero((np.arange(60) / 60 - picture) % 1.0 < width), bool(failed))
         told += bool(compare_parts(counts, slice(0, 60), 5).significant.any())
     assert told <= 8  # 3 on average; 9 or more once in 200
 
@@ -55,7 +55,7 @@ def test_nothing_is_told_where_nothing_is_but_what_is_there() -> None:
 def test_a_part_that_decides_is_told_and_one_that_is_always_there_is_not_compared() -> None:
     counts = PartCounts(3, 24, 12, seed=0)
     for number in range(24):
-        counts.add(np.array([0, *([1] if number < 12 else [])]), number < 12)
+        counts.add_image(np.array([0, *([1] if number < 12 else [])]), number < 12)
     found = compare_parts(counts, slice(0, 3), 5)
     assert found.compared.tolist() == [False, True, False] and found.significant.tolist() == [False, True, False]
     assert found.difference[1] == 1.0 and found.low[1] == found.strength[1] > 0.6 and np.isnan(found.p[0])
@@ -84,7 +84,7 @@ def test_parts_that_some_drives_show_are_told_from_chance_by_drive() -> None:
         exchanged = permute_draws(wrong.astype(np.int8), draws, seed=trial)
         counts = PartCounts(8, 60, int(wrong.sum()), seed=trial, permuted_failures=exchanged)
         for seen, failed in zip(shows, wrong, strict=True):
-            counts.add(np.flatnonzero(seen), bool(failed))
+            counts.add_image(np.flatnonzero(seen), bool(failed))
         found = compare_parts(counts, slice(0, 8), 5)
         told += bool(found.significant.any())
         assert np.isnan(found.low).all() and (found.strength[found.compared] >= 0.0).all()

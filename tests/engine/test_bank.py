@@ -34,11 +34,11 @@ def test_conditions_are_stratified_and_numbered() -> None:
     middle, and a ball of a norm is drawn from."""
     box = Domain(torch.full((3,), 0.5), (Block(2, low=0.2, high=0.6), Block(1)))
     drawn = torch.stack([sample_condition(box, number, seed=3) for number in range(16)])
-    shares = (drawn - box.lower) / (box.upper - box.lower)
+    shares = (drawn - box.lower_bounds) / (box.upper_bounds - box.lower_bounds)
     assert all(sorted((shares[:, one] * 16).floor().tolist()) == list(range(16)) for one in range(3))
     assert torch.equal(sample_condition(box, 7, seed=3), drawn[7])
     assert not torch.equal(sample_condition(box, 7, seed=4), drawn[7])
-    choice = Domain(torch.tensor([0.25]), (Block(1, options=2),))
+    choice = Domain(torch.tensor([0.25]), (Block(1, n_options=2),))
     assert {float(sample_condition(choice, number, seed=0)) for number in range(8)} == {0.25, 0.75}
     ball = Domain(torch.full((4,), 0.5), (Block(4, norm="l2", epsilon=0.1),))
     assert ball.contains(sample_condition(ball, 5, seed=0)) and sample_condition(ball, 5, seed=0).ne(0.5).any()

@@ -10,7 +10,7 @@ import torch
 
 import advsearch
 from advsearch import seeds
-from advsearch.controls import compose
+from advsearch.controls import compose_space
 from advsearch.controls.path import PathControl
 from advsearch.engine.loading import make_renderer
 from advsearch.models import ModelWarning
@@ -87,17 +87,17 @@ def test_each_picture_of_a_clip_is_that_of_its_time(tmp_path: Path) -> None:
     """The first bit for bit, the others with noise of their own, as in stills at these times."""
     scene = advsearch.load_scene("mug", camera=clip(tmp_path)).description
     path = PathControl(path="orbit", seconds=2.0, time=[0.0, 1.0])
-    whole = make_renderer(scene, compose([path], scene), SIDE, "none", 0)
+    whole = make_renderer(scene, compose_space([path], scene), SIDE, "none", 0)
     alone = load_description("mug")
-    still = make_renderer(alone, compose([path], alone), SIDE, "none", 0)
+    still = make_renderer(alone, compose_space([path], alone), SIDE, "none", 0)
     u = torch.tensor([0.4])
     with torch.no_grad():
         pictures = whole(u, 3, 4).split(SIDE, dim=1)
         for number, picture in enumerate(pictures):
-            seed = 3 if number == 0 else seeds.stream(3, "camera", number)
+            seed = 3 if number == 0 else seeds.derive_seed(3, "camera", number)
             torch.testing.assert_close(picture, still(u + 0.1 * number, seed, 4), atol=2e-3, rtol=0.0)
-            mask = still.mask(u + 0.1 * number)
-            assert torch.equal(whole.surfaces(u, camera=number).visible_mask("object"), mask)
+            mask = still.compute_object_mask(u + 0.1 * number)
+            assert torch.equal(whole.find_surfaces(u, camera=number).visible_mask("object"), mask)
     assert float((pictures[3] - pictures[0]).abs().mean()) > 0.02
 
 

@@ -61,12 +61,12 @@ def test_a_window_is_cut_out_and_pasted() -> None:
     pixels = torch.rand(4, 7, 3, requires_grad=True)
     image = torch.rand(10, 20, 3)
     pasted = window.paste(pixels, image)
-    outside = window.is_outside((10, 20))
+    outside = window.make_outside_mask((10, 20))
     assert int(outside.sum()) == 200 - 28
-    assert torch.equal(pasted[outside], image[outside]) and torch.equal(window.select(pasted), pixels)
+    assert torch.equal(pasted[outside], image[outside]) and torch.equal(window.crop_image(pasted), pixels)
     assert torch.equal(window.pad(pixels, (10, 20))[outside], torch.zeros(172, 3))
     (gradient,) = torch.autograd.grad((pasted * image).sum(), pixels)
-    assert torch.equal(gradient, window.select(image))
+    assert torch.equal(gradient, window.crop_image(image))
 
 
 @pytest.fixture(scope="module")
@@ -85,11 +85,11 @@ def test_pixels_of_the_window_are_those_of_the_whole_picture(renderer: Renderer)
         pasted = crop(renderer.start, 5, 64)
         whole = renderer(renderer.start, 6, 64)
         again = crop(renderer.start, 5, 64)
-    outside = WINDOW.is_outside((40, 40))
+    outside = WINDOW.make_outside_mask((40, 40))
     assert torch.equal(pasted[outside], around[outside])
     noise = (renderer(renderer.start, 7, 64) - whole).detach()
-    difference = WINDOW.select(pasted - whole)
-    assert float(difference.square().mean()) < 1.5 * float(WINDOW.select(noise).square().mean())
+    difference = WINDOW.crop_image(pasted - whole)
+    assert float(difference.square().mean()) < 1.5 * float(WINDOW.crop_image(noise).square().mean())
     assert torch.equal(pasted, again)
     assert torch.equal(renderer(renderer.start, 6, 64).detach(), whole)  # the film is whole again
 
@@ -100,7 +100,7 @@ def test_its_gradient_is_that_of_the_whole_picture_and_of_differences(renderer: 
     weights = torch.rand(40, 40, 3, generator=torch.Generator().manual_seed(0))
 
     def loss(image: Tensor) -> Tensor:
-        return (image * weights)[~WINDOW.is_outside((40, 40))].sum()
+        return (image * weights)[~WINDOW.make_outside_mask((40, 40))].sum()
 
     u = 0.5 * renderer.start + 0.2
     spp = 128
@@ -127,11 +127,11 @@ def test_a_matrix_of_the_window_predicts_what_a_whole_one_does(renderer: Rendere
                 LinearRenderer(traced, traced.start, 5),
             )
         ]  # fmt: skip
-    outside = WINDOW.is_outside((40, 40))
+    outside = WINDOW.make_outside_mask((40, 40))
     assert not cut[outside].any()
-    noise = float(WINDOW.select(whole - other).square().mean())
-    assert float(WINDOW.select(cut - whole).square().mean()) < 2.0 * noise
-    assert cosine(WINDOW.select(cut), WINDOW.select(whole)) > 0.99
+    noise = float(WINDOW.crop_image(whole - other).square().mean())
+    assert float(WINDOW.crop_image(cut - whole).square().mean()) < 2.0 * noise
+    assert cosine(WINDOW.crop_image(cut), WINDOW.crop_image(whole)) > 0.99
 
 
 @pytest.mark.medium
@@ -140,8 +140,8 @@ def test_the_window_is_chosen_by_what_changes_outside(monkeypatch: pytest.Monkey
     problem = make_problem(resolution=96)
     chosen = find_window(problem)
     assert isinstance(chosen, Windowing) and chosen.window.area < windows.MAX_AREA * 96 * 96
-    seen = problem.renderer.mask(problem.domain.start)
-    assert not bool(seen[chosen.window.is_outside((96, 96))].any())
+    seen = problem.renderer.compute_object_mask(problem.domain.start)
+    assert not bool(seen[chosen.window.make_outside_mask((96, 96))].any())
     assert chosen.deviation.is_accepted and chosen.deviation.levels < windows.MAX_LEVELS
     again = find_window(problem)
     assert isinstance(again, Windowing) and again.deviation == chosen.deviation

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, get_objective, search
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, ObjectiveKind
-from advsearch.controls import CONTROLS, NumberControl, Parameter, compose
+from advsearch.controls import CONTROLS, NumberControl, Parameter, compose_space
 from advsearch.copies import copy_value
 from advsearch.engine.judging import judge_images
 from advsearch.engine.loading import load_scene, make_controls
@@ -157,7 +157,7 @@ def test_a_task_from_a_function_and_the_facts_that_it_gets() -> None:
     mask = torch.ones(2, 2, dtype=torch.bool)
     facts = Facts(
         "mug",
-        describe_values=lambda: {"pose.yaw": 1.0},
+        compute_numbers=lambda: {"pose.yaw": 1.0},
         compute_sight=lambda: Sight(mask, torch.ones(2, 2), torch.ones(2, 2)),
     )
     task, output = make_task(judge), LOGITS.clone()
@@ -207,7 +207,7 @@ def test_a_policy_that_writes_into_what_it_is_handed_moves_no_budget() -> None:
         result = search(
             partial(evaluate, destroys=destroys), domain, Walking(destroys), steps=5, seed=0, on_step=told(destroys)
         )
-        assert domain.start.eq(0.5).all() and domain.upper.eq(0.7).all()
+        assert domain.start.eq(0.5).all() and domain.upper_bounds.eq(0.7).all()
         found.append((result.best_u.tolist(), [one.objective for one in result.history], result.agreement))
     assert found[0] == found[1]
     domain = Domain(torch.full((4,), 0.5), (Block(4, "linf", 0.2),))
@@ -238,7 +238,7 @@ class DimControl(NumberControl):
 
 
 def test_a_control_that_destroys_what_it_is_handed() -> None:
-    space = compose([*make_controls(["texture"]), DimControl(amount=[0, 1])], MUG)
+    space = compose_space([*make_controls(["texture"]), DimControl(amount=[0, 1])], MUG)
     u = space.start.clone()
     image = torch.rand(4, 4, 3)
     kept_u, kept, before = u.clone(), image.clone(), space.inputs(u)["object.base_color"].clone()
@@ -257,7 +257,7 @@ def test_what_a_space_hands_out_may_be_destroyed(kind: str) -> None:
     scene = load_scene(**scenes[kind]).description if kind in scenes else MUG
     if kind == "backdrop":
         scene = load_photographed_box().description
-    space = compose(make_controls([kind]), scene)
+    space = compose_space(make_controls([kind]), scene)
     u = space.start.clone()
     first = {
         ask: copy_value(getattr(space, ask)(u)) for ask in ("inputs", "get_printable_colors", "get_numeric_values")

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult
 from advsearch.attacks.candidates import FailureRate, Failures, FoundFailure
-from advsearch.attacks.verification import TRIAL_LOOKS, Rule
+from advsearch.attacks.verification import TRIAL_LOOKS, VerificationRule
 from advsearch.engine.journal import Journal, ParallelEvaluator
 from advsearch.engine.verifier import Verifier
 from advsearch.progress import NullProgress, Stages
@@ -18,7 +18,7 @@ from advsearch.questions.attack.stages import MAX_TRIED_FAILURES, verify_failure
 from advsearch.questions.attack.summary import DifferentFailures
 from stand_ins import StandInProblem
 
-NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
+NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", n_options=2)))
 
 
 class Coin(StandInProblem):
@@ -38,17 +38,17 @@ def failure(first: float, objective: float = 1.0) -> FoundFailure:
     return FoundFailure(torch.tensor([first, 0.5, 0.25]), objective, {0: (first - 0.05, first + 0.05), 2: (0.0, 0.5)})
 
 
-def checked(known: Failures, *, rule: Rule | None = None, trials: int = 20) -> Verifier:
+def checked(known: Failures, *, rule: VerificationRule | None = None, trials: int = 20) -> Verifier:
     """An attack of which everything but the different failures has been checked."""
     problem: Any = Coin(domain=NAMED)
     problem.rule = rule or problem.rule
-    verifier = Verifier(Journal(None, ParallelEvaluator(problem)), (8,), Stages(NullProgress()), looks=TRIAL_LOOKS)
+    verifier = Verifier(Journal(None, ParallelEvaluator(problem)), (8,), Stages(NullProgress()), look_sizes=TRIAL_LOOKS)
     nothing = (0.0, 0.0, 0.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
     found = SearchResult(torch.full((3,), 0.5), *nothing, failures=known)
-    verifier.state.search = found
+    verifier.run_state.search_result = found
     verifier.choose_spp({"clean": NAMED.start})
     clean = tuple(StandInProblem().evaluate(Query(torch.zeros(6), seed)).required_judgement for seed in range(trials))
-    verifier.state.clean_trials = clean
+    verifier.run_state.clean_trials = clean
     verify_failures(verifier, found)
     return verifier
 
@@ -58,7 +58,7 @@ def failures(*firsts: float) -> Failures:
 
 
 def described(verifier: Verifier) -> DifferentFailures:
-    told = describe_failures(verifier.problem, verifier.state)
+    told = describe_failures(verifier.problem, verifier.run_state)
     assert told is not None
     return told
 
@@ -87,7 +87,7 @@ def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:
 
 def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
     share = FailureRate(0.034, (0.021, 0.08), 22.5, 500)
-    known = replace(failures(0.9), over=(), n_failures=70, n_visited=500, n_cells=None, failure_rate=share)
+    known = replace(failures(0.9), cell_parameter_indices=(), n_failures=70, n_visited=500, n_cells=None, failure_rate=share)
     told = described(checked(known))
     assert failures_text(told).startswith(
         "claimed in 70 of 500 draws; of all configurations 2.1-8 % fail in one render (95 % interval), 3.4 % by the "

@@ -42,9 +42,9 @@ def test_differences_are_central_differences_of_the_picture_with_one_seed() -> N
     weights = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(1))
     u = find_interior_point(render)
     leaf = u.clone().requires_grad_()
-    before = render.renders
+    before = render.n_renders
     (render(leaf, seed=3, spp=4) * weights).sum().backward()
-    assert render.renders - before == 1 + 2 * len(u)
+    assert render.n_renders - before == 1 + 2 * len(u)
     first = render.plan.groups[1]
     noise = render.compute_differences(u, weights, 3, 4)
     assert leaf.grad is not None and torch.equal(leaf.grad, noise)
@@ -53,7 +53,7 @@ def test_differences_are_central_differences_of_the_picture_with_one_seed() -> N
     step[1] = first.step
     from advsearch import seeds
 
-    common = seeds.stream(render.root_seed, "differences", 3)
+    common = seeds.derive_seed(render.root_seed, "differences", 3)
     with torch.no_grad():
         rise = (weights * (render(u + step, common, 4) - render(u - step, common, 4))).sum()
     assert float(leaf.grad[1]) == pytest.approx(float(rise) / (2.0 * first.step), rel=1e-3)
@@ -82,7 +82,7 @@ def test_a_secant_differences_the_loss_itself() -> None:
     value, gradient = render.gradient(bent, u, 5, 4)
     from advsearch import seeds
 
-    common, step = seeds.stream(render.root_seed, "differences", 5), render.plan.groups[0].step
+    common, step = seeds.derive_seed(render.root_seed, "differences", 5), render.plan.groups[0].step
     with torch.no_grad():
         rise = bent(render(u + step, common, 4)) - bent(render(u - step, common, 4))
         assert float(value) == pytest.approx(float(bent(render(u, 5, 4))))
@@ -170,7 +170,7 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
         with torch.no_grad():
             for again in range(2):
                 assert torch.equal(recorded(u, again, 4), plain(u, again, 4)), (number, again)
-        recording = recorded.scene._recorded["path", 4, recorded.scene.depth, None]
+        recording = recorded.scene._recorded["path", 4, recorded.scene.current_max_depth, None]
         of_a_move[id(recording)] = recording
         if number < 4:
             assert len(of_a_move) == 1 + (number == 3)  # an integrator that is new makes recordings stale

@@ -24,7 +24,7 @@ def test_ground_truth_of_every_configuration_is_that_of_its_scene(tmp_path: Path
             found = {name: one.pixels for name, one in picture.channels().items()}
         assert sorted(found) == ["depth.Z", "mask.Y"]
         masks.append(found["mask.Y"] == 1.0)
-        assert np.array_equal(masks[-1], render.mask(torch.full_like(render.start, turn)).numpy())
+        assert np.array_equal(masks[-1], render.compute_object_mask(torch.full_like(render.start, turn)).numpy())
     assert not np.array_equal(*masks)
 
 
@@ -41,7 +41,7 @@ def test_an_attack_keeps_ground_truth_of_the_clean_scene_and_of_its_adversarial_
     for name, u in (("clean", render.start), ("adversarial", found.u)):
         with OpenEXR.File(str(run / "images" / f"{name}.aov.exr"), separate_channels=True) as picture:
             layers, header = {key: one.pixels for key, one in picture.channels().items()}, dict(picture.header())
-        expected = render.surfaces(u).make_layers(names.split(","), "object")
+        expected = render.find_surfaces(u).make_layers(names.split(","), "object")
         assert sorted(layers) == sorted(expected) and "metres" in header["depth"]
         for key, value in expected.items():
             assert np.array_equal(layers[key], value.numpy()), key

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.controls import compose
+from advsearch.controls import compose_space
 from advsearch.controls.path import PathControl
 from advsearch.engine.loading import make_controls, make_renderer
 from advsearch.scene.description import load_description
@@ -23,7 +23,7 @@ DRIVE: dict[str, Any] = {"path": "orbit", "seconds": SECONDS, "time": 0.9}
 
 def renderer(controls: list[Any], denoise: str = "none") -> Renderer:
     scene = load_description("mug")
-    return make_renderer(scene, compose(controls, scene), SIDE, denoise, 0)
+    return make_renderer(scene, compose_space(controls, scene), SIDE, denoise, 0)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def stills() -> Callable[[float, int, int], Tensor]:
 
 
 def levels(radiance: Tensor, like: Renderer) -> Tensor:
-    return like.formation.display(radiance)
+    return like.formation.map_to_display(radiance)
 
 
 @pytest.mark.parametrize("count", [1, 5, 16])
@@ -59,7 +59,7 @@ def test_motion_blur_is_the_mean_of_64_stills(stills: Callable[[float, int, int]
     blurred = renderer([PathControl(**DRIVE, shutter=0.15)])
     assert len(blurred.moments) == 64  # half a pixel from one to the next
     times = 0.9 + 0.15 * ((torch.arange(64) + 0.5) / 64 - 0.5)
-    each = [stills(float(time), 2, seeds.stream(1, "moment", k)) for k, time in enumerate(times)]
+    each = [stills(float(time), 2, seeds.derive_seed(1, "moment", k)) for k, time in enumerate(times)]
     mean = levels(torch.stack(each).mean(dim=0), blurred)
     assert float((blurred(blurred.start, 1, 128) - mean).abs().max()) < LEVELS
     assert float((levels(stills(0.9, 64, 5), blurred) - mean).abs().max()) > 20 * LEVELS
@@ -72,8 +72,8 @@ def test_rows_that_are_read_one_after_the_other_are_those_of_as_many_stills(
     """With the same noise, where each row has a moment of its own."""
     rolled = renderer([PathControl(**DRIVE, rolling=0.1)])
     times = [0.9 + 0.1 * ((row + 0.5) / SIDE - 0.5) for row in range(SIDE)]
-    rows = torch.stack([stills(time, 4, seeds.stream(1, "moment", row))[row] for row, time in enumerate(times)])
-    own = compose([PathControl(**DRIVE, rolling=0.1)], load_description("mug"))
+    rows = torch.stack([stills(time, 4, seeds.derive_seed(1, "moment", row))[row] for row, time in enumerate(times)])
+    own = compose_space([PathControl(**DRIVE, rolling=0.1)], load_description("mug"))
     offsets, shares, samples = divide_exposure(0.0, 0.1, SIDE, SIDE)
     rolled.moments = tuple(
         Moment(own.advance_time(float(at)), one, samples) for at, one in zip(offsets, shares, strict=True)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.attacks import Trials
+from advsearch.attacks import TrialCounts
 from advsearch.engine.record import make_control_group, make_rate
 from advsearch.tasks import Judgement, Prediction
 
@@ -20,12 +20,12 @@ WRONG = Judgement.from_margin(3.0, 3.0, Prediction("vase", 2, 0.8))
 
 def test_trials_without_a_number_are_counted_and_means_are_of_the_others() -> None:
     trials = [NOTHING, WRONG, RIGHT, NOTHING]
-    rate = make_rate(Trials(1, 4, 16), trials, [WRONG])
+    rate = make_rate(TrialCounts(1, 4, 16), trials, [WRONG])
     assert (rate.not_a_number, rate.margin, rate.labels) == (2, -1.0, {"vase": 1})
     control = make_control_group(trials, 16)
     assert (control.correct, control.trials, control.not_a_number) == (1, 4, 2)
-    assert math.isnan(make_rate(Trials(0, 2, 16), [NOTHING, NOTHING], []).margin)
-    assert "not_a_number" not in make_rate(Trials(1, 2, 16), [WRONG, RIGHT], [WRONG]).to_dict()
+    assert math.isnan(make_rate(TrialCounts(0, 2, 16), [NOTHING, NOTHING], []).margin)
+    assert "not_a_number" not in make_rate(TrialCounts(1, 2, 16), [WRONG, RIGHT], [WRONG]).to_dict()
 
 
 class Broken(nn.Module):

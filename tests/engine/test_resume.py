@@ -99,10 +99,10 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
         assert attack_on(problem, config, make_policy("pgd"), Stages(NullProgress()), run).interrupted
     assert can_resume(tmp_path / "run")
     found = carry_out(tmp_path / "run", config, resume=True)
-    assert found.search is not None and len(found.search.history) == 25
-    assert len(found.frames) == 25  # those from before the interrupt too
+    assert found.search_result is not None and len(found.search_result.history) == 25
+    assert len(found.search_frames) == 25  # those from before the interrupt too
     whole = carry_out(tmp_path / "whole", config)
-    assert whole.search is not None and torch.equal(whole.search.best_u, found.search.best_u)
+    assert whole.search_result is not None and torch.equal(whole.search_result.best_u, found.search_result.best_u)
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
@@ -120,14 +120,14 @@ def test_an_interrupt_of_the_check_keeps_the_configuration_and_going_on_verifies
         rendered += query.phase is None
         if rendered == trials:
             raise KeyboardInterrupt
-        answered.append((query.kind, query.index))
+        answered.append((query.kind, query.row_index))
         return once(self, query)
 
     monkeypatch.setattr(StandInProblem, "evaluate", evaluate)
     stopped = carry_out(tmp_path / "run", config)
     assert stopped.interrupted and stopped.verification is None
-    assert stopped.search is not None and whole.search is not None
-    assert torch.equal(stopped.search.best_u, whole.search.best_u)
+    assert stopped.search_result is not None and whole.search_result is not None
+    assert torch.equal(stopped.search_result.best_u, whole.search_result.best_u)
     resumed = carry_out(tmp_path / "run", config, resume=True)
     assert resumed.verification is not None and whole.verification is not None
     assert resumed.verification.adversarial_counts == whole.verification.adversarial_counts
@@ -245,10 +245,10 @@ def test_the_random_searchs_configuration_is_taken_where_it_is_the_worse_one(pol
     problem: Any = Weaker()
     config = configuration().model_copy(update={"steps": 200})
     findings = attack_on(problem, config, policy, Stages(NullProgress()))
-    assert findings.search is not None and findings.baseline is not None and findings.verification is not None
+    assert findings.search_result is not None and findings.random_search_result is not None and findings.verification is not None
     assert (findings.outdone_verification is not None) == beaten
-    random = findings.baseline.best_u
-    assert torch.equal(findings.search.best_u, random) == beaten
+    random = findings.random_search_result.best_u
+    assert torch.equal(findings.search_result.best_u, random) == beaten
     assert torch.equal(findings.verification.u, problem.domain.project(random)) == beaten
 
 

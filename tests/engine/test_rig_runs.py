@@ -20,7 +20,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.models import load_model
 from advsearch.runs.store import NAME, Store
-from advsearch.scene.geometry import camera_to_world, compute_center, object_to_world
+from advsearch.scene.geometry import camera_to_world, compute_center, compute_object_to_world
 from advsearch.tasks import make_task
 from conftest import ROOT
 
@@ -107,7 +107,7 @@ def test_every_picture_has_the_box_of_an_independent_projection(tmp_path: Path, 
     for row, yaw in zip(swept.rows(), (0.0, 50.0), strict=True):
         payload: Any = row.payload
         assert row.correct and len(payload["pictures"]) == len(scene.rig)
-        to_world = object_to_world(scene.with_values(pose__yaw=yaw))
+        to_world = compute_object_to_world(scene.with_values(pose__yaw=yaw))
         points = vertices @ to_world[:3, :3].T + to_world[:3, 3]
         for number, picture in enumerate(payload["pictures"]):
             pose, seen_fov = camera_to_world(scene), fov

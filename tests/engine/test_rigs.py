@@ -71,7 +71,7 @@ def test_each_camera_takes_the_picture_that_it_takes_alone(tmp_path: Path, kind:
     assert seen.shape == (32, 64, 3)
     torch.testing.assert_close(seen[:, :32], own, atol=0.0, rtol=0.0)
     assert float((seen[:, 32:] - own).abs().mean()) > 0.02
-    description = both.scene.definition[0]
+    description = both.scene.description_and_filter[0]
     base = torch.from_numpy(camera_to_world(description)).float()
     pose = description.rig[1].make_inputs({}, base, torch.zeros(3), description.size_in_metres)["camera.to_world"]
     shift = (pose[:3, 3] - base[:3, 3]) * description.size_in_metres
@@ -159,4 +159,4 @@ def test_frames_of_nerfstudio_are_as_far_apart_as_before_they_were_scaled(
     mounts = read_rig(transforms(tmp_path, scale, **entries))
     np.testing.assert_allclose(mounts[1].pose[:3, 3], [0.3, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(mounts[2].pose[:3, 3], [0.6, 0.0, 0.2], atol=1e-9)
-    assert mounts[0].model is not None and not mounts[0].model.reading_notes
+    assert mounts[0].camera_model is not None and not mounts[0].camera_model.reading_notes

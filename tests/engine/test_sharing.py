@@ -44,7 +44,7 @@ def test_what_is_in_the_journal_is_not_asked_again(tmp_path: Path) -> None:
 
     def evaluate(some: Sequence[Query]) -> Iterator[Any]:
         for one in some:
-            asked.append(one.index)
+            asked.append(one.row_index)
             yield problem.evaluate(one)
 
     with RunDirectory.create(tmp_path / "run") as run:

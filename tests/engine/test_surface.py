@@ -52,7 +52,7 @@ class Never(nn.Module):
 
 def network(module: nn.Module, size: int, task: Any) -> Model:
     return advsearch.load_model(
-        module, labels=LABELS, input_size=size, name=type(module).__name__, read=make_task(task).reader
+        module, labels=LABELS, input_size=size, name=type(module).__name__, read=make_task(task).output_reader
     )
 
 
@@ -129,7 +129,7 @@ def test_a_stopped_sweep_and_one_that_is_asked_afterwards_have_the_same_map(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(surface.SurfaceCounts, "add", stopped)
+        patch.setattr(surface.SurfaceCounts, "add_image", stopped)
         assert main([*asked, str(parts), "--surface", "--json"]) == 130
     assert "surface" not in json.loads(capsys.readouterr().out)
     assert main(["resume", str(parts), "--quiet"]) == 0

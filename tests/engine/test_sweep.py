@@ -32,7 +32,7 @@ from advsearch.engine.judging import make_domain
 from advsearch.errors import InputError, RunExistsError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.axes import Points, add_grid_axes, choose_n_parts, parse_axes, parse_axis_values
+from advsearch.questions.sweep.axes import SceneConfigurations, add_grid_axes, choose_n_parts, parse_axes, parse_axis_values
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
@@ -191,10 +191,10 @@ def scene() -> advsearch.Scene:
     return advsearch.load_scene("mug")
 
 
-def points_of(scene: advsearch.Scene, grid: dict[str, Any], drawn: tuple[Any, ...] = (), samples: int = 1) -> Points:
+def points_of(scene: advsearch.Scene, grid: dict[str, Any], drawn: tuple[Any, ...] = (), samples: int = 1) -> SceneConfigurations:
     axes = parse_axes(grid, drawn)
     space = make_space(add_grid_axes(drawn, axes, scene.description), scene.description)
-    return Points(space, make_domain(space.controls), axes, samples, "sobol", 0)
+    return SceneConfigurations(space, make_domain(space.controls), axes, samples, "sobol", 0)
 
 
 def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
@@ -202,8 +202,8 @@ def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
     axes = parse_axes(grid, ())
     points = points_of(scene, grid)
     space = make_space(add_grid_axes((), axes, scene.description), scene.description)
-    assert points.count == 24 * 3 * 3
-    u = points.make_configurations(0, points.count)
+    assert points.n_images == 24 * 3 * 3
+    u = points.make_configurations(0, points.n_images)
     listed = list(itertools.product(*(axis.values for axis in axes)))
     for one, wanted, said in zip(u, listed, points.describe_images(u, 0), strict=True):
         shown = space.describe(one)
@@ -253,8 +253,8 @@ def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
     axes = parse_axes(grid, ())
     space = make_space(add_grid_axes((), axes, scene.description), scene.description)
     began = time.process_time()
-    points = Points(space, make_domain(space.controls), axes, 1, "sobol", 0)
-    assert points.count == 10**12
+    points = SceneConfigurations(space, make_domain(space.controls), axes, 1, "sobol", 0)
+    assert points.n_images == 10**12
     said = points.describe_images(points.make_configurations(10**12 - 8, 8), 10**12 - 8)
     assert time.process_time() - began < 10.0
     assert [round(float(said[-1][name]["value"]), 6) for name in grid] == [359.964, 60.0, 0.1]

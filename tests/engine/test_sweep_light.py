@@ -29,13 +29,13 @@ def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pictures_fall_into_groups_that_differ_in_light_alone() -> None:
     """Of pose x power x camera x tint with two draws each, each group has all of power and tint."""
     groups = Groups(ProductIndex((2, 3, 2, 4)), 2, (False, True, False, True), True)
-    assert (groups.group_size, groups.n_groups, groups.n_alternating_groups) == (24, 4, 2)
+    assert (groups.group_size, groups.n_groups, groups.n_groups_to_cache) == (24, 4, 2)
     found: dict[int, list[int]] = {}
     for number in range(groups.grid.count * 2):
-        found.setdefault(groups.find_group(number), []).append(number)
+        found.setdefault(groups.find_group_of_image(number), []).append(number)
     assert sorted(found) == [0, 1, 2, 3]
     for members in found.values():
-        assert [groups.find_member(members[-1], place) for place in range(groups.group_size)] == members
+        assert [groups.find_image_of_group(members[-1], place) for place in range(groups.group_size)] == members
 
 
 @pytest.mark.medium

@@ -54,13 +54,13 @@ def swept(**more: Any) -> Any:
 def test_all_frames_of_a_drive_are_a_group_and_draws_tell_drives_apart() -> None:
     """Of time x pose with three draws, where cameras do not share what is drawn."""
     groups = Groups(ProductIndex((5, 2)), 3, (True, False), False, frames=0)
-    assert (groups.group_size, groups.n_groups, groups.n_alternating_groups) == (5, 6, 6)
+    assert (groups.group_size, groups.n_groups, groups.n_groups_to_cache) == (5, 6, 6)
     found: dict[int, list[int]] = {}
     for number in range(30):
-        found.setdefault(groups.find_group(number), []).append(number)
+        found.setdefault(groups.find_group_of_image(number), []).append(number)
     assert sorted(found) == list(range(6)) and all(len({one % 6 for one in some}) == 1 for some in found.values())
     for members in found.values():
-        assert [groups.find_member(members[-1], place) for place in range(5)] == members
+        assert [groups.find_image_of_group(members[-1], place) for place in range(5)] == members
 
 
 @pytest.mark.medium

@@ -57,7 +57,7 @@ class Disorder:
             if self.lose in [query.index for _, _, query in items]:
                 for one in items:
                     lost = "no answer: 3 workers died of it" if one[2].index == self.lose else ""
-                    yield BatchResult([one], None if lost else self.call([one]), lost=lost)
+                    yield BatchResult([one], None if lost else self.call([one]), failure_reason=lost)
             else:
                 yield BatchResult(items, self.call(items), f"worker {count % 2}")
 

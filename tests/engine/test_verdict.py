@@ -36,7 +36,7 @@ def test_the_pictures_that_choose_the_sample_count_are_no_trials(
     made = noted(monkeypatch)
     findings = carry_out(tmp_path / "run", UNASKED)
     assert findings.verification is not None and findings.verification.ending is Ending.FOUND
-    assert findings.verification.adversarial_counts.trials in TRIAL_LOOKS and findings.verification.stopped == "decided"
+    assert findings.verification.adversarial_counts.n_trials in TRIAL_LOOKS and findings.verification.stop_reason == "decided"
     assert len(set(made)) == len(made) == findings.verification_renders, "no picture is made twice"
     with RunDirectory.resume(tmp_path / "run") as run:
         stored = [row for row in run.store.rows() if row.phase is None]
@@ -66,5 +66,5 @@ def test_stopped_anywhere_it_goes_on_to_the_same_rows_and_counts(
 def test_trials_that_are_asked_for_are_neither_more_nor_fewer(tmp_path: Path) -> None:
     asked = UNASKED.model_copy(update={"trials": 17})
     findings = carry_out(tmp_path / "run", asked)
-    assert findings.verification is not None and findings.verification.stopped == "asked for"
-    assert (len(findings.clean_trials), findings.verification.adversarial_counts.trials) == (17, 17)
+    assert findings.verification is not None and findings.verification.stop_reason == "asked for"
+    assert (len(findings.clean_trials), findings.verification.adversarial_counts.n_trials) == (17, 17)

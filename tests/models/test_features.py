@@ -57,7 +57,7 @@ def test_a_module_gives_the_input_of_its_last_linear_layer() -> None:
     features = features_of(load(network))
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
     assert (features.size, features.penultimate) == (7, True)
-    assert features.source == "the input of 6 (Linear), 7 numbers"
+    assert features.source_description == "the input of 6 (Linear), 7 numbers"
 
 
 @pytest.mark.medium
@@ -66,7 +66,7 @@ def test_a_module_gives_the_input_of_its_last_linear_layer() -> None:
 def test_an_exported_program_gives_what_its_module_gave(tmp_path: Path, lower: Callable[[Any], Any]) -> None:
     network = sequential()
     features = features_of(load_model(exported(network, tmp_path, lower)))
-    assert features.penultimate and features.source.startswith("the input of the operator ")
+    assert features.penultimate and features.source_description.startswith("the input of the operator ")
     assert torch.allclose(features(images()), by_hand(network, -1), atol=1e-6)
 
 

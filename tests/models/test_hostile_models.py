@@ -253,7 +253,7 @@ def test_nested_descriptions_are_refused(depth: int, exported: Path, tmp_path: P
     ],
 )  # fmt: skip
 def test_expressions_of_sizes_that_are_read(text: str) -> None:
-    assert reader.problem(text) == ""
+    assert reader.find_expression_problem(text) == ""
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_expressions_of_sizes_that_are_read(text: str) -> None:
     ],
 )  # fmt: skip
 def test_expressions_that_are_none(text: str) -> None:
-    message = reader.problem(text)
+    message = reader.find_expression_problem(text)
     assert message and len(message) < 250
 
 

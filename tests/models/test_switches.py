@@ -10,21 +10,21 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.models import load_model
 from advsearch.trust.code import allow_code
-from advsearch.trust.foreign_code import PLAIN, Switches, use_plain_switches
+from advsearch.trust.foreign_code import DEFAULT_TORCH_STATE, TorchState, use_default_torch_state
 
 TURNED = {
-    "type": Switches(dtype=torch.float64),
-    "gradients": Switches(gradients=False),
-    "deterministic": Switches(deterministic=2),
-    "anomalies": Switches(anomalies=True),
-    "all": Switches(torch.float64, PLAIN.device, gradients=False, deterministic=2, anomalies=True),
+    "type": TorchState(dtype=torch.float64),
+    "gradients": TorchState(gradients=False),
+    "deterministic": TorchState(deterministic=2),
+    "anomalies": TorchState(anomalies=True),
+    "all": TorchState(torch.float64, DEFAULT_TORCH_STATE.device, gradients=False, deterministic=2, anomalies=True),
 }
 
 
 @pytest.fixture(autouse=True)
 def turned_back() -> Iterator[None]:
     yield
-    PLAIN.apply()
+    DEFAULT_TORCH_STATE.apply()
 
 
 class OfItsType(nn.Module):
@@ -47,18 +47,18 @@ def test_a_model_is_loaded_and_asked_whatever_is_turned(turned: str) -> None:
     theirs = TURNED[turned]
     theirs.apply()
     model = load_model(OfItsType(), input_size=16)
-    assert Switches.read_current() == theirs, "as they were"
+    assert TorchState.read_current() == theirs, "as they were"
     assert model.differentiable and model.dtype == theirs.dtype
-    with use_plain_switches():
+    with use_default_torch_state():
         picture = torch.full((16, 16, 3), 0.5, requires_grad=True)
         logits = model(picture)
         (gradient,) = torch.autograd.grad(logits.max(), picture)
         assert (
             logits.dtype == gradient.dtype == torch.float32
             and bool(gradient.any())
-            and Switches.read_current() == PLAIN
+            and TorchState.read_current() == DEFAULT_TORCH_STATE
         )
-    assert Switches.read_current() == theirs
+    assert TorchState.read_current() == theirs
 
 
 def test_a_network_that_switches_gradients_off_as_it_runs_does_so_for_itself() -> None:
@@ -76,7 +76,7 @@ def test_a_scene_is_rendered_and_searched_whatever_is_turned() -> None:
     named = load_model(network, input_size=16, labels=["mug", "bowl", "vase"])
     assert advsearch.render("mug", named, spp=1).views[0].predictions[0].label == "mug"
     result = advsearch.attack("mug", named, steps=2, spp=1, trials=6, verify_spp=1, baseline=False)
-    assert Switches.read_current() == TURNED["all"]
+    assert TorchState.read_current() == TURNED["all"]
     assert result.summary.ending == "budget spent" and result.summary.renders["gradient"] > 0
 
 
@@ -89,5 +89,5 @@ def test_what_the_code_of_a_network_turns_stays_with_it(tmp_path: Path, monkeypa
     monkeypatch.syspath_prepend(tmp_path)
     allow_code("turning_nets:make")
     model = load_model("turning_nets:make", input_size=16)
-    assert Switches.read_current() == PLAIN and model.dtype == torch.float64 and model.differentiable
-    assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and Switches.read_current() == PLAIN
+    assert TorchState.read_current() == DEFAULT_TORCH_STATE and model.dtype == torch.float64 and model.differentiable
+    assert model(torch.zeros(16, 16, 3)).dtype == torch.float32 and TorchState.read_current() == DEFAULT_TORCH_STATE

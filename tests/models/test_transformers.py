@@ -180,7 +180,7 @@ def test_the_output_of_a_detector_is_read_as_the_library_reads_it(tmp_path: Path
     prepared = processor("YolosImageProcessor")
     published(tmp_path, "YolosForObjectDetection", prepared, **more)
     network = transformers.YolosForObjectDetection.from_pretrained(tmp_path)
-    model = load_model(Asked(network), input_size=SIDE, labels=NAMES, read=Detection(iou=0.5).reader)
+    model = load_model(Asked(network), input_size=SIDE, labels=NAMES, read=Detection(iou=0.5).output_reader)
     task = Detection(suppression=1.0, confidence=1e-6).on(model)
     with torch.no_grad():
         answer = network(pixel_values=PICTURES[:1].permute(0, 3, 1, 2))

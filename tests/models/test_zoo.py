@@ -19,7 +19,7 @@ from advsearch.errors import FileFormatError, ModelError, UnknownNameError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.zoo.library import report_library_errors
 from advsearch.tasks import Detection
-from advsearch.trust.code import allow_named, restrict_allowed_code
+from advsearch.trust.code import allow_code_in_settings, restrict_allowed_code
 from fuzz import onnx_files
 
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
@@ -134,14 +134,14 @@ def test_torchvision_brings_its_weights_and_what_belongs_to_them(torchvision: An
 def test_torchvision_finds_objects_at_the_size_that_it_would_resize_to(
     torchvision: Any, name: str, size: tuple[int, int]
 ) -> None:
-    model = load_model(f"torchvision:{name}", read=Detection().reader)
+    model = load_model(f"torchvision:{name}", read=Detection().output_reader)
     assert (model.input_size, model.labels, model.batch_limits) == (size, ("mug", "bowl", "vase"), (1, 4))
     assert (model.preprocessing.mean, model.preprocessing.std) == ((0.0,) * 3, (1.0,) * 3), "it normalises by itself"
     found = model(IMAGES.repeat(3, 1, 1, 1))
     assert len(found) == 6 and found[0]["boxes"].tolist() == [[0.0, 0.0, size[1], size[0]]]
     torch.testing.assert_close(found[1]["scores"], IMAGES[1].mean()[None], atol=0.02, rtol=0.0)
     assert Detection().on(model).predictions(found)[0][0].label == "bowl"
-    assert load_model(f"torchvision:{name}", read=Detection().reader, input_size=8).input_size == (8, 8)
+    assert load_model(f"torchvision:{name}", read=Detection().output_reader, input_size=8).input_size == (8, 8)
 
 
 def test_what_a_library_unpickles_is_refused(torchvision: Any, tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_a_model_that_only_a_file_names_is_fetched_from_nowhere() -> None:
             pass
         fetch()  # outside of the block nothing is changed
         for given in ({"model": "reference,timm:tiny@own.safetensors"}, {"model": ["hf:owner/tiny"]}):
-            allow_named(given)
+            allow_code_in_settings(given)
         for spec in ("timm:tiny", "timm:tiny@own.safetensors", "hf:owner/tiny"):
             with report_library_errors(spec, ""):
                 fetch()

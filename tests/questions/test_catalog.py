@@ -14,7 +14,7 @@ import pytest
 
 import advsearch
 from advsearch import registry
-from advsearch.catalog import BUILT_INS, is_present
+from advsearch.catalog import BUILT_INS, is_module_installed
 from advsearch.experiment import Experiment
 from advsearch.settings import HEADER
 
@@ -32,7 +32,7 @@ CORE_PARTS = {
 
 def test_every_part_of_the_catalog_is_there_and_is_what_it_says() -> None:
     for part in BUILT_INS:
-        assert is_present(part.target.partition(":")[0]), part
+        assert is_module_installed(part.import_path.partition(":")[0]), part
         assert not part.help.endswith("."), part
     for name, experiment in registry.EXPERIMENTS.items():
         assert isinstance(experiment, Experiment)
@@ -106,7 +106,7 @@ def list_removable_modules() -> dict[str, list[str]]:
     for part in BUILT_INS:
         is_core = part.name in CORE_PARTS.get(part.kind, "").split()
         if part.kind not in ("experiment", "model source") and not is_core:
-            found.setdefault(part.target.partition(":")[0], []).append(f"{part.kind} {part.name}")
+            found.setdefault(part.import_path.partition(":")[0], []).append(f"{part.kind} {part.name}")
     return found
 
 
@@ -131,7 +131,7 @@ def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
 
 
 def test_no_control_imports_another_one() -> None:
-    modules = {part.target.partition(":")[0] for part in BUILT_INS if part.kind == "control"}
+    modules = {part.import_path.partition(":")[0] for part in BUILT_INS if part.kind == "control"}
     found = set()
     for module in modules:
         spec = importlib.util.find_spec(module)

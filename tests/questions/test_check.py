@@ -81,7 +81,7 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     assert summary.ending == "out of time" and not is_finished(folder)
     # a sitting that is longer
     monkeypatch.setattr(RunContext, "open_measurements", lambda context, seconds=None: Measurements(context))
-    assert values(check.run(config, resumed=folder)) == values(whole) and is_finished(folder)
+    assert values(check.run(config, resumed_directory=folder)) == values(whole) and is_finished(folder)
     assert main(["show", str(folder)]) == 0
     assert words.READING in capsys.readouterr().out
 
@@ -107,7 +107,7 @@ class Stop(NullProgress):
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
         if self.at and self.at in name:
-            INTERRUPTS.count += 1
+            INTERRUPTS.n_received += 1
             raise RuntimeError("what Dr.Jit makes of a KeyboardInterrupt")
 
 
@@ -150,12 +150,12 @@ def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
     assert whole.gains and whole.bounces is not None and whole.plan is not None and whole.plan.left_out
     config, folder, before = CheckConfig(**PLANNED, run=str(tmp_path / "run")), tmp_path / "run", 0
     for number, stop in enumerate((Stop(1), Stop(2), Stop(stage="saves"), Stop(stage="gradients for camera"))):
-        stopped = check.run(config, progress=stop, resumed=folder if number else None)
+        stopped = check.run(config, progress=stop, resumed_directory=folder if number else None)
         assert stopped.ending == "interrupted" and not is_finished(folder)
         assert len(stopped.rows) > before or stopped.bounces is not None
         assert timeless(kept(folder)) == timeless(stopped)
         before = len(stopped.rows)
-    INTERRUPTS.count = 0
+    INTERRUPTS.n_received = 0
     assert main(["resume", str(folder), "--json", "--quiet"]) in (0, 3)
     resumed = CheckResult.from_values(json.loads(capsys.readouterr().out))
     assert timeless(resumed) == timeless(whole) == timeless(kept(folder)) and is_finished(folder)

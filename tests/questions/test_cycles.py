@@ -69,12 +69,12 @@ def by_cycles(scene: SceneDescription) -> Cycles:
 @pytest.mark.medium
 def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> None:
     u = torch.full_like(renderer.start, 0.7)
-    made = by_cycles(renderer.scene.definition[0])
-    theirs = renderer.copy_with(source=made.radiance)
+    made = by_cycles(renderer.scene.description_and_filter[0])
+    theirs = renderer.copy_with(external_render=made.radiance)
     first, again = (theirs.radiance(u, seed, 4) for seed in (1, 2))
-    assert first.shape == (8, 12, 3) and not torch.equal(first, again) and theirs.renders == 2
+    assert first.shape == (8, 12, 3) and not torch.equal(first, again) and theirs.n_renders == 2
     told = json.loads((folder / "scene.json").read_text())
-    inputs = renderer.scene.assembly(renderer.space.inputs(u))
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
     meshes = trimesh.load(folder / "scene.glb", process=False).geometry
     assert set(meshes) == {"object", "ground"}
     np.testing.assert_array_equal(
@@ -96,9 +96,9 @@ def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> No
 
 def test_blender_gets_the_field_of_view_in_radians(folder: Path, renderer: Renderer) -> None:
     (folder / "does.py").write_text("sys.exit(3)")
-    inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start)) | {"camera.fov": torch.tensor([60.0])}
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start)) | {"camera.fov": torch.tensor([60.0])}
     with pytest.raises(BlenderError):
-        by_cycles(renderer.scene.definition[0]).radiance(inputs, 0, 1)
+        by_cycles(renderer.scene.description_and_filter[0]).radiance(inputs, 0, 1)
     assert json.loads((folder / "scene.json").read_text())["fov"] == pytest.approx(1.0471976)
 
 
@@ -114,9 +114,9 @@ def test_what_blender_can_not_render_is_said(
 ) -> None:
     monkeypatch.setattr(cycles, "MAX_RENDER_SECONDS", 1 if "sleep" in does else cycles.MAX_RENDER_SECONDS)
     (folder / "does.py").write_text(does)
-    inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
     with pytest.raises(BlenderError, match=words):
-        by_cycles(renderer.scene.definition[0]).radiance(inputs, 0, 1)
+        by_cycles(renderer.scene.description_and_filter[0]).radiance(inputs, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -130,4 +130,4 @@ def test_what_is_not_carried_over_is_said(
     folder: Path, renderer: Renderer, changes: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(BlenderError, match=words):
-        by_cycles(replace(renderer.scene.definition[0], **changes))
+        by_cycles(replace(renderer.scene.description_and_filter[0], **changes))

@@ -79,7 +79,7 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
         elevation = np.where(outside, 10.0, 70.0)
         return pd.DataFrame({"camera.elevation": elevation, "correct": outside, "unit": np.arange(10), "label": ""})
 
-    monkeypatch.setattr(explaining.Renders, "render_rows", rendered)
+    monkeypatch.setattr(explaining.SweepRunner, "run_sweep", rendered)
     result = advsearch.explain(swept, confirm=10, pairs=0, clusters=0, run=tmp_path / "run")
     confirmed = result.rules[0].confirmed
     assert confirmed is not None and (confirmed.right, confirmed.total) == (0, 9)  # what lies outside is not counted
@@ -100,7 +100,7 @@ def test_the_nearest_right_prediction_differs_in_one_value(
         self.n_renders += len(made)
         return made.assign(correct=right, label=np.where(right, "mug", "bowl"))
 
-    monkeypatch.setattr(explaining.Renders, "render_rows", rendered)
+    monkeypatch.setattr(explaining.SweepRunner, "run_sweep", rendered)
     result = advsearch.explain(swept, confirm=0, pairs=1, clusters=0, run=tmp_path / "run")
     (pair,) = result.pairs
     assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
@@ -152,7 +152,7 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
         shades = torch.tensor([0.2 + 0.6 * (number % 2) for number in numbers])
         return shades[:, None, None, None].expand(-1, 4, 4, 3), Read()
 
-    monkeypatch.setattr(explaining.Renders, "render_again", again)
+    monkeypatch.setattr(explaining.SweepRunner, "render_again", again)
     result = advsearch.explain(swept, confirm=0, pairs=0, clusters=50, run=tmp_path / "run")
     found = result.clusters
     assert found is not None and found.are_separated and found.failures == 50 == len(set(asked))

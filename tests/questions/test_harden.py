@@ -57,19 +57,19 @@ def test_a_run_trains_measures_and_goes_on(
     given = {**SMALL, "labels": "labels.json", "run": "run"}
     config = HardenConfig(**given)
     given.pop("model")
-    taught = ClassifierTrainer.round
+    taught = ClassifierTrainer.train_round
 
     def stopped(self: Any, number: int, *args: Any, **options: Any) -> None:
         if number == 2:
             raise KeyboardInterrupt
         taught(self, number, *args, **options)
 
-    monkeypatch.setattr(ClassifierTrainer, "round", stopped)
+    monkeypatch.setattr(ClassifierTrainer, "train_round", stopped)
     first = asked.run(config)
     assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
     both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert attacks == both
-    monkeypatch.setattr(ClassifierTrainer, "round", taught)
+    monkeypatch.setattr(ClassifierTrainer, "train_round", taught)
     result = advsearch.harden(SMALL["model"], resume=True, **given)
     assert attacks[3:] == both
     (row,) = result.table
@@ -107,7 +107,7 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
         judged_at.append(part)
         return Score(1.0 - 0.1 * part, 0.5 + 0.2 * part)
 
-    monkeypatch.setattr(ClassifierTrainer, "score", judged)
+    monkeypatch.setattr(ClassifierTrainer, "evaluate_student", judged)
     with RunDirectory.create_for(config) as run:
         Rounds(run, course_of(config, net)).store_round(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):

@@ -73,8 +73,8 @@ def example(seed: int) -> Example:
 @pytest.mark.medium
 def test_a_copy_learns_by_the_networks_own_loss_and_keeps_its_statistics() -> None:
     course, seen = course_of(epochs=60, rate=0.02), [example(k) for k in range(24)]
-    course.round(1, seen)
-    models, held_out = (course.work.model, course.student.model), [example(k) for k in range(100, 112)]
+    course.train_round(1, seen)
+    models, held_out = (course.scene_jobs.model, course.student.model), [example(k) for k in range(100, 112)]
     before, after = ([one.is_right(which) for one in held_out] for which in models)
     assert sum(before) <= 3 and sum(after) >= 9
     network = course.student.network
@@ -114,7 +114,7 @@ def test_losses_are_torchvisions_transformers_or_the_callers() -> None:
         asked.append(len(targets))
         return network(x)[0].sum()  # type: ignore[no-any-return]
 
-    course_of(mine, epochs=1).round(1, [example(k) for k in range(3)])
+    course_of(mine, epochs=1).train_round(1, [example(k) for k in range(3)])
     assert asked == [3]
 
 
@@ -134,7 +134,7 @@ def coco(folder: Path, **changes: Any) -> Path:
 def test_a_coco_folder_is_read_by_the_names_of_its_categories(tmp_path: Path) -> None:
     (one,) = read_coco(coco(tmp_path / "good"), model())
     assert one.boxes.tolist() == [[2.0, 1.0, 7.0, 5.0]] and one.labels.tolist() == [1]
-    assert one.levels.shape == (10, 20, 3)
+    assert one.image_uint8.shape == (10, 20, 3)
     with pytest.raises(InputError, match="none of its categories"):
         read_coco(coco(tmp_path / "other", categories=[{"id": 3, "name": "cat"}]), model())
     image = {"id": 7, "height": 10, "width": 20}
@@ -160,17 +160,17 @@ def test_a_run_trains_on_what_it_found_and_measures_scene_by_scene(
         "threads": 1, "run": "run", "environment": "studio", "held_out_environment": "noon",
     }  # fmt: skip
     monkeypatch.setattr("advsearch.questions.harden.scenes.CLEAN_SCENES", 1)
-    given["data"], taught = str(coco(tmp_path / "own")), DetectorTrainer.round
+    given["data"], taught = str(coco(tmp_path / "own")), DetectorTrainer.train_round
 
     def stopped(self: DetectorTrainer, number: int, *args: Any, **options: Any) -> None:
         if number == 2:
             raise KeyboardInterrupt
         taught(self, number, *args, **options)
 
-    monkeypatch.setattr(DetectorTrainer, "round", stopped)
+    monkeypatch.setattr(DetectorTrainer, "train_round", stopped)
     first = advsearch.harden(OneBox(), **given)
     assert first.ending == "interrupted" and first.after is None
-    monkeypatch.setattr(DetectorTrainer, "round", taught)
+    monkeypatch.setattr(DetectorTrainer, "train_round", taught)
     result = advsearch.harden(OneBox(), resume=True, **given)
     assert [one.robust for one in result.rounds[:2]] == [one.robust for one in first.rounds]
     assert result.ending == "done" and result.weights and result.hardened is None

@@ -59,12 +59,12 @@ def example(label: int, left: int) -> Example:
 @pytest.mark.medium
 def test_a_copy_learns_the_objects_pixels_and_leaves_the_others_as_they_were() -> None:
     course, seen = course_of(epochs=80, rate=0.1), [example(1 + k % 2, k) for k in range(8)]
-    course.round(1, seen)
+    course.train_round(1, seen)
     held_out = [example(1, 10), example(2, 9)]
-    assert [one.is_right(course.work.model) for one in held_out] == [False, False]
+    assert [one.is_right(course.scene_jobs.model) for one in held_out] == [False, False]
     assert [one.is_right(course.student.model) for one in held_out] == [True, True]
     for one in held_out:
-        said = course.student.model(one.levels[None] / 255.0)[0].argmax(dim=0)
+        said = course.student.model(one.image_uint8[None] / 255.0)[0].argmax(dim=0)
         region: Any = one.truth
         assert (said[~region.mask] == 0).all()
 

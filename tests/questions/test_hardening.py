@@ -111,8 +111,8 @@ def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
     other = RenderedLesson.create((2,), pictures[0], pictures[:2])
     search_worse_images([other, lesson], model)
     for one, right in ((lesson, (1,)), (other, (2,))):
-        loss = negative_log_likelihood(model(one.images / 255.0), [right] * len(one.images))
-        assert torch.equal(one.worst_image, pictures[int(loss.argmax())]) and one.images.dtype == torch.uint8
+        loss = negative_log_likelihood(model(one.images_uint8 / 255.0), [right] * len(one.images_uint8))
+        assert torch.equal(one.worst_image, pictures[int(loss.argmax())]) and one.images_uint8.dtype == torch.uint8
     both = negative_log_likelihood(torch.tensor([[1.0, 1.0, 1.0, 1.0]]), [(0, 2)])
     assert both.item() == pytest.approx(0.6931, abs=1e-3)
 
@@ -121,12 +121,12 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     made, lessons = student(), pupils()
     ticks: list[int] = []
     course = course_of(made, rate=0.04, epochs=12)
-    before = course.score(lessons)
-    course.round(1, lessons, tick=lambda: ticks.append(1))
-    after = course.score(lessons)
+    before = course.evaluate_student(lessons)
+    course.train_round(1, lessons, tick=lambda: ticks.append(1))
+    after = course.evaluate_student(lessons)
     assert len(ticks) == course.count_steps(lessons) == 12
     more = [Lesson((5,), to_uint8(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
-    assert course.score([*lessons, *more]) == Score(after.clean / 2, after.robust)
+    assert course.evaluate_student([*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
 
 
@@ -138,7 +138,7 @@ def test_the_weights_that_are_kept_lose_no_more_plain_pictures_than_they_may(cle
     ]
     noted = json.dumps([one.model_dump() for one in done])
     run: Any = SimpleNamespace(store=SimpleNamespace(read_note=lambda key: noted), path=Path())
-    assert Rounds(run, course_of(student(), clean_loss=clean_loss)).best == best
+    assert Rounds(run, course_of(student(), clean_loss=clean_loss)).best_round_number == best
 
 
 class Tinted(TextureLesson):
@@ -185,7 +185,7 @@ def test_lessons_that_judge_are_left_as_they_are() -> None:
     textured = [tinted(number) for number in range(3)]
     pictures = torch.stack([coloured(0, level, 7) for level in (0.0, 0.3)])
     rendered = RenderedLesson.create((1,), pictures[0], pictures)
-    course_of(student()).score([*textured, rendered])
+    course_of(student()).evaluate_student([*textured, rendered])
     assert all(torch.equal(one.texture, torch.full((3,), 0.5)) for one in textured)
     assert rendered.losses.isinf().all()
 

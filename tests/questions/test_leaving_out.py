@@ -48,7 +48,7 @@ def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> No
     assert "segments leave out" in cut.reason
     seen = measure_path_length(light, [light.start], seed=0, spp=4)
     assert seen.depth > cut.depth and seen.cuts[-1].levels > MAX_CHANGE
-    assert dark.scene.depth == dark.scene.max_depth
+    assert dark.scene.current_max_depth == dark.scene.max_depth
 
 
 def test_bounces_are_not_cut_where_a_picture_is_not_finite(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +64,7 @@ def test_searches_cut_paths_and_verifications_do_not() -> None:
     problem, _ = problem_from_config(config)
     start = problem.domain.start
     seen: list[torch.Tensor] = []
-    searched, tried = Query(start, 0, phase="search", with_image=True), Query(start, 3, spp=8)
+    searched, tried = Query(start, 0, phase="search", includes_image=True), Query(start, 3, spp=8)
     trial = problem.evaluate(tried)
     for depth, gradient in ((None, False), (2, False), (2, True)):
         problem.search_depth = depth

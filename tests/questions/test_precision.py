@@ -26,7 +26,7 @@ from advsearch.questions.precision.rule import (
     fit_line,
     has_leveled_off,
     is_heavy_tailed,
-    recommend_count,
+    recommend_spp,
     summarize_samples,
 )
 from advsearch.runs.listing import is_finished
@@ -77,8 +77,8 @@ def test_the_reference_s_own_error_is_taken_off() -> None:
     reference = rough(256)
     point = next(one for one in measured(reference) if one.spp == 256)
     true = 256**-0.5 * math.sqrt(SIZE) / float(np.linalg.norm(TRUTH))
-    assert point.is_known and point.rms == pytest.approx(true, rel=0.06)
-    assert point.interval is not None and point.interval[0] < point.rms < point.interval[1]
+    assert point.has_known_error and point.rms_error == pytest.approx(true, rel=0.06)
+    assert point.interval is not None and point.interval[0] < point.rms_error < point.interval[1]
 
 
 def tails(kind: str, seed: int, repeats: int = 8) -> tuple[list[dict[str, float]], float]:
@@ -137,7 +137,7 @@ def reached(found: Recommended | None) -> tuple[Recommended, int, float]:
 
 @pytest.mark.parametrize("goal", [0.3, 0.1, 0.05])
 def test_a_recommended_count_reaches_its_goal(goal: float) -> None:
-    found, spp, _ = reached(recommend_count(measured(exact()), goal))
+    found, spp, _ = reached(recommend_spp(measured(exact()), goal))
     assert found.basis in ("interpolated", "fitted")
     assert error_at(spp) == pytest.approx(goal, rel=0.1)
     assert found.seconds == pytest.approx(1e-3 * spp, rel=0.01)
@@ -236,7 +236,7 @@ def point_at(spp: int, error: float, interval: tuple[float, float] | None = None
 def test_the_error_of_a_reference_is_what_its_parts_scatter_by() -> None:
     found = rough(1000)
     true = float(np.linalg.norm(found.value - TRUTH) / np.linalg.norm(TRUTH))
-    assert found.parts == 4
+    assert found.n_parts == 4
     assert found.error == pytest.approx(true, rel=0.15)
 
 
@@ -246,7 +246,7 @@ def test_the_error_of_a_reference_is_what_its_parts_scatter_by() -> None:
 def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
     error: float, times: int, promised: float
 ) -> None:
-    one, spp, _ = reached(recommend_count(measured(exact()), 0.1))
+    one, spp, _ = reached(recommend_spp(measured(exact()), 0.1))
     found = confirm_recommendation(one, point_at(spp, error, repeats=12).model_copy(update={"seconds": 0.5}))
     assert (found.basis, found.repeats, found.spp) == ("confirmed", 12, times * spp)
     assert found.error == pytest.approx(promised) and found.seconds == pytest.approx(0.5 * times)

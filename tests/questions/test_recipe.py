@@ -95,7 +95,7 @@ def test_every_bundled_recipe_is_one_that_can_be_run_and_save(name: str, quick: 
     described = read_recipe(name)
     runs = plan_runs(described, RecipeConfig(recipe=name, quick=quick))
     assert runs and len({one.name for one in runs}) == len(runs)
-    drawn = [one.config.seed for one in runs if described.parts[one.part].drawn_as is None]
+    drawn = [one.config.seed for one in runs if described.parts[one.part_name].drawn_as is None]
     assert len(set(drawn)) == len(drawn) and set(drawn) == {one.config.seed for one in runs}
     assert described.figures and all(read_figure_options(one, name) for one in described.figures)
     assert titles()[name] == described.title and described.title.endswith("?")
@@ -136,7 +136,7 @@ def test_what_is_asked_for_goes_over_the_recipe_and_labels_go_to_their_objects()
         label={"mug": "coffee mug,cup", "*": "bowl"}, seed=3,
     )  # fmt: skip
     runs = plan_runs(described, config)
-    assert [(one.part, one.config.object, one.config.environment, one.config.label) for one in runs] == [
+    assert [(one.part_name, one.config.object, one.config.environment, one.config.label) for one in runs] == [
         ("a", "x/mug.obj", "noon", "coffee mug,cup"),
         ("a", "bowl", "noon", "bowl"),
         *(("b", name, place, label) for name, label in (("x/mug.obj", "coffee mug,cup"), ("bowl", "bowl"))
@@ -165,7 +165,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began
-    result = asked.run(RecipeConfig.from_yaml(run / "run.yaml"), resumed=run)
+    result = asked.run(RecipeConfig.from_yaml(run / "run.yaml"), resumed_directory=run)
     assert done == ["mug", "bowl", "bowl"]
     assert result.to_dict() == read_result(run).to_dict() and isinstance(read_result(run), RecipeResult)
     assert [one.renders for one in result.parts] == [4, 4] and result.ending == "done"

@@ -69,5 +69,5 @@ def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, Region
     """Light is found again; pictures that were predicted are counted as such."""
     config = RegionConfig(**SMALL, run=str(tmp_path / "run"))
     assert region.run(config, progress=Stopping(9)).ending == "interrupted"
-    result = region.run(config, resumed=tmp_path / "run")
+    result = region.run(config, resumed_directory=tmp_path / "run")
     assert rows(tmp_path / "run") == rows(whole[0]) and result.renders == whole[1].renders

@@ -78,7 +78,7 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
     monkeypatch.setattr(Problem, "judge", stopped)
     first = replay.run(config)
     assert first.is_unfinished and len(first.table) == 1
-    again = replay.run(config, resumed=tmp_path / "run")
+    again = replay.run(config, resumed_directory=tmp_path / "run")
     assert again.ending == "done" and len(again.table) == 4 and done == 32 + 4 * 12 - 31
     assert again.table[0] == first.table[0]
 

@@ -46,8 +46,8 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    good = made(CaseOutcome([check_range("a", 1.0, most=2.0)], relative_error=0.02, ending="found"), "good")
-    bad = replace(made(CaseOutcome([check_range("a", 3.0, most=2.0)]), "bad"), group="stiff")
+    good = made(CaseOutcome([check_range("a", 1.0, max_value=2.0)], relative_error=0.02, ending="found"), "good")
+    bad = replace(made(CaseOutcome([check_range("a", 3.0, max_value=2.0)]), "bad"), group="stiff")
     monkeypatch.setattr(suite, "ALL_CASES", (good, bad))
     yield
 

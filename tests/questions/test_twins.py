@@ -152,7 +152,7 @@ def test_a_twin_is_the_photograph_where_the_object_is_not_seen(tmp_path: Path) -
     assert layer.alpha[rows, columns].mean() > 0.9, "whether it is hidden or not"
     twin = rendering.make_twin(item, photograph, window, layer, {}, (96, 128))
     assert np.abs(twin.images[HOLE].numpy() * 255.0 - photograph.levels)[:, middle + 2 :].max() < 1e-3
-    assert twin.texture is not None and twin.texture > 0.5
+    assert twin.texture_correlation is not None and twin.texture_correlation > 0.5
 
 
 def test_boxes_of_a_detector_agree_where_they_overlap_by_half() -> None:

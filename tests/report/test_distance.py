@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from advsearch.questions.sweep.display import compute_detection_distance, distance_sentence
+from advsearch.questions.sweep.display import compute_detection_distance, describe_detection_distance
 from advsearch.questions.sweep.summary import AxisRow
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.statistics.monotone import find_dips
@@ -26,7 +26,7 @@ def test_the_distance_lies_where_half_of_the_pictures_show_it() -> None:
     assert found.distances == DISTANCES
     assert found.distance == pytest.approx(math.sqrt(20.0 * 40.0))
     assert (found.lower, found.upper) == (10.0, 80.0)
-    assert distance_sentence(found) == "Seen from 28.3 m in half of the pictures, 10 to 80 m with 95 % confidence."
+    assert describe_detection_distance(found) == "Seen from 28.3 m in half of the pictures, 10 to 80 m with 95 % confidence."
 
 
 def test_a_share_that_rises_with_the_distance_is_pooled() -> None:
@@ -42,7 +42,7 @@ def test_a_range_with_a_dip_has_no_one_distance() -> None:
     assert (dip.distance, dip.counts, dip.until, dip.counts_beyond) == (5.0, (7, 20), 20.0, (40, 40))
     assert dip.p_value < 1e-6 and not found.is_monotone
     assert found.distance == pytest.approx(20.0 * 2.0 ** (0.5 / 0.8)), "beyond the dip nothing is pooled with it"
-    said = distance_sentence(found)
+    said = describe_detection_distance(found)
     assert said.startswith("No one distance from which on it is seen: right in 7 of 20 at 5 m, 40 of 40 beyond it")
     assert "Beyond that the share falls below a half at 30.8 m; 20 to 80 m with 95 % confidence." in said
 
@@ -67,8 +67,8 @@ def test_loose_boxes_are_no_misses() -> None:
     found = compute_detection_distance(listed)
     assert found.loose_counts == (12, 0, 3, 0, 0)
     said = "Not counted as seen, but not missed either, are loose boxes: 12 of 20 at 5 m, 3 of 20 at 20 m."
-    assert distance_sentence(found).endswith(said)
-    assert "loose" not in distance_sentence(compute_detection_distance(rows([8, 20, 15, 5, 0])))
+    assert describe_detection_distance(found).endswith(said)
+    assert "loose" not in describe_detection_distance(compute_detection_distance(rows([8, 20, 15, 5, 0])))
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_loose_boxes_are_no_misses() -> None:
     ],
 )
 def test_what_the_pictures_do_not_bound_is_left_open(correct: list[int], of: int, said: str) -> None:
-    assert distance_sentence(compute_detection_distance(rows(correct, of))).startswith(said)
+    assert describe_detection_distance(compute_detection_distance(rows(correct, of))).startswith(said)
 
 
 def test_the_interval_holds_as_often_as_it_says() -> None:

@@ -23,7 +23,7 @@ def test_rows_of_a_sweep_are_counted_by_outcome() -> None:
     predictions.add(3, judged(False, "cup in a loose box", Outcome.LOOSE))
     predictions.add(4, judged(True, OUT_OF_VIEW, Outcome.PHANTOM))
     predictions.add(5, judged(True, OUT_OF_VIEW, None))
-    assert predictions.n_phantoms_out_of_view == 1 and predictions.is_hidden.sum() == 2
+    assert predictions.n_phantoms_out_of_view == 1 and predictions.is_out_of_view.sum() == 2
     numbers = np.flatnonzero(predictions.is_counted)
     axis = TableAxis("camera.distance", "metres", [5.0, 9.0], np.array([0, 0, 1, 1]))
     near, far = axis.make_rows(predictions.is_right[numbers], numbers, predictions.outcome[numbers])

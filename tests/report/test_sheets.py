@@ -72,7 +72,7 @@ def test_what_is_larger_than_a_page_is_put_together_again(tmp_path: Path) -> Non
     assert pages > 2
     whole = np.zeros_like(picture)
     for part, (levels, width, height) in zip(tiles, drawn, strict=True):
-        x0, x1, y0, y1 = part.trim
+        x0, x1, y0, y1 = part.pixel_bounds
         assert (width, height) == pytest.approx((x1 - x0 + 6.0, y1 - y0 + 6.0), abs=1e-3)
         whole[y0:y1, x0:x1] = levels[3:-3, 3:-3]
         assert part.x >= MARGIN + 3.0

@@ -11,7 +11,7 @@ from pydantic import Field, computed_field
 from advsearch.cli.output import format_result as check_text
 from advsearch.questions.attack.page import make_page as attack_page
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.runs.results import Fields, Interval, JsonFloat, Result, as_fact
+from advsearch.runs.results import Fields, Interval, JsonFloat, Result, make_fact_schema
 from samples import attack
 
 
@@ -43,9 +43,9 @@ def test_a_result_is_json_without_what_was_not_asked_for_and_reads_back() -> Non
 class Timed(AttackSummary):
     """An attack with two fields more: one that was measured, one that is computed from others."""
 
-    picture_bytes: int | None = Field(default=None, description="of a picture", json_schema_extra=as_fact())
+    picture_bytes: int | None = Field(default=None, description="of a picture", json_schema_extra=make_fact_schema())
 
-    @computed_field(description="renders over seconds", json_schema_extra=as_fact("{:.3g}"))  # type: ignore[prop-decorator]
+    @computed_field(description="renders over seconds", json_schema_extra=make_fact_schema("{:.3g}"))  # type: ignore[prop-decorator]
     @property
     def renders_a_second(self) -> float:
         return sum(self.renders.values()) / self.seconds["total"]

@@ -124,11 +124,11 @@ def table(
         render = scene.renderer("texture", resolution=48, denoise="none")
         full = render(render.start, 0, 400).detach().numpy()
         empty = scene.renderer("texture", resolution=48, denoise="none")
-        empty.scene.assembly.is_object_hidden = True
+        empty.scene.input_assembler.is_object_hidden = True
         levels = np.round(empty(empty.start, 5, 400).detach().numpy() * 255.0).astype(np.uint8)
     path = tmp_path_factory.mktemp("photographs") / "table.png"
     Image.fromarray(levels).save(path)
-    return path, full, render.mask(render.start).numpy(), scene.description.gain, request.param
+    return path, full, render.compute_object_mask(render.start).numpy(), scene.description.gain, request.param
 
 
 @pytest.mark.medium
@@ -163,7 +163,7 @@ def test_the_ground_is_darker_below_the_object_and_as_it_was_far_away(tmp_path: 
         render = scene.renderer("texture", resolution=(48, 64), denoise=denoise)
         levels = np.round(render(render.start, 0, 36).detach().numpy() * 255.0)
         change = levels - np.array([120, 160, 90])
-        mask = render.mask(render.start).numpy()
+        mask = render.compute_object_mask(render.start).numpy()
         rows, columns = np.nonzero(mask)
         below = change[rows.max() + 1, columns.min() : columns.max()]
         assert below.min() < -15 and below.mean() < -2, denoise
@@ -188,7 +188,7 @@ def test_the_derivative_with_a_shadow_is_that_of_differences(tmp_path: Path, con
     render = scene.renderer(controls[control], resolution=32, denoise="none")
     u = torch.full((len(render.start),), 0.4)
     leaf = u.clone().requires_grad_()
-    for part in (render.mask(u), ~render.mask(u)):
+    for part in (render.compute_object_mask(u), ~render.compute_object_mask(u)):
         weights = part[..., None] * torch.linspace(0.2, 1.0, 32)[None, :, None]
         (slope,) = torch.autograd.grad((weights * render(leaf, 1, 256)).sum(), leaf)
         with torch.no_grad():
@@ -363,9 +363,9 @@ def test_the_object_has_the_noise_and_the_blur_of_the_photograph_and_is_behind_w
         render = scene.renderer("texture", resolution=96)
         pictures[name] = render(render.start, 0, 16).detach().numpy() * 255.0
         if name == "plain":
-            inside = ndimage.binary_erosion(render.mask(render.start).numpy(), iterations=8)
+            inside = ndimage.binary_erosion(render.compute_object_mask(render.start).numpy(), iterations=8)
     assert (np.round(pictures["matched"][:, :48]) == noisy[:, :48]).all(), "the photograph is in front"
-    assert not render.mask(render.start).numpy().all()
+    assert not render.compute_object_mask(render.start).numpy().all()
     right = inside.copy()
     right[:, :48] = False
     difference = (pictures["matched"] - pictures["plain"])[right & (pictures["plain"].max(axis=2) < 230.0)]
@@ -373,7 +373,7 @@ def test_the_object_has_the_noise_and_the_blur_of_the_photograph_and_is_behind_w
     again = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", occluder=tmp_path / "mask.png", settings=NO_SHADOW)
     render = again.renderer("texture", resolution=96)
     assert (render(render.start, 0, 16).detach().numpy() * 255.0 == pictures["matched"]).all(), "it repeats"
-    assert not render.mask(render.start)[:, :48].any() and render.mask(render.start)[:, 48:].any()
+    assert not render.compute_object_mask(render.start)[:, :48].any() and render.compute_object_mask(render.start)[:, 48:].any()
     steps = {name: np.abs(np.diff(picture, axis=1)).max() for name, picture in pictures.items()}
     assert steps["blurred"] < 0.6 * steps["plain"]
 
@@ -405,7 +405,7 @@ def test_what_is_farther_than_the_depth_of_the_photograph_is_hidden(tmp_path: Pa
     ball = np.where(root > 0.0, (distance - np.sqrt(np.maximum(root, 0.0))) / square, np.inf)
     shown = np.isfinite(ball) & ((depth == 0.0) | (ball < depth))
     fraction = shown.reshape(height, 2, width, 2).mean(axis=(1, 3))
-    found = render.mask(render.start).numpy()
+    found = render.compute_object_mask(render.start).numpy()
     sure = (fraction == 0.0) | (fraction == 1.0)
     assert 200 < shown.sum() / 4 < 0.8 * np.isfinite(ball).sum() / 4
     assert (found == (fraction == 1.0))[sure].mean() > 0.99

@@ -56,7 +56,7 @@ def test_a_number_that_is_changed_is_seen_or_told(kind: str, tmp_path: Path) -> 
         except FileFormatError:
             assert not harmless(path) or "roi" in path, path
             continue
-        changed = (found.numbers, found.size) != (whole.numbers, whole.size) or found.reading_notes != ()
+        changed = (found.intrinsics, found.calibrated_shape) != (whole.intrinsics, whole.calibrated_shape) or found.reading_notes != ()
         assert changed != harmless(path), path
 
 
@@ -87,7 +87,7 @@ def test_a_key_that_makes_another_picture_is_refused_by_name(kind: str, key: str
             continue
         with pytest.raises(FileFormatError, match=key):
             read(tmp_path, data)
-    assert read(tmp_path, KINDS[kind] | {key: 0.0}).numbers == read(tmp_path, KINDS[kind]).numbers
+    assert read(tmp_path, KINDS[kind] | {key: 0.0}).intrinsics == read(tmp_path, KINDS[kind]).intrinsics
 
 
 @pytest.mark.parametrize(

@@ -33,13 +33,13 @@ STILL: dict[str, object] = {"pose": {"yaw": [0, 1]}}
 FOLDING = "k1=-0.6"
 LENSES = {
     "pinhole": make_pinhole(60.0, 1.0),
-    "barrel": make_pinhole(60.0, 1.0).with_numbers(
+    "barrel": make_pinhole(60.0, 1.0).with_intrinsics(
         torch.tensor([0.8, 0.9, 0.5, 0.45, 0.02, -0.28, 0.07, 0.01, *[0.0] * 9])
     ),
-    "decentred": make_pinhole(60.0, 1.0).with_numbers(
+    "decentred": make_pinhole(60.0, 1.0).with_intrinsics(
         torch.tensor([0.6, 0.8, 0.51, 0.48, 0.01, 1.2, 0.7, 0.1, 1.5, 0.9, 0.2, 0.003, 0.001, 0.01, -0.02, 0.005, 0.01])
     ),
-    FOLDING: make_pinhole(60.0, 1.0).with_numbers(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11])),
+    FOLDING: make_pinhole(60.0, 1.0).with_intrinsics(torch.tensor([0.7, 0.7, 0.5, 0.5, 0.0, -0.6, *[0.0] * 11])),
     **make_bundled_models(),
 }
 
@@ -92,7 +92,7 @@ def test_a_panorama_has_what_is_ahead_in_its_middle_and_the_zenith_on_top() -> N
 
 def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
     lens = LENSES[FOLDING]
-    assert math.isclose(math.degrees(lens.fold_angle), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6)
+    assert math.isclose(math.degrees(lens.fold_angle_radians), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6)
     assert len(lens.notes) == 1 and "36.7 degrees" in lens.notes[0]
     _, inside = lens.compute_rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
     assert inside[0] > 0.0 > inside[1]
@@ -110,11 +110,11 @@ def test_one_camera_in_each_kind_of_file_is_the_same(name: str, tmp_path: Path) 
     path = tmp_path / name
     path.with_name(name.partition("#")[0]).write_text(TEXTS[name])
     found = read_camera(str(path))
-    assert found.kind == CAMERA_FILES[name]["kind"] and found.size == (720, 1280)
+    assert found.kind == CAMERA_FILES[name]["kind"] and found.calibrated_shape == (720, 1280)
     assert not [note for note in found.reading_notes if "M2" not in note]
     wanted = {"fx": 902.5 / 1280, "fy": 911.75 / 720, "cx": 645.75 / 1280, "cy": 353.0 / 720}
     wanted |= CAMERA_FILES[name]["numbers"]
-    assert found.values == pytest.approx({**dict.fromkeys(NUMBER_NAMES, 0.0), **wanted})
+    assert found.intrinsic_by_name == pytest.approx({**dict.fromkeys(NUMBER_NAMES, 0.0), **wanted})
 
 
 def test_binned_pixels_are_fewer_and_see_the_same(tmp_path: Path) -> None:
@@ -124,10 +124,10 @@ def test_binned_pixels_are_fewer_and_see_the_same(tmp_path: Path) -> None:
     whole = read_camera(str(path))
     path.write_text(GOOD + "binning_x: 3\nbinning_y: 0\n")
     found = read_camera(str(path))
-    assert whole.size == (720, 1280) and found.size == (720, 426)
-    assert found.values["fy"] == whole.values["fy"] and found.values["k1"] == whole.values["k1"]
-    assert found.values["fx"] * 426 * 3 == pytest.approx(whole.values["fx"] * 1280)
-    assert found.values["cx"] * 426 * 3 == pytest.approx(whole.values["cx"] * 1280)
+    assert whole.calibrated_shape == (720, 1280) and found.calibrated_shape == (720, 426)
+    assert found.intrinsic_by_name["fy"] == whole.intrinsic_by_name["fy"] and found.intrinsic_by_name["k1"] == whole.intrinsic_by_name["k1"]
+    assert found.intrinsic_by_name["fx"] * 426 * 3 == pytest.approx(whole.intrinsic_by_name["fx"] * 1280)
+    assert found.intrinsic_by_name["cx"] * 426 * 3 == pytest.approx(whole.intrinsic_by_name["cx"] * 1280)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_models_of_colmap(line: str, kind: str, numbers: dict[str, float], tmp_p
     (tmp_path / "cameras.txt").write_text(f"1 {line}\n")
     found = read_camera(str(tmp_path / "cameras.txt"))
     assert found.kind == kind
-    assert {name: found.values[name] for name in numbers} == pytest.approx(numbers)
+    assert {name: found.intrinsic_by_name[name] for name in numbers} == pytest.approx(numbers)
 
 
 GOOD = ros("plumb_bob", K)
@@ -244,8 +244,8 @@ def through_fisheye() -> Renderer:
 
 def test_the_object_is_seen_where_the_model_projects_it(through_fisheye: Renderer) -> None:
     """The mask, and with it the box that a detector should find."""
-    rows, columns = torch.nonzero(through_fisheye.mask(through_fisheye.start), as_tuple=True)
-    description = through_fisheye.scene.definition[0]
+    rows, columns = torch.nonzero(through_fisheye.compute_object_mask(through_fisheye.start), as_tuple=True)
+    description = through_fisheye.scene.description_and_filter[0]
     pose = torch.from_numpy(camera_to_world(description))
     vertices = torch.from_numpy(description.base_vertices)
     points = (vertices - pose[:3, 3]) @ pose[:3, :3] * torch.tensor([-1.0, -1.0, 1.0])
@@ -266,7 +266,7 @@ def test_outside_the_circle_all_is_black_in_pictures_guides_and_predictions(thro
     for picture in (traced, predicted):
         assert float(picture[corner].abs().max()) < 1e-3, "the denoiser leaves a little"
     assert float(traced[16, 16].mean()) > 0.05
-    assert not bool((through_fisheye.surfaces(u).id[corner] > 0).any())
+    assert not bool((through_fisheye.find_surfaces(u).id[corner] > 0).any())
     off = (predicted - traced).abs().mean() / traced.abs().mean()
     assert float(off) < 0.1, "the predicted picture is seen along the same rays"
 
@@ -304,7 +304,7 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
     with torch.no_grad():
         white, black = (one.radiance(torch.full_like(one.start, value), 1, 32) for value in (1.0, 0.0))
     painted = (white - black).mean(dim=-1) > 0.15 * float((white - black).mean(dim=-1).max())
-    truth = make_sight(one.surfaces(one.start))
+    truth = make_sight(one.find_surfaces(one.start))
     seen = Facts("mug", compute_sight=lambda: truth)
     shown = Facts("mug", compute_sight=lambda: replace(truth, mask=painted))
     assert seen.box is not None and shown.box is not None
@@ -315,7 +315,7 @@ def test_truth_is_that_of_the_distorted_picture(camera: str, tmp_path: Path) -> 
     flat = (plain.base_vertices - pose[:3, 3]) @ pose[:3, :3] * (-1.0, -1.0, 1.0)
     model = scene.description.camera_model
     assert model is not None
-    fx, fy, cx, cy = model.numbers[:4]
+    fx, fy, cx, cy = model.intrinsics[:4]
     straight = 48 * (flat[:, :2] / flat[:, 2:] * (fx, fy) + (cx, cy))
     ends = (*straight.min(axis=0), *straight.max(axis=0))
     assert max(abs(a - b) for a, b in zip(seen.box, ends, strict=True)) > 2.5, "a pinhole's box is another one"

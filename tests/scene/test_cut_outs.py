@@ -55,7 +55,7 @@ def test_what_is_cut_out_is_not_seen(framed: Path) -> None:
     scene = advsearch.load_scene(framed, settings=SEEN)
     renderer = scene.renderer("pose", resolution=SIZE, denoise="none")
     assert scene.description.notes == ()
-    mask, picture = renderer.mask(renderer.start), renderer(renderer.start, seed=0, spp=64)
+    mask, picture = renderer.compute_object_mask(renderer.start), renderer(renderer.start, seed=0, spp=64)
     rows = np.flatnonzero(mask.any(1).numpy())
     first, last = int(rows[0]), int(rows[-1]) + 1
     hole = slice(first + (last - first) // 4 + 1, last - (last - first) // 4 - 1)

@@ -43,7 +43,7 @@ def test_extremes_are_finite(name: str) -> None:
     assert bool(torch.isfinite(picture).all()) and float(picture.min()) >= 0.0 and float(picture.max()) <= 1.0
     _, gradient = render.gradient(make_smooth_loss((SIZE, SIZE)), u, 0, 2)
     assert bool(torch.isfinite(gradient).all())
-    assert render.non_finite == 0
+    assert render.n_non_finite == 0
 
 
 def test_one_texel_of_a_hundred_thousand_is_finite() -> None:

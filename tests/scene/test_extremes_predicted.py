@@ -71,7 +71,7 @@ def lit(
     seen = (
         check_range("largest derivative by a texel", float(gradient.abs().max()), 0.0, 0.0)
         if slope is None
-        else check_range("error of the derivative by the texture", error, most=slope)
+        else check_range("error of the derivative by the texture", error, max_value=slope)
     )
     hidden = textured * (gradient == 0.0)
     light.path_renderer = renderer
@@ -79,11 +79,11 @@ def lit(
         unseen = float((light(u * (1.0 - hidden)) - picture).abs().max())
     checks = [
         check_condition("the picture is in [0, 1]", bool((picture >= 0.0).all() and (picture <= 1.0).all())),
-        check_range("levels of 255 off", off, most=levels),
+        check_range("levels of 255 off", off, max_value=levels),
         seen,
         check_range("largest change where texels without a derivative become black", unseen, 0.0, 0.0),
     ]
-    finite = bool(torch.isfinite(picture).all() and torch.isfinite(gradient).all()) and light.non_finite == 0
+    finite = bool(torch.isfinite(picture).all() and torch.isfinite(gradient).all()) and light.n_non_finite == 0
     measured = {"entries": float(light.n_entries), "derivative": wanted, "hidden numbers": float(hidden.sum())}
     return CaseOutcome(checks, finite, error, measurements=measured)
 

@@ -167,7 +167,7 @@ def test_sharp_texels_stay_sharp(tmp_path: Path) -> None:
     seen = {"ground.size": 0.0, "camera.elevation": 89.0, "camera.azimuth": 0.0, "material.specular": 0.0}
     scene = advsearch.load_scene(path, environment=white, settings=seen)
     renderer = scene.renderer("pose", resolution=64, denoise="none")
-    got, inside = renderer(renderer.start, seed=0, spp=64).numpy(), renderer.mask(renderer.start).numpy()
+    got, inside = renderer(renderer.start, seed=0, spp=64).numpy(), renderer.compute_object_mask(renderer.start).numpy()
     rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
     wanted = linear_to_srgb((0.625 * srgb_to_linear(pixels / np.float32(255.0))).astype(np.float32))
     side = len(rows) / 4.0

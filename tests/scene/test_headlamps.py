@@ -109,7 +109,7 @@ def test_the_ground_ahead_has_the_lux_of_both_headlamps() -> None:
     for one in (lit, dark):
         renderer = rendered(one, 96)
         found.append(renderer.radiance(renderer.start, 3, 64).numpy() @ np.array(LUMINANCE))
-    seen, described = renderer.surfaces(renderer.start), lit.description
+    seen, described = renderer.find_surfaces(renderer.start), lit.description
     camera, right = (lamp.to_world for lamp in beams(described))
     place = 0.5 * (camera + right)[:3, 3] * described.size_in_metres
     assert place[2] == pytest.approx(EGO_LAMP_POSITION[2]) and camera[:3, 2] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)

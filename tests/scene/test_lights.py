@@ -12,7 +12,7 @@ from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
-from advsearch.scene.transport.lights import BasisRenderer, find_lighting
+from advsearch.scene.transport.lights import BasisRenderer, find_light_groups
 from small_models import levels
 from stand_ins import Impatient, rows
 
@@ -58,9 +58,9 @@ def off(renderer: Renderer, predicted: BasisRenderer, u: Tensor) -> tuple[float,
 )  # fmt: skip
 def test_what_is_light(controls: Any, light: set[str], more: set[str]) -> None:
     made = rendered_by(controls)
-    found = find_lighting(made)
+    found = find_light_groups(made)
     names = {group.name for group in made.plan.groups}
-    assert light <= found.groups.keys() and not more & found.groups.keys()
+    assert light <= found.inputs_by_group.keys() and not more & found.inputs_by_group.keys()
     assert light | more <= names
     assert bool(found.harmonic_groups) == ("environment.harmonics" in light)
 

@@ -45,7 +45,7 @@ def distances(origin: Doubles, rays: Doubles, vertices: Tensor, faces: npt.NDArr
 def cast(render: Renderer, u: Tensor) -> dict[str, Doubles]:
     """Distance to every mesh (H, W), by name, through the middle of each pixel."""
     assert isinstance(render.space, Space) and render.space.scene is not None
-    placed = render.scene.assembly(render.space.inputs(u))
+    placed = render.scene.input_assembler(render.space.inputs(u))
     camera, fov = placed["camera.to_world"].numpy().astype(np.float64), float(placed["camera.fov"])
     half = math.tan(math.radians(fov) / 2.0)
     side = half * (1.0 - (2.0 * np.arange(SIZE) + 1.0) / SIZE)  # Mitsuba's cameras have x to the left
@@ -68,7 +68,7 @@ def test_a_mask_is_where_the_object_is_hit_first(moved: Renderer, seed: int) -> 
     found = cast(moved, u)
     alone = np.isfinite(found["object"])
     nearest = alone & (found["object"] < found["occlusion"])
-    mask = moved.mask(u)
+    mask = moved.compute_object_mask(u)
     assert mask.shape == (SIZE, SIZE) and mask.dtype == torch.bool
     assert np.array_equal(mask.numpy(), nearest)
     assert 20 < nearest.sum() < alone.sum() - 20, "a part of it is hidden"
@@ -76,16 +76,16 @@ def test_a_mask_is_where_the_object_is_hit_first(moved: Renderer, seed: int) -> 
 
 def test_a_mask_is_of_its_own_configuration_and_leaves_renders_as_they_are(moved: Renderer) -> None:
     first, second = (torch.rand(moved.start.shape, generator=torch.Generator().manual_seed(seed)) for seed in (2, 3))
-    before, mask = moved(first, seed=1, spp=2), moved.mask(first)
-    assert not torch.equal(moved.mask(second), mask) and torch.equal(moved.mask(first), mask)
+    before, mask = moved(first, seed=1, spp=2), moved.compute_object_mask(first)
+    assert not torch.equal(moved.compute_object_mask(second), mask) and torch.equal(moved.compute_object_mask(first), mask)
     assert torch.allclose(moved(first, seed=1, spp=2), before, atol=1e-6)
     with pytest.raises(InputError, match="entry of u"):
-        moved.mask(first + 2.0)
+        moved.compute_object_mask(first + 2.0)
 
 
 def mask_of(controls: dict[str, dict[str, object]]) -> Tensor:
     render = load_scene("mug").renderer(make_controls(controls), resolution=SIZE, denoise="none")
-    return render.mask(render.start)
+    return render.compute_object_mask(render.start)
 
 
 def test_a_lamp_hides_the_object_only_while_it_shines() -> None:

@@ -62,4 +62,4 @@ def test_an_outline_that_is_elsewhere_is_not_believed(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(outlines, "project_points", behind)
     assert (seen(one).visible_fraction, seen(one).is_truncated) == (None, None)
-    assert torch.equal(torch.from_numpy(seen(one).mask), one.surfaces(one.start).visible_mask("object"))
+    assert torch.equal(torch.from_numpy(seen(one).mask), one.find_surfaces(one.start).visible_mask("object"))

@@ -18,7 +18,7 @@ from advsearch.controls.backdrop import BackdropControl
 from advsearch.engine.loading import fit_camera, make_controls
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import photograph_files
-from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.geometry import camera_to_world, compute_object_to_world
 from advsearch.scene.photograph_files import read_photograph_folder, read_photograph_view
 from advsearch.trust import stored_files
 
@@ -50,7 +50,7 @@ def test_a_camera_file_states_lens_pose_part_and_settings(tmp_path: Path) -> Non
     plain = advsearch.load_scene(BOX, backdrop=f"{copy}#16,0,96,96", unit="mm", settings=settings).description
     plain = plain.with_measured_view(stated["camera_matrix"], stated["object_to_camera"])
     assert scene.values == pytest.approx(plain.values) and scene.camera_model and plain.camera_model
-    np.testing.assert_allclose(scene.camera_model.numbers, plain.camera_model.numbers, rtol=1e-12)
+    np.testing.assert_allclose(scene.camera_model.intrinsics, plain.camera_model.intrinsics, rtol=1e-12)
     assert scene.backdrop_photograph and scene.backdrop_photograph.crop == (16, 0, 96, 96)
     assert scene.requested == {"ground.size", "backdrop.noise"}, "a control may vary the pose"
     # what the user states wins
@@ -71,8 +71,8 @@ def test_the_first_photograph_is_the_clean_scene_and_one_is_chosen(folder: Path)
     # the object stays, and the camera sees it as it was measured
     for place, view in enumerate(description.photographs.scenes.values()):  # type: ignore[union-attr]
         inputs = space.inputs(torch.tensor([(place + 0.5) / 6]))
-        seen = np.linalg.inv(inputs["camera.to_world"].double().numpy()) @ object_to_world(description)
-        np.testing.assert_allclose(seen, np.linalg.inv(camera_to_world(view)) @ object_to_world(view), atol=1e-5)
+        seen = np.linalg.inv(inputs["camera.to_world"].double().numpy()) @ compute_object_to_world(description)
+        np.testing.assert_allclose(seen, np.linalg.inv(camera_to_world(view)) @ compute_object_to_world(view), atol=1e-5)
         gain = description.gain * 2.0 ** float(inputs["camera.exposure"])
         assert gain == pytest.approx(view.gain, rel=1e-5)
     chosen = make_space(make_controls({"backdrop": {"which": NAMES[2:4]}}), description)
@@ -172,7 +172,7 @@ def test_one_file_has_the_cameras_of_a_folder_and_is_read_once(
     for number, view in enumerate(scene.photographs.scenes.values()):
         height = camera_to_world(view)[:3, 3] * view.size_in_metres
         np.testing.assert_allclose(height, [0.0, 0.0, 1.0 + number], atol=1e-9)
-        assert view.camera_model and view.camera_model.values["fx"] == 50 / 64
+        assert view.camera_model and view.camera_model.intrinsic_by_name["fx"] == 50 / 64
     opened_files = stored_files.list_opened_files(photographs)
     assert str(tmp_path / name) in opened_files, "a run keeps its digest"
 

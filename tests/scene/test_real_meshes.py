@@ -106,7 +106,7 @@ def test_a_mesh_stands_upright_in_the_frame_and_is_lit(name: str, tmp_path: Path
     edge = np.tan(np.radians(described.get_number("camera.fov") / 2.0))
     assert (np.abs(seen[:, :2]) <= edge * seen[:, 2:]).all()
     renderer = scene.renderer("pose", resolution=24, denoise="none")
-    body = renderer.mask(renderer.start)
+    body = renderer.compute_object_mask(renderer.start)
     picture = renderer(renderer.start, seed=0, spp=4)
     assert 0.05 < float(body.float().mean()) < 0.9 and 0.1 < float(picture[body].mean()) < 0.95
     for control in ("texture", "material", "geometry", "patch", "light", "camera"):

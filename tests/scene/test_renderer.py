@@ -88,7 +88,7 @@ def test_an_interrupted_gradient_leaves_nothing_behind(raw: Renderer, monkeypatc
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setitem(raw.scene._integrators, ("path", raw.scene.depth), Interrupted())
+        patch.setitem(raw.scene._integrators, ("path", raw.scene.current_max_depth), Interrupted())
         raw.scene.render_adjoint({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, torch.ones(SIZE, SIZE, 3), 1, 4)
     assert torch.equal(base, raw.scene.render_radiance({}, 5, 4))
 
@@ -187,10 +187,10 @@ def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypat
     broken = torch.full((SIZE, SIZE, 3), 0.5)
     broken[0, 0, 0], broken[1, 1, 1] = float("nan"), float("inf")
     monkeypatch.setattr(raw.scene, "render_images", lambda *_, **__: [broken])
-    before = raw.non_finite
+    before = raw.n_non_finite
     with torch.no_grad():
         image = raw(raw.start, seed=0, spp=1)
-    assert raw.non_finite - before == 2
+    assert raw.n_non_finite - before == 2
     assert bool(torch.isfinite(image).all()) and float(image[0, 0, 0]) == 0.0
 
 
@@ -204,7 +204,7 @@ def test_a_picture_is_radiance_times_the_gain_through_the_curve() -> None:
         "linear": light,
     }
     for transfer, expected in shown.items():
-        assert torch.allclose(ImageFormation(gain=2.5, transfer=transfer).display(radiance), expected)
+        assert torch.allclose(ImageFormation(gain=2.5, transfer=transfer).map_to_display(radiance), expected)
 
 
 @pytest.mark.medium
@@ -226,7 +226,7 @@ def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:
     assert noise["better"] < 0.75 * noise["plain"]
     means = [found.mean(0) for found in pictures.values()]
     assert float((means[0] - means[1]).square().mean()) < (noise["plain"] + noise["better"]) / 8 * 1.5
-    assert better.scene.copy_with(max_depth=3).sampler == "multijitter"
+    assert better.scene.copy_with(max_depth=3).sampler_name == "multijitter"
 
 
 SECOND = "render: it has first derivatives only"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.rig import Mount, read_rig
+from advsearch.scene.rig import RigCamera, read_rig
 
 BY_HAND = "cameras: [{}, {place: [0.6, 0, 0]}, {place: [0, -0.5, 0.1], turn: [90, 0, 0]}, {turn: [0, 30, 0]}]"
 """0.6 to the right; 0.5 above, 0.1 ahead and turned to the right; turned up."""
@@ -45,14 +45,14 @@ def images(folder: Path, lines: list[str] | None = None, points: str = "1.5 2.5 
     return written(folder, "images.txt", text)
 
 
-def wanted(folder: Path) -> list[Mount]:
+def wanted(folder: Path) -> list[RigCamera]:
     return list(read_rig(written(folder, "rig.yaml", BY_HAND)))
 
 
 @pytest.mark.parametrize("points", ["1.5 2.5 7 3 4 -1", ""])
 def test_poses_of_others_are_those_by_hand(tmp_path: Path, points: str) -> None:
     for found in (read_rig(transforms(tmp_path) + "#0,1,2,3"), read_rig(images(tmp_path, points=points))):
-        assert len(found) == 4 and all(one.model is not None and one.model.size == (24, 32) for one in found)
+        assert len(found) == 4 and all(one.camera_model is not None and one.camera_model.calibrated_shape == (24, 32) for one in found)
         for mount, by_hand in zip(found, wanted(tmp_path), strict=True):
             np.testing.assert_allclose(mount.pose, by_hand.pose, atol=1e-9)
 

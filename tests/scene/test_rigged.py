@@ -259,7 +259,7 @@ def test_bones_of_vrm_have_their_names(old: bool, tmp_path: Path) -> None:
     path = figure(extensions=held, extensionsUsed=list(held)).write(tmp_path).rename(tmp_path / "someone.vrm")
     asset = import_object(path)
     assert isinstance(asset.mesh.rig, SkeletonRig)
-    assert {"hips", "leftUpperArm"} <= set(asset.mesh.rig.joints)
+    assert {"hips", "leftUpperArm"} <= set(asset.mesh.rig.node_of_joint)
     assert len(asset.warnings) == 1 and "Bend" in asset.warnings[0]
 
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.geometry import FRAME_FILL, camera_to_world, make_rotation, object_to_world
+from advsearch.scene.geometry import FRAME_FILL, camera_to_world, make_rotation, compute_object_to_world
 
 
 def projected(description: SceneDescription) -> np.ndarray:
     """Vertices in units of half the picture, and their depth, by an independent pinhole projection."""
     camera = camera_to_world(description)
     world = (
-        description.object.mesh.vertices @ object_to_world(description)[:3, :3].T + object_to_world(description)[:3, 3]
+        description.object.mesh.vertices @ compute_object_to_world(description)[:3, :3].T + compute_object_to_world(description)[:3, 3]
     )
     local = (world - camera[:3, 3]) @ camera[:3, :3]
     half = np.tan(np.radians(description.get_number("camera.fov")) / 2)
@@ -54,7 +54,7 @@ def test_a_rolled_camera_turns_the_picture_and_nothing_else() -> None:
 @pytest.mark.parametrize("pose", [{}, {"pose.pitch": 35.0}, {"pose.roll": 90.0, "pose.scale": 2.0}])
 def test_an_object_stands_on_the_ground_in_every_pose(pose: dict[str, float]) -> None:
     description = load_description("mug", setting_values=pose)
-    matrix = object_to_world(description)
+    matrix = compute_object_to_world(description)
     heights = description.object.mesh.vertices @ matrix[2, :3] + matrix[2, 3]
     assert heights.min() == pytest.approx(0.0, abs=1e-6)
 

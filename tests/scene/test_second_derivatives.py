@@ -18,7 +18,7 @@ import advsearch
 from advsearch.controls.geometry import _Solve
 from advsearch.scene.color import LINEAR_LIMIT, linear_to_srgb
 from advsearch.scene.formation import ImageFormation
-from advsearch.scene.mitsuba_backend.transport import Vertices
+from advsearch.scene.mitsuba_backend.transport import PathVertices
 from advsearch.scene.surface.arrangement import multiply_sparse
 from advsearch.scene.transport.matrix import CELL_SIZE, TextureTransport
 
@@ -41,7 +41,7 @@ def transport() -> Callable[[Tensor], Tensor]:
     made, shape = TextureTransport((2, 2), (CELL_SIZE, CELL_SIZE)), (CELL_SIZE, CELL_SIZE, 3)
     places = torch.tensor([[0.1, 0.3], [0.2, 0.3], [0.3, 0.3], [0.3, 0.4]])
     weight = torch.arange(1.0, 13.0).reshape(4, 3) / 6.0
-    made.add_pass([Vertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], pass_weight=1.0)
+    made.add_pass([PathVertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], pass_weight=1.0)
     made.finish()
     spread = torch.randn(10, *shape, generator=torch.Generator().manual_seed(1)) / CELL_SIZE
     return lambda x: made(torch.einsum("n,nhwc->hwc", x.float(), spread)).double()
@@ -83,14 +83,14 @@ def test_a_shown_picture_is_the_encoded_one() -> None:
     radiance = torch.rand(8, 8, 3, generator=generator) - 0.1
     radiance[0, :5, 0] = torch.tensor([0.0, 1.0 / 1.37, LINEAR_LIMIT / 1.37, math.inf, -1.0])
     cotangent, found = torch.randn(8, 8, 3, generator=generator), []
-    for shown in (formation.display, lambda one: linear_to_srgb(one * 1.37)):
+    for shown in (formation.map_to_display, lambda one: linear_to_srgb(one * 1.37)):
         at = radiance.clone().requires_grad_()
         picture = shown(at)
         picture.backward(cotangent)
         assert at.grad is not None
         found.append((picture.detach(), at.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
-    assert torch.autograd.gradgradcheck(formation.display, torch.linspace(0.02, 0.6, 9).double().requires_grad_())
+    assert torch.autograd.gradgradcheck(formation.map_to_display, torch.linspace(0.02, 0.6, 9).double().requires_grad_())
 
 
 ONCE = {"_Radiance", "_Differences", "_OnceDifferentiable"}

@@ -22,15 +22,15 @@ def board(front: tuple[float, float], back: tuple[float, float], flat: bool = Fa
 
 def test_cells_run_from_the_top_row_and_have_places_on_the_mesh() -> None:
     parts = SurfaceParts(board((0.0, 0.5), (0.5, 1.0)))
-    assert not parts.is_unwrapped and parts.count == MAP_SIZE**2 + 4
+    assert not parts.is_unwrapped and parts.n_parts == MAP_SIZE**2 + 4
     uv = np.array([(0.0, 1.0), (0.499, 1.0), (1.0, 0.0), (0.25, 0.5)])
     found = parts.find_cells(np.array([1, 1, 3, 0]), uv)
     half = MAP_SIZE // 2
     assert found.tolist() == [0, half - 1, MAP_SIZE**2 - 1, half * MAP_SIZE + half // 2]
     assert parts.centers[found[:3]] == pytest.approx(np.array([(0, 0, 1), (1, 0, 1), (1, 0.1, 0)]), abs=2.0 / MAP_SIZE)
-    assert parts.face[found].tolist() == [1, 1, 2, 0]
+    assert parts.face_of_part[found].tolist() == [1, 1, 2, 0]
     assert parts.center_uvs[0] == pytest.approx((0.5 / MAP_SIZE, 1 - 0.5 / MAP_SIZE)) and parts.is_covered.all()
-    assert parts.part_slices["face"] == slice(MAP_SIZE**2, MAP_SIZE**2 + 4) and parts.face[MAP_SIZE**2 :].tolist() == [
+    assert parts.part_slices["face"] == slice(MAP_SIZE**2, MAP_SIZE**2 + 4) and parts.face_of_part[MAP_SIZE**2 :].tolist() == [
         0,
         1,
         2,
@@ -45,7 +45,7 @@ def test_cells_run_from_the_top_row_and_have_places_on_the_mesh() -> None:
 )
 def test_places_that_texture_coordinates_do_not_tell_apart_get_new_ones(mesh: Mesh) -> None:
     parts = SurfaceParts(mesh)
-    assert parts.is_unwrapped and parts.corners.min() >= 0.0 and parts.corners.max() <= 1.0
+    assert parts.is_unwrapped and parts.face_uvs.min() >= 0.0 and parts.face_uvs.max() <= 1.0
     same = mesh.uvs[mesh.faces[[0, 2]]].mean(axis=1)
     front, back = parts.find_cells(np.array([0, 2]), same.astype(np.float64))
     assert front != back and parts.is_covered.mean() > 0.2

@@ -14,19 +14,19 @@ SIZE = 32
 @pytest.fixture(scope="module")
 def seen() -> tuple[MitsubaScene, Surfaces]:
     render = load_scene("mug").renderer(["pose"], resolution=SIZE)
-    return render.scene, render.surfaces(render.start)
+    return render.scene, render.find_surfaces(render.start)
 
 
 def test_depth_normal_and_texture_coordinates_are_those_of_the_triangle(seen: tuple[MitsubaScene, Surfaces]) -> None:
     scene, found = seen
-    mesh = scene.assembly.meshes["object"]
-    metres = scene.definition[0].size_in_metres
+    mesh = scene.input_assembler.meshes["object"]
+    metres = scene.description_and_filter[0].size_in_metres
     vertices, faces = metres * mesh.transform_mesh(None, None)[0], torch.from_numpy(mesh._mesh.faces.astype(np.int64))
     uvs = torch.from_numpy(mesh._mesh.uvs)
     there = found.visible_mask("object")
     assert int(there.sum()) > SIZE
     eye = metres * scene.get_base_value("camera.to_world")[:3, 3]
-    corners = faces[found.face[there]]
+    corners = faces[found.face_index[there]]
     for low, high, value in (
         (
             vertices[corners].sub(eye).norm(dim=2).amin(1) - 2e-3,

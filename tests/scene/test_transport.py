@@ -14,7 +14,7 @@ from torch import Tensor
 import advsearch
 from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
-from advsearch.scene.mitsuba_backend.transport import Vertices
+from advsearch.scene.mitsuba_backend.transport import PathVertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import lights
 from advsearch.scene.transport import matrix as linear
@@ -74,12 +74,12 @@ def test_its_derivative_is_that_of_the_adjoint(renderer: Renderer, predicted: li
     assert torch.equal(exact, predicted.renderer.gradient(loss, u, seed=4, spp=8)[1]), "nothing of it is by chance"
 
 
-def vertices(rows: Sequence[tuple[int, float, float, float]], sharp: bool = True) -> Vertices:
+def vertices(rows: Sequence[tuple[int, float, float, float]], sharp: bool = True) -> PathVertices:
     """Vertices from rows of pixel, u, v and weight, that the camera sees or not."""
     table = np.array(rows, dtype=np.float32).reshape(-1, 4)
     weight = torch.from_numpy(table[:, 3:]).expand(-1, 3).contiguous()
     seen = torch.full((len(table),), sharp)
-    return Vertices(torch.from_numpy(table[:, 0]).long(), torch.from_numpy(table[:, 1:3]).contiguous(), weight, seen)
+    return PathVertices(torch.from_numpy(table[:, 0]).long(), torch.from_numpy(table[:, 1:3]).contiguous(), weight, seen)
 
 
 def test_a_lookup_is_bilinear_and_repeats_at_the_border() -> None:
@@ -119,7 +119,7 @@ def test_what_is_kept_small_says_the_same(texture: tuple[int, int], bytes_an_ent
     cotangent = torch.ones(1, 2, 3)
     both = small.multiply_transposed(cotangent), made.multiply_transposed(cotangent)
     torch.testing.assert_close(*both, rtol=2 * HALF, atol=1e-6)
-    assert small.bytes == bytes_an_entry * small._sharp.entries + 2 * (4 + 6) * 2
+    assert small.n_bytes == bytes_an_entry * small._sharp.entries + 2 * (4 + 6) * 2
 
 
 @pytest.mark.parametrize(

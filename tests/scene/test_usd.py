@@ -17,7 +17,7 @@ from advsearch.scene.description import SceneDescription, load_description
 from advsearch.scene.glb import encode_glb
 from advsearch.scene.importing import usd
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.scenes import list_contents
+from advsearch.scene.importing.scenes import read_file_contents
 from advsearch.scene.library import load_object
 from advsearch.scene.parts import PointLamp, SpotLamp
 
@@ -330,7 +330,7 @@ def test_references_payloads_variants_and_instances(tmp_path: Path) -> None:
     }"""
     narrow, wide = (mesh(CUBE * [size, 0.1, 1], SIDES, name="board") for size in (1.0, 3.0))
     file = written(tmp_path, legs + head % (narrow, wide))
-    found = list_contents(file)
+    found = read_file_contents(file)
     assert [one.triangles for one in found.nodes] == [12, 12, 12]
     names = [one.name for one in found.nodes]
     assert names == ["Root/leg0/stick", "Root/leg1/stick", "board"]
@@ -361,7 +361,7 @@ def test_a_skeleton_is_at_rest(tmp_path: Path) -> None:
         uniform matrix4d[] bindTransforms = [{identity}, {identity}]
         uniform matrix4d[] restTransforms = [{identity}, {moved}]
     }}"""
-    (node,) = list_contents(written(tmp_path, body, root="SkelRoot")).nodes
+    (node,) = read_file_contents(written(tmp_path, body, root="SkelRoot")).nodes
     assert node.size == pytest.approx((3.0, 1.0, 1.0))
 
 

@@ -44,7 +44,7 @@ def seen(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Where houses are seen (H, W), and where the road or the car is; row 0 on top."""
     renderer = scene.renderer({"texture": {}}, resolution=SIDE, denoise="none")
     u = renderer.start
-    surfaces = renderer.surfaces(u)
+    surfaces = renderer.find_surfaces(u)
     picture = renderer.radiance(u, 0, 16)
     things = np.isfinite(surfaces.depth.numpy())
     return (picture.mean(dim=-1).numpy() > 0.5) & ~things, things

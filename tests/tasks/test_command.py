@@ -13,7 +13,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, ModelError
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.options import to_setting
+from advsearch.options import convert_to_setting
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.tasks import Facts, make_task
 from advsearch.tasks.command import Command
@@ -103,7 +103,7 @@ def test_a_state_is_read_from_a_file_that_is_not_trusted(tmp_path: Path) -> None
     file = tmp_path / "state.json"
     file.write_text(json.dumps({"speed": 2, "joints": [0.1, 0.2]}))
     task = Command(state=str(file), envelope=1)
-    assert task.state == {"speed": (2.0,), "joints": (0.1, 0.2)} and make_task(to_setting(task)) == task
+    assert task.state == {"speed": (2.0,), "joints": (0.1, 0.2)} and make_task(convert_to_setting(task)) == task
     for text in ("[1]", "{", '{"a": NaN}', '{"a": "b"}', "1" * (1 << 21), "[" * 1000):
         file.write_text(text)
         with pytest.raises(AdvsearchError):

@@ -95,7 +95,7 @@ def test_nearer_and_farther_have_a_sign_and_a_mixture_has_neither() -> None:
 
 
 def test_where_nothing_is_seen_nothing_is_wrong_and_where_numbers_are_none_nothing_is_right() -> None:
-    unseen = DepthTruth(torch.zeros_like(MASK), TRUTH.z)
+    unseen = DepthTruth(torch.zeros_like(MASK), TRUTH.z_depth)
     (found,) = TASK.judge(said(GROUND), unseen)
     assert (found.right, found.prediction.label, found.payload) == (True, "out of view", None)
     for value in (math.nan, math.inf):
@@ -114,14 +114,14 @@ def test_what_is_beside_the_object_has_to_say_the_scale() -> None:
     for truth, count in ((alone, 0), (above, 60)):
         assert not truth.determines_scale
         task = TASK.after_calibration(said(INVERSE), truth)
-        assert f"expected 16 pixels at distances that differ by a factor of 1.1, got {count}" in task.ambiguities
-        assert not TASK.after_calibration(said(INVERSE, METRIC), truth).ambiguities
+        assert f"expected 16 pixels at distances that differ by a factor of 1.1, got {count}" in task.ambiguity_message
+        assert not TASK.after_calibration(said(INVERSE, METRIC), truth).ambiguity_message
     (found,) = TASK.judge([{DISPARITY: torch.where(MASK, 3.0, 1.0)}], above)
     payload: Any = found.payload
     assert found.right and payload["fitted"] == "in the whole picture"
     assert (
-        TASK.after_calibration(said(INVERSE), OPEN).ambiguities == ""
-        and TASK.after_calibration(said(INVERSE), None).ambiguities == ""
+        TASK.after_calibration(said(INVERSE), OPEN).ambiguity_message == ""
+        and TASK.after_calibration(said(INVERSE), None).ambiguity_message == ""
     )
 
 
@@ -129,7 +129,7 @@ def test_the_gradient_agrees_with_differences() -> None:
     """Of every objective, in float64, along a direction."""
     generator = torch.Generator().manual_seed(0)
     at, way = (torch.randn((HIGH, WIDE), generator=generator, dtype=torch.float64) for _ in range(2))
-    truth = DepthTruth(MASK, TRUTH.z.double())
+    truth = DepthTruth(MASK, TRUTH.z_depth.double())
     for kind in (DISPARITY, RELATIVE, METRIC):
         start = said(INVERSE.double(), kind)[0][kind] + 0.02 * at
         for seek in ("", "nearer", "farther", "gone"):
@@ -142,9 +142,9 @@ def test_the_gradient_agrees_with_differences() -> None:
 
 
 def test_it_is_compared_with_the_distance_along_the_axis() -> None:
-    sight = Sight(MASK, 2.0 * TRUTH.z, TRUTH.z)
+    sight = Sight(MASK, 2.0 * TRUTH.z_depth, TRUTH.z_depth)
     truth = TASK.truth(Facts("mug", compute_sight=lambda: sight))
-    assert torch.equal(truth.z, TRUTH.z) and TASK.truth_names(truth) == (AS_FAR,)
+    assert torch.equal(truth.z_depth, TRUTH.z_depth) and TASK.truth_names(truth) == (AS_FAR,)
     for kind in (DISPARITY, RELATIVE, METRIC):
         true, right = TASK.marks(said(moved(2.0), kind), truth)[0]
         assert (

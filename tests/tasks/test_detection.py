@@ -194,7 +194,7 @@ def test_missed_loose_wrong_and_phantom_are_told_apart(
 
 def test_a_box_on_another_thing_of_the_class_is_no_phantom() -> None:
     """Nor is one on it a loose box of the object: the object is missed."""
-    two = replace(TRUTH, others=((14, 14, 18, 18), (7, 5, 15, 13)))
+    two = replace(TRUTH, other_boxes=((14, 14, 18, 18), (7, 5, 15, 13)))
     assert get_outcome(judged(TASK, dense((AWAY, [0.9, 0.0, 0.0])), two).payload) is Outcome.MISSED
     assert get_outcome(judged(TASK, dense((LOOSE, [0.9, 0.0, 0.0])), two).payload) is Outcome.MISSED
     third = [0.0, 0.8, 0.2, 1.0]
@@ -306,14 +306,14 @@ class Pixels(nn.Module):
 
 
 def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
-    model = load_model(Pixels(), input_size=(8, 16), read=Detection().reader, labels=NAMES)
+    model = load_model(Pixels(), input_size=(8, 16), read=Detection().output_reader, labels=NAMES)
     task = Detection().on(model)
-    assert (task.labels, task.named, task.inferred_unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
+    assert (task.labels, task.has_class_names, task.inferred_unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
     assert model.differentiable
     output = model(torch.full((8, 16, 3), 0.9))
     at = DetectionTruth((0,), (4, 8, 12, 24), (32, 32))
     assert task.judge(output, at)[0].right, "2 to 6 of 16 are 4 to 12 of 32"
-    unnamed = Detection(unit="fractions").on(load_model(Pixels(), input_size=(8, 16), read=Detection().reader))
+    unnamed = Detection(unit="fractions").on(load_model(Pixels(), input_size=(8, 16), read=Detection().output_reader))
     assert unnamed.labels == ("class 0", "class 1", "class 2") and unnamed.unit == "fractions"
     facts = Facts("mug", "#2", compute_sight=lambda: Sight(torch.ones(4, 4).bool(), torch.ones(4, 4), torch.ones(4, 4)))
     assert unnamed.truth(facts) == DetectionTruth((2,), (0, 0, 4, 4), (4, 4))

@@ -48,7 +48,7 @@ class Shaped(nn.Module):
 def on(network: nn.Module, **options: Any) -> tuple[Detection, list[Detections]]:
     """The task after it has seen the picture, and the answer to it."""
     task = Detection(**options)
-    model = load_model(network, input_size=100, read=task.reader, labels=NAMES)
+    model = load_model(network, input_size=100, read=task.output_reader, labels=NAMES)
     output = model(PICTURE)
     return task.on(model).after_calibration(output, TRUTH), output
 
@@ -99,9 +99,9 @@ def test_scores_and_classes_are_told_apart_and_rows_that_fill_up_are_nothing(for
     task, output = on(Shaped(made, fill))
     (found,) = task.judge(output, TRUTH)
     assert found.right and astuple(found.prediction) == ("cup", 0, pytest.approx(0.8))
-    assert task.inferred_unit == "pixels" and not task.ambiguities and not task.doubts
+    assert task.inferred_unit == "pixels" and not task.ambiguity_message and not task.format_doubts
     assert [one.label for one in task.predictions(output, 5)[0]] == ["cup", "bowl"]
-    nothing = task.judge(load_model(Shaped(made, fill), input_size=100, read=task.reader)(PICTURE * 2.0), TRUTH)
+    nothing = task.judge(load_model(Shaped(made, fill), input_size=100, read=task.output_reader)(PICTURE * 2.0), TRUTH)
     assert nothing[0].prediction == Prediction("no cup", None, 0.0), "rows that fill up are no answer of NaN"
 
 
@@ -140,8 +140,8 @@ def test_the_unit_is_read_from_boxes_that_count_and_an_odd_form_is_named(
     form: Callable[[Tensor], Tensor], unit: str, doubts: str
 ) -> None:
     task, _ = on(Shaped(lambda b, s, c: (form(b), s, c.long())))
-    assert task.inferred_unit == unit and (doubts in task.doubts if doubts else not task.doubts)
-    assert [doubts in one and "may be read wrongly" in one for one in task.remarks] == [True] * bool(doubts)
+    assert task.inferred_unit == unit and (doubts in task.format_doubts if doubts else not task.format_doubts)
+    assert [doubts in one and "may be read wrongly" in one for one in task.output_remarks] == [True] * bool(doubts)
 
 
 def dense(*scores: list[float]) -> list[Detections]:
@@ -166,7 +166,7 @@ def test_background_is_no_prediction_wherever_it_stands(name: str, place: int) -
         hidden = DetectionTruth(truth.labels, None, (100, 100))
         assert not task.with_objective("create").judge(output, hidden)[0].success
     honest = Detection(labels=("cup", "none of the above"), unit="fractions", seek="mislabel")
-    assert honest.judge(dense([0.1, 0.9]), DetectionTruth((0,), truth.box, truth.size))[0].success
+    assert honest.judge(dense([0.1, 0.9]), DetectionTruth((0,), truth.box, truth.image_size))[0].success
 
 
 @pytest.mark.parametrize(

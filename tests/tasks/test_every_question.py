@@ -163,7 +163,7 @@ def test_a_box_elsewhere_is_sought_by_its_objective(
     """From the search to the drawn picture, with the clean scene right and no such box in it."""
     names = ["cup", "bowl", "dog"][: 2 if objective == "displace" else 3]
     model = advsearch.load_model(
-        network, labels=names, input_size=SIDE, read=Detection().reader, name="stand-in"
+        network, labels=names, input_size=SIDE, read=Detection().output_reader, name="stand-in"
     )  # fmt: skip
     result = advsearch.attack(
         "mug", model, task="detection", label="cup", objective=objective, controls=controls, steps=24, trials=6, spp=2,

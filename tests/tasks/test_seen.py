@@ -86,7 +86,7 @@ def test_a_payload_comes_back_from_the_rows_of_searches_and_trials(tmp_path: Pat
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the runs `swept` and `attacked`."""
     folder = tmp_path_factory.mktemp("home")
-    model, task = load_model(Middle(), input_size=16, read=Edge().reader), Edge()
+    model, task = load_model(Middle(), input_size=16, read=Edge().output_reader), Edge()
     fast: dict[str, Any] = {"spp": 1, "denoise": "none", "task": task}
     azimuths = {"camera.azimuth": [0.0, 120.0, 240.0], "camera.elevation": [5.0, 60.0]}
     advsearch.sweep("banana", model, azimuths, trials=6, run=str(folder / "runs/swept"), **fast)

@@ -66,7 +66,7 @@ def test_a_target_has_to_get_enough_of_the_pixels() -> None:
     chair = replace(TASK, target=(2,), accuracy=0.5)
     assert not chair.judge(HALF, TRUTH)[0].success and chair.judge(QUARTER, TRUTH)[0].success
     assert float(chair.pixel_margin(QUARTER, TRUTH)) == 0.0 and float(chair.pixel_margin(ALL, TRUTH)) == -2.0
-    assert chair.target_names == ("chair",) and chair.goal == "a target answer"
+    assert chair.target_names == ("chair",) and chair.success_description == "a target answer"
     easier = replace(TASK, minimise=True)
     assert easier.judge(ALL, TRUTH)[0].success and not easier.judge(QUARTER, TRUTH)[0].success
 
@@ -102,7 +102,7 @@ class Logits:
 
 
 def test_a_task_learns_names_from_its_model() -> None:
-    model = load_model(Mapped(), input_size=4, read=Segmentation().reader, labels=NAMES)
+    model = load_model(Mapped(), input_size=4, read=Segmentation().output_reader, labels=NAMES)
     task = Segmentation().on(model, target="chair")
     assert (task.labels, task.target) == (NAMES, (2,)) and model.differentiable
     facts = Facts(
@@ -116,7 +116,7 @@ def test_a_task_learns_names_from_its_model() -> None:
     with pytest.raises(InputError, match="target"):
         task.check(Facts("bottle", "chair"))
     with pytest.raises(ModelError, match=r"\(N, classes, height, width\)"):
-        load_model(nn.Sequential(nn.Flatten(), nn.Linear(48, 3)), input_size=4, read=Segmentation().reader)
+        load_model(nn.Sequential(nn.Flatten(), nn.Linear(48, 3)), input_size=4, read=Segmentation().output_reader)
 
 
 def test_pixels_that_are_not_numbers_are_no_output() -> None:

@@ -146,9 +146,9 @@ def test_logits_are_the_mean_cosine_of_the_nearest_of_each_name(folder: Path, mo
 def test_a_linear_head_is_the_minimum_of_its_loss_and_the_same_each_time(folder: Path, model: Model) -> None:
     task = Similarity(references=str(folder), method="linear").on(model)
     again = Similarity(references=str(folder), method="linear").on(model)
-    assert task.gallery and task.gallery.head and again.gallery and again.gallery.head
-    assert all(torch.equal(*both) for both in zip(task.gallery.head, again.gallery.head, strict=True))
-    weights, biases = (one.double().requires_grad_() for one in task.gallery.head)
+    assert task.gallery and task.gallery.linear_head and again.gallery and again.gallery.linear_head
+    assert all(torch.equal(*both) for both in zip(task.gallery.linear_head, again.gallery.linear_head, strict=True))
+    weights, biases = (one.double().requires_grad_() for one in task.gallery.linear_head)
     given, owners = task.gallery.features.double(), task.gallery.name_index
     shares = torch.stack([1.0 / (3 * (owners == one).sum()) for one in owners])
     each = nn.functional.cross_entropy(given @ weights.T + biases, owners, reduction="none")

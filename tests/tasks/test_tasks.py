@@ -34,7 +34,7 @@ def test_a_score_over_zero_is_a_success(task: Classification, scores: list[float
     assert [one.right for one in found] == [True, False, False, True, False]
     assert [one.margin for one in found[:4]] == [2.0, -2.0, -4.0, 0.0], "whatever is sought"
     assert math.copysign(1.0, found[3].margin) == 1.0, "no -0.0"
-    assert task.goal == goal
+    assert task.success_description == goal
 
 
 @pytest.mark.parametrize("logits", [[math.nan, 0.0, 1.0], [math.nan] * 3, [1.0, math.inf, 0.0], [math.inf, 0.0, 0.0]])
@@ -111,7 +111,7 @@ class Level(nn.Module):
 
 
 def at(numbers: Mapping[str, float]) -> Facts:
-    return Facts("mug", describe_values=lambda: numbers)
+    return Facts("mug", compute_numbers=lambda: numbers)
 
 
 def test_three_methods_make_a_task() -> None:
@@ -122,7 +122,7 @@ def test_three_methods_make_a_task() -> None:
     assert (near.score, near.right, near.prediction, near.payload) == (-8.0, True, Prediction("32 degrees"), 32.0)
     assert (far.score, far.success, far.right) == (15.0, True, False)
     assert not lost.success and not lost.right
-    easier = task.on(load_model(Level(), input_size=8, read=task.reader), minimise=True)
+    easier = task.on(load_model(Level(), input_size=8, read=task.output_reader), minimise=True)
     assert [one.success for one in easier.judge(output[:2], truth)] == [True, False]
     assert float(task.average([output[:1], output[1:2]])) == 43.5
 
@@ -141,7 +141,7 @@ def test_its_score_is_what_is_maximised_where_nothing_else_is_said() -> None:
 @pytest.mark.medium
 @pytest.mark.parametrize(("tolerance", "right"), [(1e3, 2), (1e-3, 0)])
 def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: int) -> None:
-    network, task = load_model(Level(), input_size=8, read=Yaw().reader), Yaw(tolerance=tolerance)
+    network, task = load_model(Level(), input_size=8, read=Yaw().output_reader), Yaw(tolerance=tolerance)
     fast: dict[str, Any] = {"spp": 1, "denoise": "none", "resolution": 16}
     swept = advsearch.sweep("mug", network, {"pose.yaw": [0.0, 90.0]}, task=task, trials=0, **fast).summary
     assert swept.worst is not None

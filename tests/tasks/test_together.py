@@ -105,7 +105,7 @@ def test_each_is_judged_by_its_own_rule() -> None:
     truth = task.truth(facts)
     output = model(torch.rand((SIDE, SIDE, 3), generator=torch.Generator().manual_seed(0)))
     task = task.after_calibration(output, truth)
-    assert task.calibrates and not task.ambiguities and len(task.remarks) == 1
+    assert task.calibrates and not task.ambiguity_message and len(task.output_remarks) == 1
     own = list(zip(task.tasks, output[0], truth, strict=True))
     margins = [-float(one.loss(said, true)) for one, said, true in own]
     scores = [float(one.score(said, true)) for one, said, true in own]

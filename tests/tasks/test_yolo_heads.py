@@ -119,10 +119,10 @@ FORMS: dict[str, tuple[Callable[[Tensor], Any], float | None, str]] = {
 def on(network: nn.Module, labels: Any = NAMES, **options: Any) -> tuple[Detection, Any]:
     """The task after it has seen the picture, and the answer to it."""
     task = Detection(**options)
-    model = load_model(network, input_size=100, read=task.reader, labels=labels)
+    model = load_model(network, input_size=100, read=task.output_reader, labels=labels)
     output = model(PICTURE)
     names = tuple(labels)
-    return task.on(model).after_calibration(output, DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.size)), output
+    return task.on(model).after_calibration(output, DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.image_size)), output
 
 
 @pytest.mark.filterwarnings("ignore:no gradient")
@@ -132,7 +132,7 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     made, objectness, order = FORMS[form]
     names = read_labels("coco") if classes == 80 else tuple(f"thing {k}" for k in range(classes))
     task, output = on(Head(made, classes, objectness), names)
-    truth = DetectionTruth((cup(classes),), TRUTH.box, TRUTH.size)
+    truth = DetectionTruth((cup(classes),), TRUTH.box, TRUTH.image_size)
     (found,) = task.judge(output, truth)
     score = 0.8 * (objectness or 1.0)
     assert found.right and astuple(found.prediction) == (
@@ -143,7 +143,7 @@ def test_each_form_is_read_right(form: str, classes: int) -> None:
     best: Any = found.payload
     assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
     assert task.inferred_order == order and task.inferred_unit == ("fractions" if "RT-DETR" in form else "pixels")
-    assert not task.ambiguities and not task.doubts
+    assert not task.ambiguity_message and not task.format_doubts
 
 
 def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
@@ -176,15 +176,15 @@ def test_what_fits_twice_is_asked_for() -> None:
     with pytest.raises(InputError, match=f"{V8}.*or .*{V8_LAST}"):
         on(Head(square, len(names)), names)
     task, output = on(Head(square, len(names)), names, order=V8)
-    truth = DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.size)
-    assert task.judge(output, truth)[0].prediction.probability == pytest.approx(0.8, abs=1e-4) and not task.remarks
+    truth = DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.image_size)
+    assert task.judge(output, truth)[0].prediction.probability == pytest.approx(0.8, abs=1e-4) and not task.output_remarks
 
 
 @pytest.mark.parametrize("order", ["boxes objectness scores", "boxes, objectness, scores, channels, first"])
 def test_an_order_says_what_a_head_is(order: str) -> None:
     task, output = on(Head(first, objectness=0.9), order=order)
     assert astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.72, abs=1e-4))
-    assert not task.remarks
+    assert not task.output_remarks
     with pytest.raises(InputError, match="order"):
         Detection(order="boxes objectness")
 
@@ -197,9 +197,9 @@ def test_a_head_of_unknown_order_has_no_masks_that_are_known() -> None:
 def test_names_and_size_come_from_the_network(names: Any) -> None:
     network: Any = Head(first)
     network.names, network.args = names, {"imgsz": 96}
-    model = load_model(network, read=Detection().reader)
+    model = load_model(network, read=Detection().output_reader)
     assert model.labels == NAMES and model.input_size == (96, 96)
-    assert load_model(network, read=Detection().reader, labels=["x", "y", "z"], input_size=64).labels == ("x", "y", "z")
+    assert load_model(network, read=Detection().output_reader, labels=["x", "y", "z"], input_size=64).labels == ("x", "y", "z")
 
 
 @pytest.mark.parametrize("iou", [0.3, 0.7])
@@ -252,10 +252,10 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
     make.set_model_props(model, {"names": str(dict(enumerate(NAMES))), "imgsz": "[100, 100]", "stride": "32"})
     onnx.save(model, str(tmp_path / "head.onnx"))
     with pytest.warns(ModelWarning, match="no gradient"):
-        loaded = load_model(tmp_path / "head.onnx", read=Detection().reader)
+        loaded = load_model(tmp_path / "head.onnx", read=Detection().output_reader)
     assert loaded.labels == NAMES and loaded.input_size == (100, 100)
     output = loaded(PICTURE)
     task = Detection().on(loaded).after_calibration(output, TRUTH)
     assert (
-        astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.doubts
+        astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.format_doubts
     )

@@ -125,7 +125,7 @@ class ArchiveState:
         )
         is_resampled = torch.rand(count, dim, generator=rng) < RESAMPLED_FRACTION
         for block, part in self.domain.list_block_slices():
-            if block.options:
+            if block.n_options:
                 offspring[:, part] = torch.where(
                     is_resampled[:, part], samples[:, part], first[:, part]
                 )
@@ -279,12 +279,12 @@ def _make_archive(
     """
     from ribs import archives  # an optional package, which takes seconds to import
 
-    lower = domain.lower[measure_indices].tolist()
-    upper = domain.upper[measure_indices].tolist()
+    lower = domain.lower_bounds[measure_indices].tolist()
+    upper = domain.upper_bounds[measure_indices].tolist()
     return archives.GridArchive(
         solution_dim=domain.dim,
         dims=dims,
-        seed=seeds.stream(seed, "archive"),
+        seed=seeds.derive_seed(seed, "archive"),
         ranges=list(zip(lower, upper, strict=True)),
         solution_dtype=np.float32,
         objective_dtype=np.float64,
@@ -392,7 +392,7 @@ class MapElites(Policy[ArchiveState]):
         # cells.
         cells_of_axes = [
             n_options or self.cells
-            for n_options in domain.options[measure_indices].tolist()
+            for n_options in domain.option_counts[measure_indices].tolist()
         ]
         n_cells = math.prod(cells_of_axes)
         if n_cells > MAX_CELLS:
@@ -463,7 +463,7 @@ class MapElites(Policy[ArchiveState]):
             positions,
             objectives,
             is_periodic=policies.find_periodic(state.domain)[state.measure_indices],
-            is_discrete=state.domain.options[state.measure_indices] > 0,
+            is_discrete=state.domain.option_counts[state.measure_indices] > 0,
         )
         examples = []
         for index in diverse:
@@ -474,7 +474,7 @@ class MapElites(Policy[ArchiveState]):
             examples.append(policies.FoundFailure(u, objectives[index], ranges))
         return policies.Failures(
             tuple(examples),
-            over=measure_indices,
+            cell_parameter_indices=measure_indices,
             n_failures=len(failed_rows),
             n_visited=len(elites["objective"]),
             n_cells=int(archive.cells),
@@ -527,7 +527,7 @@ class MapElites(Policy[ArchiveState]):
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:
             return torch.arange(min(2, domain.dim))
-        index_of_name = {name: index for index, name in enumerate(domain.names)}
+        index_of_name = {name: index for index, name in enumerate(domain.element_names)}
         for name in names:
             if name not in index_of_name:
                 raise errors.UnknownNameError(

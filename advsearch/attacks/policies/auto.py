@@ -17,7 +17,7 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import (
     NO_COUNTS,
-    Counts,
+    CorrectionCounts,
     Evaluated,
     Policy,
     Proposal,
@@ -149,7 +149,7 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
 
 def _count_numbers(box: BoxCoordinates) -> int:
     """Return the number of box coordinates that have a derivative: no choices."""
-    return int((box.options == 0).sum())
+    return int((box.option_counts == 0).sum())
 
 
 def _plan_box_ascent(box: BoxCoordinates, steps: int) -> BudgetPlan:
@@ -176,7 +176,7 @@ def _make_pgd(domain: Domain) -> PGD:
     """Return the policy of the ascent, with the momentum that suits the noise."""
     if domain.draws_conditions:
         return PGD(momentum=RANDOM_CONDITIONS_MOMENTUM)
-    return PGD(momentum=EXACT_MOMENTUM) if domain.exact else PGD()
+    return PGD(momentum=EXACT_MOMENTUM) if domain.is_noise_free else PGD()
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +304,7 @@ class Auto(Policy[AutoState]):
             steps, ascent = _make_pgd(state.domain).propose(state.ascent, n)
             if steps:
                 (proposal,) = steps
-                return self._propose_ascent_step(state, proposal, ascent.count)
+                return self._propose_ascent_step(state, proposal, ascent.n_evaluations)
             has_norm_balls = state.box.count < state.domain.dim
             if has_norm_balls:
                 return (), state
@@ -388,7 +388,7 @@ class Auto(Policy[AutoState]):
             u = state.domain.project(
                 state.box.to_configuration(ascent.u, state.box_before_trial)
             )
-            ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
+            ascent = replace(ascent, u=u, counts=ascent.counts + CorrectionCounts(rejected=1))
         return replace(state, ascent=ascent, latest_objective=evaluation.objective)
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
@@ -398,7 +398,7 @@ class Auto(Policy[AutoState]):
         has_full_gradient = plan.gradient is True
         return domain.gradient_cost > 0 and has_ascent and has_full_gradient
 
-    def counts(self, state: AutoState) -> Counts:
+    def counts(self, state: AutoState) -> CorrectionCounts:
         return NO_COUNTS if state.ascent is None else state.ascent.counts
 
     def _choose_next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
@@ -442,7 +442,7 @@ class Auto(Policy[AutoState]):
         for block in state.domain.blocks:
             # the reach of a box is its unit step; a norm ball has none
             reach = ASCENT_REACH * block.radius if block.norm == "box" else None
-            ascent_blocks.append(replace(block, reach=reach))
+            ascent_blocks.append(replace(block, unit_step_length=reach))
         domain = replace(state.domain, blocks=tuple(ascent_blocks))
         renders_left = max(1, state.plan.steps - state.renders_spent)
         ascent = _make_pgd(domain).start(domain, seeded(state.seed, 0), renders_left)

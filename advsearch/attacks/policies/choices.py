@@ -23,7 +23,7 @@ from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, option_center
 from advsearch.attacks.evaluation import (
     NO_COUNTS,
-    Counts,
+    CorrectionCounts,
     Evaluated,
     Policy,
     Proposal,
@@ -73,7 +73,7 @@ class Race:
         active_runners: indices of the searches that take part in this round, the best
             first.
         round: index of the current round.
-        spent: number of renders of the evaluations so far.
+        renders_spent: number of renders of the evaluations so far.
         runner_of_proposal: for each of the latest proposals, the index of its search.
     """
 
@@ -82,7 +82,7 @@ class Race:
     n_rounds: int
     active_runners: tuple[int, ...] = ()
     round: int = 0
-    spent: int = 0
+    renders_spent: int = 0
     runner_of_proposal: tuple[int, ...] = ()
 
     @property
@@ -103,7 +103,7 @@ class Race:
         """
         active_runners = tuple(field)
         rounds_left = self.n_rounds - number
-        renders_of_round = (self.steps - self.spent) // rounds_left
+        renders_of_round = (self.steps - self.renders_spent) // rounds_left
         renders_each = max(1, renders_of_round // len(active_runners))
         runners = [
             replace(runner, renders_left=renders_each if index in active_runners else 0)
@@ -346,9 +346,9 @@ class RacingPolicy(Policy[Racing]):
                 state=runner_state,
                 best_objective=max(runner.best_objective, best),
             )
-        spent = state.spent + sum(evaluation.cost for _, evaluation in evaluated)
+        spent = state.renders_spent + sum(evaluation.cost for _, evaluation in evaluated)
         return replace(
-            state, runners=tuple(runners), spent=spent, runner_of_proposal=()
+            state, runners=tuple(runners), renders_spent=spent, runner_of_proposal=()
         )
 
     def distribution(self, state: Racing) -> Distribution | None:
@@ -368,7 +368,7 @@ class RacingPolicy(Policy[Racing]):
             default=None,
         )
 
-    def counts(self, state: Racing) -> Counts:
+    def counts(self, state: Racing) -> CorrectionCounts:
         return sum(
             (runner.policy.counts(runner.state) for runner in state.runners), NO_COUNTS
         )
@@ -454,7 +454,7 @@ class Choices(RacingPolicy[ChoicesState]):
             steps: renders of the search.
         """
         seed = draw_seed(generator)
-        is_choice = domain.options > 0  # a number has 0 options
+        is_choice = domain.option_counts > 0  # a number has 0 options
         numbers = (~is_choice).nonzero().flatten()
         choices = is_choice.nonzero().flatten()
         policy: Policy[Any]
@@ -465,9 +465,9 @@ class Choices(RacingPolicy[ChoicesState]):
             policy = Random()
             inner_domain = Domain(torch.zeros(1), (Block(1),))
         combinations = _select_combinations(
-            domain.options[choices].tolist(),
+            domain.option_counts[choices].tolist(),
             domain.initial_point[choices],
-            max_combinations=_count_runners(domain, policy, steps),
+            max_combinations=_count_affordable_combinations(domain, policy, steps),
             generator=seeded(seed, 0),
         )
         race = start_race([(policy, inner_domain)] * len(combinations), steps, seed)
@@ -534,7 +534,7 @@ def wrap_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
     If the domain has choices and the policy only searches numbers, it is wrapped in
     `Choices`. Otherwise the policy itself is returned.
     """
-    has_choices = any(block.options for block in domain.blocks)
+    has_choices = any(block.n_options for block in domain.blocks)
     if has_choices and not policy.handles_choices:
         return Choices(policy)
     return policy
@@ -548,14 +548,14 @@ def _drop_choices(domain: Domain, numbers: Tensor) -> Domain:
     return replace(
         domain,
         start=domain.start[numbers],
-        blocks=tuple(block for block in domain.blocks if not block.options),
+        blocks=tuple(block for block in domain.blocks if not block.n_options),
         restart_point=restart_point,
     )
 
 
-def _count_runners(domain: Domain, policy: Policy[Any], steps: int) -> int:
+def _count_affordable_combinations(domain: Domain, policy: Policy[Any], steps: int) -> int:
     """Return how many combinations of options can be searched in `steps` renders."""
-    n_combinations = math.prod(domain.options[domain.options > 0].tolist())
+    n_combinations = math.prod(domain.option_counts[domain.option_counts > 0].tolist())
     # two may take part, however large a configuration is
     max_in_memory = max(2, MAX_NUMBERS // domain.dim)
     limit = min(MAX_COMBINATIONS, n_combinations, max_in_memory)

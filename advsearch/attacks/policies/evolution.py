@@ -35,7 +35,7 @@ from advsearch.attacks.evaluation import (
     seeded,
 )
 from advsearch.errors import InputError
-from advsearch.seeds import stream
+from advsearch.seeds import derive_seed
 
 MAX_FULL_DIM = 80
 """Largest dimension with a full covariance matrix. Above it only the diagonal is
@@ -272,7 +272,7 @@ def _isolate_numpy_random(seed: int, generation: int) -> Iterator[None]:
         generation: index of the generation; each has its own random numbers.
     """
     state_before = np.random.get_state()  # noqa: NPY002
-    np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
+    np.random.seed(derive_seed(seed, "pycma", generation))  # noqa: NPY002
     try:
         with warnings.catch_warnings(), limit_to_single_thread():
             warnings.simplefilter("ignore")

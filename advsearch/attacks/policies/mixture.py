@@ -325,8 +325,8 @@ class MixtureState:
 
     def to_configuration(self, x: Tensor) -> Tensor:
         """Return the configuration (d,) of x, which is in fractions of each range."""
-        width = self.domain.upper - self.domain.lower
-        return self.domain.project((self.domain.lower + x * width).float())
+        width = self.domain.upper_bounds - self.domain.lower_bounds
+        return self.domain.project((self.domain.lower_bounds + x * width).float())
 
     def find_distinctive_ranges(
         self, mixture: Components, k: int
@@ -345,8 +345,8 @@ class MixtureState:
         Returns:
             Bounds in the units of u, by index in u.
         """
-        lower = self.domain.lower.double()
-        width = (self.domain.upper - self.domain.lower).double()
+        lower = self.domain.lower_bounds.double()
+        width = (self.domain.upper_bounds - self.domain.lower_bounds).double()
         ranges: dict[int, tuple[float, float]] = {}
         for index, n_options in enumerate(self.ranges.n_options.tolist()):
             if n_options:
@@ -463,7 +463,7 @@ class Mixture(Policy[MixtureState]):
                 f"policy 'mixture': expected at most {MAX_DIM} numbers, got "
                 f"{domain.dim}; use pgd or auto"
             )
-        ranges = Ranges(domain.options, policies.find_periodic(domain))
+        ranges = Ranges(domain.option_counts, policies.find_periodic(domain))
         no_points = torch.empty(0, domain.dim, dtype=torch.float64)
         state = MixtureState(
             domain,
@@ -543,7 +543,7 @@ class Mixture(Policy[MixtureState]):
                 )
         return policies.Failures(
             self._list_examples(state),
-            over=(),
+            cell_parameter_indices=(),
             n_failures=int((has_failed & ~is_unknown).sum()),
             n_visited=len(state.log),
             n_cells=None,

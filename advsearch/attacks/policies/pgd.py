@@ -17,7 +17,7 @@ from torch import Tensor
 from advsearch.attacks.domain import Block, Domain, compute_half_widths
 from advsearch.attacks.evaluation import (
     NO_COUNTS,
-    Counts,
+    CorrectionCounts,
     Evaluated,
     Policy,
     Proposal,
@@ -40,7 +40,7 @@ MIN_CLIPPED_SIZE = 8
 
 def clip_gradient(
     domain: Domain, gradient: Tensor, lengths: tuple[float, ...]
-) -> tuple[Tensor, tuple[float, ...], Counts]:
+) -> tuple[Tensor, tuple[float, ...], CorrectionCounts]:
     """Clip the outliers of a gradient, which stem from the noise of a render.
 
     - In a norm ball of at least `MIN_CLIPPED_SIZE` elements, each element is clipped to
@@ -62,7 +62,7 @@ def clip_gradient(
         and the counts of outliers.
     """
     # Without noise, large elements are real.
-    if domain.exact or domain.draws_conditions:
+    if domain.is_noise_free or domain.draws_conditions:
         return gradient, lengths, NO_COUNTS
     clipped_gradient = gradient.clone()
     has_outliers = False
@@ -80,7 +80,7 @@ def clip_gradient(
     is_too_long = length > max_length and max_length > 0.0
     if is_too_long:
         clipped_gradient = clipped_gradient * (max_length / length)
-    counts = Counts(cut=int(has_outliers), shortened=int(is_too_long))
+    counts = CorrectionCounts(cut=int(has_outliers), shortened=int(is_too_long))
     return clipped_gradient, lengths, counts
 
 
@@ -231,7 +231,7 @@ class Ascent:
         step_size: step size before it is decayed, in units of each block's radius.
         mean_square: (d,) for Adam, the mean of squared gradients.
         peak: the best evaluation; None as long as none is finite.
-        count: number of evaluations so far.
+        n_evaluations: number of evaluations so far.
         n_updates: number of gradients that were accumulated.
         n_flat: number of gradients of zero in a row.
         lengths: lengths of the latest gradients, see `clip_gradient`.
@@ -250,11 +250,11 @@ class Ascent:
     step_size: float
     mean_square: Tensor = NO_SQUARES
     peak: Peak | None = None
-    count: int = 0
+    n_evaluations: int = 0
     n_updates: int = 0
     n_flat: int = 0
     lengths: tuple[float, ...] = ()
-    counts: Counts = NO_COUNTS
+    counts: CorrectionCounts = NO_COUNTS
     window: StepWindow = field(default_factory=lambda: StepWindow(MIN_WINDOW))
     start_objective: float = math.nan
     n_idle_windows: int = 0
@@ -283,7 +283,7 @@ class AscentPolicy(Policy[Ascent]):
         if has_no_gradient or has_no_gain:
             return (), state
         # The search logs the step size; it does not move u.
-        proposal = Proposal(state.u, gradient=True, step_size=self.pace(state))
+        proposal = Proposal(state.u, gradient=True, step_size=self.compute_step_size(state))
         return (proposal,), state
 
     def update(self, state: Ascent, evaluated: Evaluated) -> Ascent:
@@ -298,9 +298,9 @@ class AscentPolicy(Policy[Ascent]):
             evaluated: one configuration and its evaluation.
         """
         ((u, evaluation),) = evaluated
-        state = replace(state, count=state.count + 1)
+        state = replace(state, n_evaluations=state.n_evaluations + 1)
         if not evaluation.is_finite:
-            counts = state.counts + Counts(rejected=1)
+            counts = state.counts + CorrectionCounts(rejected=1)
             return self.retreat(
                 replace(state, step_size=state.step_size / 2, counts=counts)
             )
@@ -309,7 +309,7 @@ class AscentPolicy(Policy[Ascent]):
         if state.peak is None or evaluation.objective > state.peak.objective:
             # the direction includes the gradient at u already
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
-        return self.step(state, u, evaluation.objective)
+        return self.take_step(state, u, evaluation.objective)
 
     def _accumulate(self, state: Ascent, gradient: Tensor) -> Ascent:
         """Return the state after accumulating a gradient (d,), without its outliers.
@@ -324,16 +324,16 @@ class AscentPolicy(Policy[Ascent]):
         if not bool(clipped_gradient.any()):
             return replace(state, n_flat=state.n_flat + 1)
         return replace(
-            self.learn(state, clipped_gradient),
+            self.accumulate_gradient(state, clipped_gradient),
             n_updates=state.n_updates + 1,
             n_flat=0,
         )
 
-    def counts(self, state: Ascent) -> Counts:
+    def counts(self, state: Ascent) -> CorrectionCounts:
         return state.counts
 
     @abstractmethod
-    def pace(self, state: Ascent) -> float:
+    def compute_step_size(self, state: Ascent) -> float:
         """Return the step size of the next evaluation."""
 
     @abstractmethod
@@ -344,11 +344,11 @@ class AscentPolicy(Policy[Ascent]):
         """
 
     @abstractmethod
-    def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
+    def accumulate_gradient(self, state: Ascent, gradient: Tensor) -> Ascent:
         """Return the state after accumulating a gradient (d,), which is not all zero."""
 
     @abstractmethod
-    def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
+    def take_step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         """Return the state with the next configuration to propose.
 
         Args:
@@ -447,7 +447,7 @@ class PGD(AscentPolicy):
             u = domain.sample(seeded(seed, 0))[0]
         # every step needs a gradient, which costs renders too
         steps = max(1, steps // (1 + domain.gradient_cost))
-        if domain.exact:  # without noise all windows are short
+        if domain.is_noise_free:  # without noise all windows are short
             window_length = max(MIN_WINDOW_EXACT, round(MIN_WINDOW_FRACTION * steps))
         else:
             window_length = max(MIN_WINDOW, round(FIRST_WINDOW * steps))
@@ -461,9 +461,9 @@ class PGD(AscentPolicy):
             window=StepWindow(window_length),
         )
 
-    def pace(self, state: Ascent) -> float:
-        if state.domain.exact or state.domain.draws_conditions:
-            return state.decay_step_size(state.count)
+    def compute_step_size(self, state: Ascent) -> float:
+        if state.domain.is_noise_free or state.domain.draws_conditions:
+            return state.decay_step_size(state.n_evaluations)
         return state.step_size
 
     def retreat(self, state: Ascent) -> Ascent:
@@ -479,7 +479,7 @@ class PGD(AscentPolicy):
         without_direction = replace(state, direction=torch.zeros_like(state.u))
         return self._move_uphill(without_direction, state.domain.initial_point)
 
-    def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
+    def accumulate_gradient(self, state: Ascent, gradient: Tensor) -> Ascent:
         """Add a gradient, scaled to mean magnitude 1, to the decayed earlier ones."""
         # m <- momentum * m + g / mean|g|; divided by the largest element first, so that
         # the sum of huge or tiny elements stays within float32
@@ -489,7 +489,7 @@ class PGD(AscentPolicy):
         )
         return replace(state, direction=direction)
 
-    def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
+    def take_step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         """Take a step from u (d,), whose objective was evaluated.
 
         Steps are grouped in windows, and after each window the step size may be halved.
@@ -505,7 +505,7 @@ class PGD(AscentPolicy):
         is_complete = len(window.values) >= window.length
         if not is_complete:
             return self._move_uphill(replace(state, window=window), u)
-        if state.domain.exact:
+        if state.domain.is_noise_free:
             return self._move_uphill(self._end_exact_window(state, window), u)
         return self._end_noisy_window(state, window, u)
 
@@ -560,7 +560,7 @@ class PGD(AscentPolicy):
             state = replace(
                 state,
                 direction=peak.direction,
-                counts=state.counts + Counts(rejected=1),
+                counts=state.counts + CorrectionCounts(rejected=1),
             )
         next_window = window.next(state.steps, best, halved=is_stalled)
         return self._move_uphill(replace(state, window=next_window), u)
@@ -569,8 +569,8 @@ class PGD(AscentPolicy):
         """Move from u along the accumulated gradient, or at random if that is zero."""
         uphill = state.direction
         if not bool(uphill.any()):
-            uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
-        moved_u = torch.add(u, state.domain.steepest(u, uphill), alpha=self.pace(state))
+            uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.n_evaluations))
+        moved_u = torch.add(u, state.domain.compute_steepest_step(u, uphill), alpha=self.compute_step_size(state))
         return replace(state, u=state.domain.project(moved_u))
 
 
@@ -630,8 +630,8 @@ class Adam(AscentPolicy):
             step_size=self.step_size,
         )
 
-    def pace(self, state: Ascent) -> float:
-        return state.decay_step_size(state.count)
+    def compute_step_size(self, state: Ascent) -> float:
+        return state.decay_step_size(state.n_evaluations)
 
     def retreat(self, state: Ascent) -> Ascent:
         """Go back to the best configuration, or to the initial point if there is none.
@@ -647,7 +647,7 @@ class Adam(AscentPolicy):
             n_updates=0,
         )
 
-    def learn(self, state: Ascent, gradient: Tensor) -> Ascent:
+    def accumulate_gradient(self, state: Ascent, gradient: Tensor) -> Ascent:
         """Add a gradient to the decayed means of gradients and of their squares.
 
         In an l2 block the square of each element is the mean over the block: there the
@@ -665,7 +665,7 @@ class Adam(AscentPolicy):
             mean_square=torch.lerp(squares, state.mean_square, self.beta2),
         )
 
-    def step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
+    def take_step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         """Take a step along the mean gradient divided by its root mean square.
 
         Args:
@@ -680,10 +680,10 @@ class Adam(AscentPolicy):
             mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
             direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
         else:  # random signs
-            noise = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
+            noise = torch.randn(u.numel(), generator=seeded(state.seed, state.n_evaluations))
             direction = noise.sign_()
         # the index of the latest evaluation, which `count` includes already
-        rate = state.decay_step_size(state.count - 1)
+        rate = state.decay_step_size(state.n_evaluations - 1)
         half_widths = compute_half_widths(state.domain)
         u = torch.addcmul(u, half_widths, direction, value=rate)
         return replace(state, u=state.domain.project(u))

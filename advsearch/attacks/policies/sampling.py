@@ -178,11 +178,11 @@ def to_domain(domain: Domain, x: Tensor) -> Tensor:
         x: (d + number of l2 blocks,) in [0, 1]. The first d elements belong to those of
             u; the others decide the distance from the center in each l2 ball.
     """
-    u = torch.lerp(domain.lower, domain.upper, x[: domain.dim])
+    u = torch.lerp(domain.lower_bounds, domain.upper_bounds, x[: domain.dim])
     distance_numbers = iter(x[domain.dim :].tolist())  # one for each l2 ball, in order
     for block, part in domain.list_block_slices():
-        if block.options:
-            u[part] = option_center(x[part], block.options)
+        if block.n_options:
+            u[part] = option_center(x[part], block.n_options)
         elif block.norm == "l2" and block.epsilon is not None:
             # Normal quantiles of uniform numbers are a normal vector, whose direction
             # is uniform. They are infinite at 0 and 1, hence the clamp.
@@ -255,8 +255,8 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
         domain: domain of the search.
         counts: number of values of each element.
     """
-    lower = domain.lower.clone()
-    upper = domain.upper.clone()
+    lower = domain.lower_bounds.clone()
+    upper = domain.upper_bounds.clone()
     for block, part in domain.list_block_slices():
         if block.norm == "l2" and block.epsilon is not None:
             lower[part] = lower[part].maximum(domain.start[part] - block.epsilon)
@@ -265,7 +265,7 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
     for block, count, low, high in zip(
         _list_blocks(domain), counts, lower.tolist(), upper.tolist(), strict=True
     ):
-        is_choice = block.options > 0
+        is_choice = block.n_options > 0
         if is_choice:  # the center of each option's part of [0, 1]
             axes.append((torch.arange(count) + 0.5) / count)
         elif block.periodic:  # the upper bound is the lower one, and comes once
@@ -315,7 +315,7 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
     Raises:
         InputError: the grid does not fit into the renders.
     """
-    options = domain.options.tolist()  # 0 for a number
+    options = domain.option_counts.tolist()  # 0 for a number
     n_numbers = options.count(0)
     n_combinations = math.prod(count for count in options if count)
     min_values = points or 2
@@ -371,7 +371,7 @@ def _compute_levels(block: Block, count: int) -> Tensor:
     bounds, 1 at the center. All options of a choice have level 0.
     """
     level = torch.zeros(count, dtype=torch.long)
-    if block.options:
+    if block.n_options:
         return level
     # The upper bound of an angle has the index `count`. It equals the lower bound, and
     # is no value of the axis.

@@ -36,14 +36,14 @@ class BoxCoordinates:
         low: (k,) their lower bounds.
         width: (k,) of their ranges.
         periodic: (k,) whether 0 and 1 mean the same value, as for an angle.
-        options: (k,) number of options of a discrete choice; 0 for a number.
+        option_counts: (k,) number of options of a discrete choice; 0 for a number.
     """
 
     indices: Tensor
     low: Tensor
     width: Tensor
     periodic: Tensor
-    options: Tensor
+    option_counts: Tensor
 
     @property
     def count(self) -> int:
@@ -69,7 +69,7 @@ class BoxCoordinates:
         """
         x = torch.where(self.periodic, torch.remainder(x, 1.0), x).clamp_(0.0, 1.0)
         return torch.where(
-            self.options > 0, option_center(x, self.options.clamp(min=1)), x
+            self.option_counts > 0, option_center(x, self.option_counts.clamp(min=1)), x
         )
 
     def sample_screen(self, seed: int, n: int) -> Tensor:
@@ -104,7 +104,7 @@ class BoxCoordinates:
         always_moved = torch.randint(k, (n,), generator=generator)
         is_moved[torch.arange(n), always_moved] = True
         noise = torch.randn(n, k, generator=generator)
-        is_choice = self.options > 0
+        is_choice = self.option_counts > 0
         x = torch.where(is_choice, x, x + is_moved * size * noise)
         may_resample = torch.rand(n, k, generator=generator) < RESAMPLED_FRACTION
         is_resampled = is_moved & is_choice & may_resample
@@ -126,7 +126,7 @@ class BoxCoordinates:
             (n, f) float64.
         """
         x = x.double()
-        is_plain = ~self.periodic & (self.options == 0)
+        is_plain = ~self.periodic & (self.option_counts == 0)
         angle = 2.0 * math.pi * x[:, self.periodic]
         # the circle has the radius 1 / pi, divided by the length scale
         scaled_length = math.pi * lengths[self.periodic]
@@ -135,8 +135,8 @@ class BoxCoordinates:
             angle.cos() / scaled_length,
             angle.sin() / scaled_length,
         ]
-        for coordinate in torch.nonzero(self.options).flatten().tolist():
-            n_options = int(self.options[coordinate])
+        for coordinate in torch.nonzero(self.option_counts).flatten().tolist():
+            n_options = int(self.option_counts[coordinate])
             option = (x[:, coordinate] * n_options).long().clamp_(max=n_options - 1)
             corner = torch.nn.functional.one_hot(option, n_options).double()
             # two corners of a one-hot code are sqrt(2) apart
@@ -157,10 +157,10 @@ def find_box_coordinates(domain: Domain) -> BoxCoordinates:
     indices = torch.cat([torch.empty(0, dtype=torch.long), *index_blocks])
     return BoxCoordinates(
         indices,
-        low=domain.lower[indices],
-        width=domain.upper[indices] - domain.lower[indices],
+        low=domain.lower_bounds[indices],
+        width=domain.upper_bounds[indices] - domain.lower_bounds[indices],
         periodic=find_periodic(domain)[indices],
-        options=domain.options[indices],
+        option_counts=domain.option_counts[indices],
     )
 
 
@@ -303,7 +303,7 @@ class Observations:
             )
             n_fitted = n_points
         used = _select_best_and_latest(values, self.memory)
-        surrogate = fit(self.box, self.points[used], values[used], scales)
+        surrogate = fit_gaussian_process(self.box, self.points[used], values[used], scales)
         return surrogate, replace(self, scales=scales, n_fitted=n_fitted)
 
 
@@ -328,7 +328,7 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
     return (1.0 + r + r.square() / 3.0) * torch.exp(-r)
 
 
-def fit(
+def fit_gaussian_process(
     box: BoxCoordinates, x: Tensor, y: Tensor, scales: Scales | None = None
 ) -> Surrogate:
     """Fit a Gaussian process to values at points of the unit box.
@@ -378,7 +378,7 @@ def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
     length_unit = math.sqrt(k)
 
     def find_most_likely(candidates: list[Scales]) -> Surrogate:
-        fits = [fit(box, x, y, scales) for scales in candidates]
+        fits = [fit_gaussian_process(box, x, y, scales) for scales in candidates]
         return max(fits, key=lambda surrogate: surrogate.likelihood)
 
     # one length scale for all coordinates, in units of `length_unit`

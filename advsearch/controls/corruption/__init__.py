@@ -170,7 +170,7 @@ class CorruptionControl(Control):
         super().__init__(name, **settings)
         # A range of one parameter does not fix the other: a name without a severity has
         # no effect, and a severity needs a name.
-        self.has_requested_search = False
+        self.has_requested_range = False
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; the severity of stepped corruptions has no derivative."""
@@ -185,7 +185,7 @@ class CorruptionControl(Control):
             image,
             CORRUPTION_NAMES[int(values["which"])],
             values["severity"],
-            int(self.chosen["seed"]),
+            int(self.choice_values["seed"]),
         )
 
     def compute_measurements(

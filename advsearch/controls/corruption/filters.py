@@ -44,7 +44,7 @@ def compute_reference_size(height: int, width: int) -> tuple[int, int]:
 
 def make_generator(seed: int, name: str) -> torch.Generator:
     """Return a random generator, which is different for each seed and corruption."""
-    return torch.Generator().manual_seed(seeds.stream(seed, f"corruption {name}"))
+    return torch.Generator().manual_seed(seeds.derive_seed(seed, f"corruption {name}"))
 
 
 def interpolate_table(

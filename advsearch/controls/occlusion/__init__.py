@@ -113,7 +113,7 @@ class Placement:
         angle: angle from that center to the occluder, radians.
         size: size of the occluder; smaller than requested if it would not fit.
         distance: distance from the camera; not the requested one if it would not fit.
-        hidden: fraction of the object's area in the image that is hidden.
+        hidden_fraction: fraction of the object's area in the image that is hidden.
         is_out_of_sight: whether the occluder is behind the camera, and hides nothing.
     """
 
@@ -121,7 +121,7 @@ class Placement:
     angle: float
     size: float
     distance: float
-    hidden: float
+    hidden_fraction: float
     is_out_of_sight: bool
 
 
@@ -207,7 +207,7 @@ class OcclusionControl(Control):
         Raises:
             InputError: it is no name or path, or `which` is set as well.
         """
-        occluder = self.chosen["object"]
+        occluder = self.choice_values["object"]
         if occluder is None:
             return
         if not isinstance(occluder, (str, Path)) or not str(occluder).strip():
@@ -220,7 +220,7 @@ class OcclusionControl(Control):
                 f"{self.name}: object and which both state the "
                 "occluder; leave one of them out"
             )
-        self._settings["object"] = self.chosen["object"] = str(occluder)
+        self._settings["object"] = self.choice_values["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with a mesh for every occluder that may be chosen.
@@ -265,7 +265,7 @@ class OcclusionControl(Control):
     ) -> dict[str, Value]:
         """Return how much is hidden, and the true size and distance of the occluder."""
         placement = self.find_placement(values, earlier_inputs)
-        measurements = {"hidden": Value(value=float(placement.hidden), unit="1")}
+        measurements = {"hidden": Value(value=float(placement.hidden_fraction), unit="1")}
         if not placement.is_out_of_sight:
             lengths = {"true_size": placement.size, "true_distance": placement.distance}
             for name, length in lengths.items():
@@ -274,13 +274,13 @@ class OcclusionControl(Control):
 
     def _list_options(self) -> tuple[str, ...]:
         """Return every occluder that can be chosen; each is a part of the scene."""
-        if self.chosen["object"] is not None:
-            return (str(self.chosen["object"]),)
+        if self.choice_values["object"] is not None:
+            return (str(self.choice_values["object"]),)
         return tuple(map(str, self.list_allowed_values("which", PRIMITIVES[0])))
 
     def _select_option(self, values: Values) -> str:
         """Return the occluder of a configuration."""
-        if self.chosen["object"] is not None:
+        if self.choice_values["object"] is not None:
             return self._list_options()[0]
         return OPTIONS[int(values["which"])]
 
@@ -363,7 +363,7 @@ def _find_covering_angle(
     angle_outside = silhouettes.find_angle_outside(
         view.directions_of_image,
         view.rim,
-        passage.cover,
+        passage.occluder_silhouette,
         passage.axes,
         passage.direction,
     )
@@ -381,7 +381,7 @@ def _make_hidden_placement(size: float, distance: float) -> Placement:
         angle=0.0,
         size=size,
         distance=distance,
-        hidden=0.0,
+        hidden_fraction=0.0,
         is_out_of_sight=True,
     )
 
@@ -419,7 +419,7 @@ class _ObjectView:
         model = scene.camera_model
         if model is not None:
             if "camera.lens" in earlier_inputs:
-                model = model.with_numbers(earlier_inputs["camera.lens"].detach().cpu())
+                model = model.with_intrinsics(earlier_inputs["camera.lens"].detach().cpu())
             directions_of_image = _spread_directions(
                 model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
             )
@@ -456,7 +456,7 @@ def _object_in_camera(
         geometry.get_camera_pose(scene, earlier_inputs).detach().double().cpu().numpy()
     )
     pose = _get_array(
-        earlier_inputs, "object.to_world", geometry.object_to_world(scene)
+        earlier_inputs, "object.to_world", geometry.compute_object_to_world(scene)
     )
     offsets = _get_array(earlier_inputs, "object.offsets", np.zeros(3))
     vertices = scene.object.mesh.vertices.astype(np.float64) + offsets

@@ -159,7 +159,7 @@ class Passage:
 
     Attributes:
         target_directions: (N, 3) unit directions in which the target is visible.
-        cover: silhouette of the occluder when it is straight ahead of a camera.
+        occluder_silhouette: silhouette of the occluder when it is straight ahead of a camera.
         axes: (3, 3) rows right, up and forward of a camera that looks at the center of
             the target.
         direction: side that the occluder comes from, degrees: 0 is the right of the
@@ -167,7 +167,7 @@ class Passage:
     """
 
     target_directions: assets.Float64Array
-    cover: Silhouette
+    occluder_silhouette: Silhouette
     axes: assets.Float64Array
     direction: float
 
@@ -195,7 +195,7 @@ class Passage:
             new_forward = outwards * math.sin(angle) + forward * math.cos(angle)
             new_right = math.cos(side) * new_outwards - math.sin(side) * sideways
             new_up = math.sin(side) * new_outwards + math.cos(side) * sideways
-            is_hidden = self.cover.contains(new_right, new_up, new_forward)
+            is_hidden = self.occluder_silhouette.contains(new_right, new_up, new_forward)
             fractions.append(float(is_hidden.mean()))
         return np.array(fractions)
 

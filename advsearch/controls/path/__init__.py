@@ -157,7 +157,7 @@ class Waypoints:
         return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
-class Start(NamedTuple):
+class StartPoses(NamedTuple):
     """Poses in the scene as it was described, float32.
 
     Attributes:
@@ -294,7 +294,7 @@ class PathControl(Control):
         Raises:
             InputError: choices contradict each other or the files.
         """
-        names = _split_paths(self.chosen["path"])
+        names = _split_paths(self.choice_values["path"])
         if len(set(names)) < len(names) or len(names) > MAX_PATHS:
             raise InputError(
                 f"{self.name}.path: expected at most {MAX_PATHS} "
@@ -313,10 +313,10 @@ class PathControl(Control):
             names, are_all_files=len(self._files) == len(all_movements)
         )
         if self._files:
-            self.chosen["seconds"] = max(
+            self.choice_values["seconds"] = max(
                 float(movement.times[-1]) for movement in self._files
             )
-        self.seconds = float(self.chosen["seconds"])
+        self.seconds = float(self.choice_values["seconds"])
 
     def _check_choices_fit_paths(
         self, names: Sequence[str], *, are_all_files: bool
@@ -347,7 +347,7 @@ class PathControl(Control):
         """Raise InputError if a choice is set that the files of the paths state."""
         if setting in self._settings:
             raise InputError(
-                f"{self.name}: {setting}: the file in {self.chosen['path']} states it; "
+                f"{self.name}: {setting}: the file in {self.choice_values['path']} states it; "
                 "leave it out"
             )
 
@@ -374,7 +374,7 @@ class PathControl(Control):
                 f"{name!r}"
             )
         # `MOVERS` has the order of the names: the camera, then the object
-        movers = [str(self.chosen["moves"])] if is_single else MOVERS
+        movers = [str(self.choice_values["moves"])] if is_single else MOVERS
         movements: dict[str, Movement] = {}
         for mover, path_name in zip(movers, names, strict=True):
             if path_name in PATHS:
@@ -393,7 +393,7 @@ class PathControl(Control):
             InputError: such a choice is set without a trajectory.
         """
         chosen_names = [
-            name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None
+            name for name in TRAJECTORY_CHOICES if self.choice_values[name] is not None
         ]
         has_trajectory = any(waypoints.is_trajectory for waypoints in self._files)
         if chosen_names and not has_trajectory:
@@ -408,7 +408,7 @@ class PathControl(Control):
         Raises:
             InputError: it is set, and is not three finite numbers.
         """
-        position = self.chosen["object_at"]
+        position = self.choice_values["object_at"]
         if position is None:
             return
         is_triple = isinstance(position, list | tuple) and len(position) == 3
@@ -502,7 +502,7 @@ class PathControl(Control):
         count = len(trajectory.positions)
         seconds = (count - 1) / KITTI_RATE
         if "seconds" in self._settings:
-            seconds = float(self.chosen["seconds"])
+            seconds = float(self.choice_values["seconds"])
         else:
             assumed["seconds"] = (
                 f"{KITTI_RATE:g} poses a second, {_format_rounded(seconds)} in all"
@@ -530,18 +530,18 @@ class PathControl(Control):
             FileFormatError: a position is too far from the object.
         """
         # Without a setting, a choice is None.
-        axes = str(self.chosen["axes"] or OPTICAL)
-        up = str(self.chosen["up"] or trajectory.default_up)
-        origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
+        axes = str(self.choice_values["axes"] or OPTICAL)
+        up = str(self.choice_values["up"] or trajectory.default_up)
+        origin = self.choice_values["object_at"] or (0.0, 0.0, 0.0)
         if trajectory.rotations is None and axes == NO_AXES:
             raise InputError(
                 f"{self.name}: axes: {path} has no rotations; leave it out"
             )
-        if self.chosen["axes"] is None and trajectory.rotations is not None:
+        if self.choice_values["axes"] is None and trajectory.rotations is not None:
             assumed["axes"] = f"{axes} ({AXES_DESCRIPTIONS[axes]})"
-        if self.chosen["up"] is None:
+        if self.choice_values["up"] is None:
             assumed["up"] = up
-        if self.chosen["object_at"] is None:
+        if self.choice_values["object_at"] is None:
             assumed["object_at"] = "[0, 0, 0]"
         positions, rotations = trajectory.orient(axes, up, origin)
         if np.abs(positions).max() > MAX_DISTANCE:
@@ -552,7 +552,7 @@ class PathControl(Control):
             )
         return positions, rotations
 
-    def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+    def get_parameter_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         """Return the spec of a parameter.
 
         The selection of a path is searched unless the user fixed it, even if the user
@@ -561,7 +561,7 @@ class PathControl(Control):
         is_path_choice = parameter.name == Control.PATH_PARAMETER
         if is_path_choice and parameter.name not in self.specs:
             return OneOf(parameter.options)
-        return super().get_spec(parameter)
+        return super().get_parameter_spec(parameter)
 
     _time_shift = 0.0  # seconds by which `advance_time` has moved the time
 
@@ -571,8 +571,8 @@ class PathControl(Control):
 
         The latter are negative if rows are read from the bottom.
         """
-        return float(self.chosen["shutter"] or 0.0), float(
-            self.chosen["rolling"] or 0.0
+        return float(self.choice_values["shutter"] or 0.0), float(
+            self.choice_values["rolling"] or 0.0
         )
 
     def advance_time(self, seconds: float) -> PathControl:
@@ -591,7 +591,7 @@ class PathControl(Control):
             self._check_camera_is_free(scene)
         self._check_trajectory_choices()
         in_scene = self.with_scene(scene)
-        names = _split_paths(self.chosen["path"])
+        names = _split_paths(self.choice_values["path"])
         for name, movements in zip(names, self._paths, strict=True):
             if CAMERA in movements:
                 in_scene._check_camera_off_target(name, movements)
@@ -781,7 +781,7 @@ class PathControl(Control):
     def _position_camera(
         self,
         movements: MovementByMover,
-        scene_start: Start,
+        scene_start: StartPoses,
         time: Tensor,
         shift: Tensor,
     ) -> tuple[Tensor, Tensor]:
@@ -812,7 +812,7 @@ class PathControl(Control):
         if isinstance(movement, Waypoints):
             return self._camera_on_waypoints(movement, center, time, shift)
         distance = (scene_position - center).norm()
-        reach = float(self.chosen["reach"])
+        reach = float(self.choice_values["reach"])
         progress = (time / self.seconds).clamp(0.0, 1.0)
         if movement == APPROACH:
             ahead = _level_direction(forward)
@@ -861,7 +861,7 @@ class PathControl(Control):
         return position, center + target
 
     def _shift_object(
-        self, movements: MovementByMover, scene_start: Start, time: Tensor
+        self, movements: MovementByMover, scene_start: StartPoses, time: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return how far the object is shifted and turned from its pose in the scene.
 
@@ -897,7 +897,7 @@ class PathControl(Control):
         progress = (time / self.seconds).clamp(0.0, 1.0)
         if movement == ORBIT:
             return no_shift, 360.0 * progress
-        reach = float(self.chosen["reach"])
+        reach = float(self.choice_values["reach"])
         distance = (position - scene_start.center).norm()
         if movement == APPROACH:
             # It begins at `reach` times its last distance from the camera.
@@ -910,12 +910,12 @@ class PathControl(Control):
 
 
 @geometry.cache_per_scene
-def get_start_poses(scene: SceneDescription, device: torch.device) -> Start:
+def get_start_poses(scene: SceneDescription, device: torch.device) -> StartPoses:
     """Return the poses of a scene; cached, as all vertices are read for the center."""
-    return Start(
+    return StartPoses(
         camera=torch.from_numpy(geometry.camera_to_world(scene)).float().to(device),
         center=torch.from_numpy(geometry.compute_center(scene)).float().to(device),
-        object=torch.from_numpy(geometry.object_to_world(scene)).float().to(device),
+        object=torch.from_numpy(geometry.compute_object_to_world(scene)).float().to(device),
     )
 
 
@@ -1053,7 +1053,7 @@ def check_times(path: Path, times: assets.Float64Array) -> None:
         )
 
 
-def make_object_pose(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
+def make_object_pose(start: StartPoses, shift: Tensor, heading: Tensor) -> Tensor:
     """Return the pose (4, 4) of an object that is turned and shifted.
 
     Args:

@@ -67,10 +67,10 @@ class ProjectorControl(PictureControl):
     Its texels are searched, and those numbers for which the user sets a range.
 
     Attributes:
-        part: projector in the scene. Set by `fit`.
+        projector_part: projector in the scene. Set by `bind_parameters`.
     """
 
-    part: parts.ProjectorPart
+    projector_part: parts.ProjectorPart
     _time_shift = 0.0  # seconds by which `advance_time` has moved the time
     kind = "projector"
     competes_with_ambient = True
@@ -219,7 +219,7 @@ class ProjectorControl(PictureControl):
                 the pattern has another range than its full one.
         """
         self._check_pattern()
-        picture = self.chosen["picture"]
+        picture = self.choice_values["picture"]
         if picture is None:
             return
         if not isinstance(picture, (str, Path)):
@@ -228,7 +228,7 @@ class ProjectorControl(PictureControl):
             )
         # as a string, since settings are stored as JSON
         self._settings["picture"] = str(picture)
-        self.chosen["picture"] = str(picture)
+        self.choice_values["picture"] = str(picture)
         conflicting = [
             setting
             for setting in ("pattern", "epsilon", "norm", "resolution", "aspect")
@@ -273,12 +273,12 @@ class ProjectorControl(PictureControl):
         """
         picture = self.read_picture()
         if picture is None:
-            rows = int(self.chosen["resolution"])
+            rows = int(self.choice_values["resolution"])
             # An image has at least two texels along each side.
-            columns = max(2, round(rows * self.chosen["aspect"]))
+            columns = max(2, round(rows * self.choice_values["aspect"]))
         else:
             rows, columns = picture.shape[:2]
-        fov = self.chosen["fov"]
+        fov = self.choice_values["fov"]
         if fov is None:
             fov = self._compute_covering_fov(scene, aspect=columns / rows)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
@@ -325,7 +325,7 @@ class ProjectorControl(PictureControl):
         camera_distance = float(np.linalg.norm(camera_offset))
         match parameter.name:
             case "pattern":
-                grey = START_GREY if self.chosen["start"] == "grey" else 0.0
+                grey = START_GREY if self.choice_values["start"] == "grey" else 0.0
                 return replace(parameter, default=grey)
             case "ambient":
                 return replace(parameter, default=self._compute_ambient_lux())
@@ -368,13 +368,13 @@ class ProjectorControl(PictureControl):
         return (
             MAX_AMBIENT_FACTOR
             * float(self.get_clean_value("ambient"))
-            * self.part.area
+            * self.projector_part.area
             * self._start_distance() ** 2
         )
 
     @property
-    def sides(self) -> tuple[int, int]:
-        return self.part.sides
+    def image_shape(self) -> tuple[int, int]:
+        return self.projector_part.sides
 
     def _start_distance(self) -> float:
         """Return the projector's distance at the start, in the parameter's unit."""
@@ -383,20 +383,20 @@ class ProjectorControl(PictureControl):
             return float(spec.value)
         return float(self.get_clean_value("distance"))
 
-    def fit(self) -> None:
+    def bind_parameters(self) -> None:
         """Find the projector's part of the scene, and its largest flash rate.
 
         The rate, `flashes`, is the upper bound of the parameter "flicker".
         """
-        (self.part,) = (
+        (self.projector_part,) = (
             part
             for part in self.scene.parts
             if isinstance(part, parts.ProjectorPart) and part.name == self.name
         )
         self._picture = self.read_picture()
-        super().fit()
+        super().bind_parameters()
         flicker = next(
-            slot.spec for slot in self.slots if slot.parameter.name == "flicker"
+            slot.parameter_spec for slot in self.parameter_slots if slot.parameter.name == "flicker"
         )
         if isinstance(flicker, Range):
             self.flashes = flicker.high
@@ -420,16 +420,16 @@ class ProjectorControl(PictureControl):
         return picture
 
     @property
-    def ambient(self) -> float | None:
-        slot = next(slot for slot in self.slots if slot.parameter.name == "ambient")
-        return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
+    def ambient_lux(self) -> float | None:
+        slot = next(slot for slot in self.parameter_slots if slot.parameter.name == "ambient")
+        return float(slot.parameter_spec.value) if isinstance(slot.parameter_spec, Fixed) else None
 
     def scale_ambient(self, factor: float) -> Self:
-        if self.ambient is None:
+        if self.ambient_lux is None:
             return self
         scaled = copy.copy(self)
-        scaled.specs = {**self.specs, "ambient": Fixed(factor * self.ambient)}
-        scaled.fit()
+        scaled.specs = {**self.specs, "ambient": Fixed(factor * self.ambient_lux)}
+        scaled.bind_parameters()
         return scaled
 
     def advance_time(self, seconds: float) -> Self:
@@ -439,11 +439,11 @@ class ProjectorControl(PictureControl):
 
     # ---- at a configuration
 
-    def values(self, u: Tensor) -> dict[str, Tensor]:
+    def compute_values(self, u: Tensor) -> dict[str, Tensor]:
         """Return the values by parameter; the pattern is rounded to 8 bits, with the
         derivative of the identity.
         """
-        values = super().values(u)
+        values = super().compute_values(u)
         pattern = values["pattern"]
         # the rounding is added as a constant, which has no derivative
         rounded = pattern + (images.round_to_8_bit(pattern.detach()) - pattern.detach())
@@ -464,14 +464,14 @@ class ProjectorControl(PictureControl):
             float(values["distance"].detach()),
         )
         pose = pose.to(values["distance"], copy=True)
-        light = self.project_light(values)
+        light = self.compute_projected_image(values)
         if self._flashes_off(values):
             light = 0.0 * light  # still depends on the pattern, for its derivative
         distance_in_units = values["distance"].detach() / self.scene.size_in_metres
         # The irradiance of white at the object, in scene units. At a distance of one
         # unit it is larger by the squared distance.
         white_irradiance = (
-            self._relative_to_ambient(values)
+            self._compute_ambient_ratio(values)
             * distance_in_units**2
             * self.scene.metered_irradiance
         )
@@ -488,7 +488,7 @@ class ProjectorControl(PictureControl):
         cycle_position = (rate * self._time_shift + phase) % 1.0
         return rate != 0.0 and cycle_position >= DUTY_CYCLE
 
-    def project_light(self, values: Values) -> Tensor:
+    def compute_projected_image(self, values: Values) -> Tensor:
         """Return the projected image (h, w, 3), linear, as fractions of white.
 
         Black texels have the light of `black`, and the image is blurred.
@@ -497,15 +497,15 @@ class ProjectorControl(PictureControl):
         light = pattern * (1.0 - values["black"]) + values["black"]
         return blur_light(light, values["blur"])
 
-    def _lux(self, values: Values) -> Tensor:
+    def _compute_white_lux(self, values: Values) -> Tensor:
         """Return the illuminance () of a white image at the object's center, lux."""
-        return values["lumens"] / (self.part.area * values["distance"].detach() ** 2)
+        return values["lumens"] / (self.projector_part.area * values["distance"].detach() ** 2)
 
-    def _relative_to_ambient(self, values: Values) -> Tensor:
+    def _compute_ambient_ratio(self, values: Values) -> Tensor:
         """Return the illuminance () of a white image at the object's center, as a
         multiple of the ambient light.
         """
-        return self._lux(values) / values["ambient"]
+        return self._compute_white_lux(values) / values["ambient"]
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -516,9 +516,9 @@ class ProjectorControl(PictureControl):
         fraction of white.
         """
         return {
-            "white": Value(value=float(self._lux(values)), unit="lux"),
+            "white": Value(value=float(self._compute_white_lux(values)), unit="lux"),
             "beside_ambient": Value(
-                value=float(self._relative_to_ambient(values)),
+                value=float(self._compute_ambient_ratio(values)),
                 unit="times the ambient light",
             ),
             "mean": Value(

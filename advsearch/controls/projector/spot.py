@@ -115,14 +115,14 @@ class SpotControl(ProjectorControl):
     # There is no image among its parameters. So it has the methods of `Control` instead
     # of those of `PictureControl`.
 
-    def get_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
-        return Control.get_spec(self, parameter)
+    def get_parameter_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+        return Control.get_parameter_spec(self, parameter)
 
     def get_budget(self, parameter: Parameter) -> Any:
         return Control.get_budget(self, parameter)
 
-    def values(self, u: Tensor) -> dict[str, Tensor]:
-        return Control.values(self, u)
+    def compute_values(self, u: Tensor) -> dict[str, Tensor]:
+        return Control.compute_values(self, u)
 
     def describe(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
@@ -136,7 +136,7 @@ class SpotControl(ProjectorControl):
 
     def check_choices(self) -> None:
         # choices of the projector that a spot does not have
-        self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
+        self.choice_values = {"aspect": 1.0, "picture": None, **self.choice_values}
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter for the scene.
@@ -157,14 +157,14 @@ class SpotControl(ProjectorControl):
             MAX_AMBIENT_FACTOR * ambient * effective_area,
         )
         default = 0.0
-        if self.has_requested_search and not self.is_searched("lumens"):
+        if self.has_requested_range and not self.is_searched("lumens"):
             default = max_lumens
         return replace(parameter, search=(0.0, max_lumens), default=default)
 
-    def get_scene_value(self, parameter: Parameter) -> float | str:
+    def get_value_without_control(self, parameter: Parameter) -> float | str:
         return 0.0  # only that of the lumens is used (`strength_parameter`)
 
-    def project_light(self, values: Values) -> Tensor:
+    def compute_projected_image(self, values: Values) -> Tensor:
         """Return the projected image (h, w, 3) of the round spot, linear.
 
         The image lies in the plane through the object's center, at right angles to the
@@ -173,11 +173,11 @@ class SpotControl(ProjectorControl):
         """
         # half the width of the projector's square image in that plane, object sizes
         half_width = (
-            math.tan(math.radians(self.part.fov) / 2.0)
+            math.tan(math.radians(self.projector_part.fov) / 2.0)
             * values["distance"].detach()
             / self.scene.size_in_metres
         )
-        rows, columns = self.part.sides
+        rows, columns = self.projector_part.sides
         # positions of the texels' centers in that plane; rows go downwards
         right = _compute_texel_centers(columns).to(half_width) * half_width
         down = _compute_texel_centers(rows).to(half_width) * half_width
@@ -195,14 +195,14 @@ class SpotControl(ProjectorControl):
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the brightness of the brightest point of the spot."""
-        brightest = float(self.project_light(values).detach().max())
+        brightest = float(self.compute_projected_image(values).detach().max())
         return {
             "lux": Value(
-                value=float(brightest * float(self._lux(values))),
+                value=float(brightest * float(self._compute_white_lux(values))),
                 unit="lux, where it is brightest",
             ),
             "beside_ambient": Value(
-                value=float(brightest * float(self._relative_to_ambient(values))),
+                value=float(brightest * float(self._compute_ambient_ratio(values))),
                 unit="times the ambient light",
             ),
         }

@@ -125,7 +125,7 @@ def draw_noise(
 
     It is standard normal, or uniform in [0, 1).
     """
-    generator = torch.Generator().manual_seed(seeds.stream(seed, stream_name))
+    generator = torch.Generator().manual_seed(seeds.derive_seed(seed, stream_name))
     sample = torch.randn if normal else torch.rand
     return sample(height, width, 3, generator=generator)
 

@@ -48,23 +48,23 @@ class PictureControl(Control):
     _picture: Tensor | None
 
     @property
-    def sides(self) -> tuple[int, int]:
+    def image_shape(self) -> tuple[int, int]:
         """Rows and columns of the image."""
-        return (int(self.chosen["resolution"]),) * 2
+        return (int(self.choice_values["resolution"]),) * 2
 
     @property
-    def is_searched_image(self) -> bool:
+    def is_image_searched(self) -> bool:
         """Whether the image is searched: no file is set, and no constant color."""
-        return self.chosen["picture"] is None and not isinstance(
+        return self.choice_values["picture"] is None and not isinstance(
             self.specs.get(self.image_parameter), Fixed
         )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         if parameter.name != self.image_parameter:
             return parameter
-        return replace(parameter, shape=(*self.sides, 3), default=0.0)
+        return replace(parameter, shape=(*self.image_shape, 3), default=0.0)
 
-    def get_spec(self, parameter: Parameter) -> Spec:
+    def get_parameter_spec(self, parameter: Parameter) -> Spec:
         """Return the spec that the user set for a parameter, or the default one.
 
         By default a searched image may have all colors, and a number is fixed at its
@@ -74,7 +74,7 @@ class PictureControl(Control):
             return self.specs[parameter.name]
         if parameter.name != self.image_parameter:
             return Fixed(parameter.default)
-        return Range(0.0, 1.0) if self.is_searched_image else Fixed(0.0)
+        return Range(0.0, 1.0) if self.is_image_searched else Fixed(0.0)
 
     def get_budget(self, parameter: Parameter) -> Budget:
         """Return how far the image may go from its start.
@@ -83,22 +83,22 @@ class PictureControl(Control):
         the range. Parameters other than the image have no limit, and the norm "box" has
         none either.
         """
-        norm = self.chosen["norm"]
+        norm = self.choice_values["norm"]
         if parameter.name != self.image_parameter or norm == "box":
             return FULL_RANGE
-        spec = self.get_spec(parameter)
+        spec = self.get_parameter_spec(parameter)
         assert isinstance(spec, Range)
-        n_values = 3 * math.prod(self.sides)  # three channels for each pixel
-        radius = self.chosen["epsilon"]
+        n_values = 3 * math.prod(self.image_shape)  # three channels for each pixel
+        radius = self.choice_values["epsilon"]
         if radius is None:
             radius = compute_default_radius(norm, n_values, self.default_epsilon)
         return Budget(norm, radius / (spec.high - spec.low))
 
-    def values(self, u: Tensor) -> dict[str, Tensor]:
+    def compute_values(self, u: Tensor) -> dict[str, Tensor]:
         """Return the values of the parameters by name; the image is (H, W, 3)."""
-        values = super().values(u)
+        values = super().compute_values(u)
         if self._picture is None:
-            image = values[self.image_parameter].reshape(*self.sides, 3)
+            image = values[self.image_parameter].reshape(*self.image_shape, 3)
         else:
             image = self._picture.to(u.device, copy=True)
         return values | {self.image_parameter: image}
@@ -109,10 +109,10 @@ class PictureControl(Control):
         Raises:
             FileFormatError: it cannot be read.
         """
-        if self.chosen["picture"] is None:
+        if self.choice_values["picture"] is None:
             return None
         try:
-            return torch.from_numpy(read_image(Path(self.chosen["picture"])))
+            return torch.from_numpy(read_image(Path(self.choice_values["picture"])))
         except FileFormatError as error:
             raise FileFormatError(f"{self.name}.picture: {error}") from error
 
@@ -121,8 +121,8 @@ class PictureControl(Control):
     ) -> dict[str, Value]:
         """Return how much a searched image changes, and the other values."""
         described = super().describe(u, earlier_inputs)
-        if not self.is_searched_image:
+        if not self.is_image_searched:
             return described
-        image = self.values(u.detach())[self.image_parameter]
-        start_image = self.values(self.start.to(u.device))[self.image_parameter]
+        image = self.compute_values(u.detach())[self.image_parameter]
+        start_image = self.compute_values(self.start.to(u.device))[self.image_parameter]
         return {**describe_color_change(self.name, image - start_image), **described}

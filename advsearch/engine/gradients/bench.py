@@ -162,7 +162,7 @@ class Bench:
         group.
         """
         started = time.perf_counter()
-        gradient = self.compute_gradient(plan, seeds.stream(self.seed, stream, index))
+        gradient = self.compute_gradient(plan, seeds.derive_seed(self.seed, stream, index))
         derivatives = torch.cat(
             [
                 gradient[group.coordinates]

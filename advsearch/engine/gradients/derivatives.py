@@ -114,7 +114,7 @@ def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     window). With a hard edge the loss would be as rough as whatever moves across it, a
     photographed interior above all, and its differences would depend on the step.
     """
-    generator = torch.Generator().manual_seed(seeds.stream(seed, "smooth loss"))
+    generator = torch.Generator().manual_seed(seeds.derive_seed(seed, "smooth loss"))
     height, width = resolution
     rows = torch.linspace(-1.0, 1.0, height)[:, None, None]
     columns = torch.linspace(-1.0, 1.0, width)[None, :, None]
@@ -312,9 +312,9 @@ def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
     """
     # differentiates by this group alone
     plan = restrict_plan(bench.renderer.plan, [group.name])
-    full_gradient = bench.compute_gradient(plan, seeds.stream(bench.seed, "probe"))
+    full_gradient = bench.compute_gradient(plan, seeds.derive_seed(bench.seed, "probe"))
     gradient = full_gradient[group.coordinates]
-    generator = torch.Generator().manual_seed(seeds.stream(bench.seed, "probe signs"))
+    generator = torch.Generator().manual_seed(seeds.derive_seed(bench.seed, "probe signs"))
     random_bits = torch.randint(0, 2, gradient.shape, generator=generator)
     random_signs = random_bits.to(gradient.dtype) * 2.0 - 1.0
     # where the gradient is 0, the random sign is left
@@ -397,7 +397,7 @@ def _measure_pair(
     # A wider step is limited to the largest one; the planned step is not changed.
     _, max_step = STEP_RANGE
     step = probe.step if factor == 1.0 else min(max_step, factor * probe.step)
-    noise_seed = seeds.stream(bench.seed, "reference", number)
+    noise_seed = seeds.derive_seed(bench.seed, "reference", number)
     return DifferencePair(
         coarse=_compute_difference(bench, probe, step, noise_seed),
         fine=_compute_difference(bench, probe, 0.5 * step, noise_seed),

@@ -544,7 +544,7 @@ def measure_path_length(
     # A denoiser would spread a change over its neighbors.
     renderer = renderer.copy_with(denoiser="none")
     full_depth = renderer.scene.max_depth
-    noise_seeds = [seeds.stream(seed, "half", half) for half in range(2)]
+    noise_seeds = [seeds.derive_seed(seed, "half", half) for half in range(2)]
 
     def render_twice(u: Tensor, depth: int) -> list[_Rendering]:
         """Render u (d,) with both seeds."""
@@ -593,7 +593,7 @@ def _render_with_depth(
     """Render u (d,) with light paths of at most `depth` segments."""
     with torch.no_grad(), renderer.scene.limit_depth(depth):
         radiance = renderer.radiance(u, seed, spp)
-        displayed = renderer.formation.display(radiance)
+        displayed = renderer.formation.map_to_display(radiance)
         return _Rendering(radiance, renderer.space.apply_to_image(u, displayed))
 
 
@@ -665,16 +665,16 @@ def measure_problem_bounces(
     This is measured on the clean configuration and `N_RANDOM_CONFIGURATIONS` random
     ones of its domain. `tick` is called after each image.
     """
-    full_configurations = [problem.add_conditions(problem.domain.start)]
+    full_configurations = [problem.make_full_configuration(problem.domain.start)]
     for index in range(N_RANDOM_CONFIGURATIONS):
-        generator = torch.Generator().manual_seed(seeds.stream(seed, "bounces", index))
+        generator = torch.Generator().manual_seed(seeds.derive_seed(seed, "bounces", index))
         u = problem.domain.sample(generator)[0]
-        condition_seed = seeds.stream(seed, "conditions of bounces", index)
-        full_configurations.append(problem.add_conditions(u, condition_seed))
+        condition_seed = seeds.derive_seed(seed, "conditions of bounces", index)
+        full_configurations.append(problem.make_full_configuration(u, condition_seed))
     return measure_path_length(
         problem.renderer,
         full_configurations,
-        seed=seeds.stream(seed, "bounces"),
+        seed=seeds.derive_seed(seed, "bounces"),
         spp=BOUNCE_SPP,
         tick=tick,
     )

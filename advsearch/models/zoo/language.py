@@ -118,7 +118,7 @@ def _load_processor(loaded: LoadedNetwork) -> Any:
             names it if it is not installed.
     """
     try:
-        return loaded.load_part("AutoProcessor")
+        return loaded.load_component("AutoProcessor")
     except errors.ModelError as error:
         if importlib.util.find_spec("torchvision") is None:
             raise errors.ModelError(

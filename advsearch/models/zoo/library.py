@@ -367,12 +367,12 @@ class AdaptedNetwork(nn.Module):
     """
 
     def __init__(
-        self, network: nn.Module, run_network: RunNetwork, *, boxes: bool = False
+        self, network: nn.Module, run_network: RunNetwork, *, returns_pixel_boxes: bool = False
     ) -> None:
         super().__init__()
         self.network = network
         self.run_network = run_network
-        self.boxes_are_corners_in_pixels = boxes
+        self.boxes_are_corners_in_pixels = returns_pixel_boxes
 
     def forward(self, images: Tensor) -> Any:
         return self.run_network(self.network, images)
@@ -387,7 +387,7 @@ class LoadedNetwork:
         name: name of the model.
         spec: what the user wrote, for messages.
         processor: processor of images; None if the network has none.
-        load_part: loads another part of the repository by its class, such as
+        load_component: loads another part of the repository by its class, such as
             "AutoTokenizer".
         purpose: what the network is loaded for.
     """
@@ -396,7 +396,7 @@ class LoadedNetwork:
     name: str
     spec: str
     processor: Any
-    load_part: Callable[[str], Any]
+    load_component: Callable[[str], Any]
     purpose: models.Purpose
 
     @cached_property
@@ -443,18 +443,18 @@ class LoadedNetwork:
         return Processing(**{**default, **self.preprocessing})
 
     def make_source(
-        self, run_network: RunNetwork, *, boxes: bool = False, **fields: Any
+        self, run_network: RunNetwork, *, returns_pixel_boxes: bool = False, **fields: Any
     ) -> models.Source:
         """Return the source of the network, with the measured preprocessing.
 
         Args:
             run_network: calls the network on images (N, 3, H, W).
-            boxes: whether the output has boxes as corners in pixels.
+            returns_pixel_boxes: whether the output has boxes as corners in pixels.
             **fields: fields of `Source`; they take precedence over the measured
                 preprocessing.
         """
         return models.make_source(
-            AdaptedNetwork(self.network, run_network, boxes=boxes),
+            AdaptedNetwork(self.network, run_network, returns_pixel_boxes=returns_pixel_boxes),
             self.name,
             **{**self.preprocessing, **fields},
         )

@@ -252,7 +252,7 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
 
 def _tokenize_sentence(loaded: LoadedNetwork) -> Tensor:
     """Return the tokens (1, L) of the text that OneFormer reads, padded with 0."""
-    tokens = loaded.load_part("AutoTokenizer")(
+    tokens = loaded.load_component("AutoTokenizer")(
         [SENTENCE],
         return_tensors="pt",
         padding="max_length",
@@ -476,7 +476,7 @@ def _make_detector_source(
     if input_size is not None:
         fields["input_size"] = input_size
     return models.make_source(
-        AdaptedNetwork(module, _run_detector, boxes=True), name, **fields
+        AdaptedNetwork(module, _run_detector, returns_pixel_boxes=True), name, **fields
     )
 
 

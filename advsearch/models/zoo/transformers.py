@@ -101,7 +101,7 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         name=name.rstrip("/").rpartition("/")[2],
         spec=spec,
         processor=processor,
-        load_part=partial(_load_part, transformers, spec, name, hub_options),
+        load_component=partial(_load_part, transformers, spec, name, hub_options),
         purpose=purpose,
     )
     return family.source(loaded)
@@ -189,7 +189,7 @@ def find_transformers_source(
         name=spec,
         spec=spec,
         processor=processor,
-        load_part=partial(_load_part, transformers, spec, origin, hub_options),
+        load_component=partial(_load_part, transformers, spec, origin, hub_options),
         purpose=purpose,
     )
     return family.source(loaded)
@@ -386,7 +386,7 @@ def _run_detector(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _make_named_source(
-    run_network: RunNetwork, *, boxes: bool = False
+    run_network: RunNetwork, *, returns_pixel_boxes: bool = False
 ) -> Callable[[LoadedNetwork], models.Source]:
     """Return a function that makes the source of a network with class names.
 
@@ -394,10 +394,10 @@ def _make_named_source(
 
     Args:
         run_network: calls the network on images (N, 3, H, W).
-        boxes: whether the output has boxes as corners in pixels.
+        returns_pixel_boxes: whether the output has boxes as corners in pixels.
     """
     return lambda loaded: loaded.make_source(
-        run_network, boxes=boxes, labels=loaded.class_names or None
+        run_network, returns_pixel_boxes=returns_pixel_boxes, labels=loaded.class_names or None
     )
 
 
@@ -462,7 +462,7 @@ NETWORKS = (
     Family(
         "ForObjectDetection",
         "ForObjectDetection",
-        _make_named_source(_run_detector, boxes=True),
+        _make_named_source(_run_detector, returns_pixel_boxes=True),
     ),
     Family(
         language.generates_text, "ForImageTextToText", language.make_language_source

@@ -50,7 +50,7 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     name = loaded.name
     names = _require_several_names(loaded)
     prompts = models.get_patterns(loaded.purpose.prompts)
-    tokenizer = loaded.load_part("AutoTokenizer")
+    tokenizer = loaded.load_component("AutoTokenizer")
     words = get_spoken_names(names)
     # One text per name, by which scores are checked and equal names are found. The
     # first prompt is enough for both.
@@ -324,7 +324,7 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
     names = loaded.purpose.require_names(
         loaded.name, "finds objects by their names", "detection"
     )
-    tokenizer = loaded.load_part("AutoTokenizer")
+    tokenizer = loaded.load_component("AutoTokenizer")
     words = get_spoken_names(names)
     with (
         models.translate_errors(
@@ -337,7 +337,7 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
         run_network = build_detector(loaded, network, tokenizer, words)
     warn_of_equal_texts(tokenizer, words, names, loaded.name)
     return loaded.make_text_source(
-        AdaptedNetwork(network, run_network, boxes=True), names, network.dtype
+        AdaptedNetwork(network, run_network, returns_pixel_boxes=True), names, network.dtype
     )
 
 

@@ -40,5 +40,5 @@ def attack(
     if context.config.is_study:
         return matrix(context) if context.config.is_matrix else curve(context)
     return attack_once(
-        context.config, progress=context.progress, resumed=context.resumed
+        context.config, progress=context.progress, resumed=context.resumed_directory
     ).summary

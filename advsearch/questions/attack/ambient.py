@@ -37,16 +37,16 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         u: (d,) the configuration.
     """
     problem = verifier.problem
-    findings = verifier.state
+    findings = verifier.run_state
     scene_lux = _find_scene_lux(problem)
     if scene_lux is None or findings.verification is None:
         return  # no light of the attack competes with the ambient light
-    findings.ambient_verifications[scene_lux] = findings.verification
+    findings.verification_by_lux[scene_lux] = findings.verification
 
     def holds(lux: float) -> bool:
         """Verify the configuration in an ambient light, and store the result."""
         verification = _verify_in_light(verifier, u, lux, lux / scene_lux)
-        findings.ambient_verifications[lux] = verification
+        findings.verification_by_lux[lux] = verification
         return verification.ending is Ending.FOUND
 
     holding_lux = scene_lux
@@ -54,7 +54,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     while failing_lux <= MAX_LUX and holds(failing_lux):
         holding_lux = failing_lux
         failing_lux = 2.0 * failing_lux
-    holds_in_direct_sun = failing_lux not in findings.ambient_verifications
+    holds_in_direct_sun = failing_lux not in findings.verification_by_lux
     if holds_in_direct_sun:  # the next light is beyond `MAX_LUX`, and was not tried
         return
     for _ in range(N_BISECTIONS):
@@ -85,7 +85,7 @@ def _verify_in_light(
     # Workers find the problem in that light by its key, which is the factor.
     evaluator = ParallelEvaluator(
         with_ambient_light(problem, factor),
-        verifier.journal.evaluator.executor,
+        verifier.journal.evaluator.workers,
         factor,
     )
     journal = replace(verifier.journal, evaluator=evaluator)
@@ -94,10 +94,10 @@ def _verify_in_light(
         problem.domain,
         u,
         claim=Ending.FOUND,
-        spp=verifier.state.spp,
-        seed=seeds.stream(problem.seed, "ambient"),
-        trials=verifier.looks,
-        rule=problem.rule,
+        spp=verifier.run_state.spp,
+        seed=seeds.derive_seed(problem.seed, "ambient"),
+        trials=verifier.look_sizes,
+        rule=problem.verification_rule,
         kind=f"ambient {lux:.6g} lux",
         control_kind=f"control {lux:.6g} lux",
     )
@@ -111,7 +111,7 @@ def _find_scene_lux(problem: Problem) -> float | None:
     """
     for control in problem.searched_space.controls:
         if control.competes_with_ambient:
-            return control.ambient  # None if the control searches it
+            return control.ambient_lux  # None if the control searches it
     return None
 
 

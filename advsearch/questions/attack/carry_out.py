@@ -26,7 +26,7 @@ from advsearch.attacks.objectives import (
 from advsearch.attacks.policies import POLICIES
 from advsearch.cluster import BatchFunction, Workers, WorkerTask
 from advsearch.cluster.workers import open_workers
-from advsearch.config import SceneConfig, has_address, make_single_value_error
+from advsearch.config import SceneConfig, has_model_url, make_single_value_error
 from advsearch.controls import make_space
 from advsearch.controls.base import Control, describe_adjusted_defaults
 from advsearch.controls.ranges import has_distribution
@@ -39,7 +39,7 @@ from advsearch.engine.judging import (
     RenderSurfaces,
 )
 from advsearch.engine.loading import Controls, Scene, fit_camera
-from advsearch.engine.naming import AnyModel, list_models, load_models
+from advsearch.engine.naming import AnyModel, to_model_list, load_models
 from advsearch.engine.problem import Problem
 from advsearch.engine.rendering import make_facts
 from advsearch.engine.shared_paths import find_shared_paths
@@ -47,7 +47,7 @@ from advsearch.engine.transport import CleanMatrix, find_matrix_refusal
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.options import to_setting
+from advsearch.options import convert_to_setting
 from advsearch.progress import Progress
 from advsearch.questions.attack.ambient import make_problem_finder
 from advsearch.questions.attack.settings import (
@@ -347,7 +347,7 @@ def load_ensemble(
     Returns:
         The model or the ensemble, and warnings of loading.
     """
-    models, warnings = load_models(list_models(model), task, config)
+    models, warnings = load_models(to_model_list(model), task, config)
     if len(models) == 1:
         return models[0], warnings
     return join_models(models, config.resolution), warnings
@@ -456,7 +456,7 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         sampler=config.pixel_sampler,
         differentiated=differentiated,
     )
-    features_seed = seeds.stream(config.seed, "clean features")
+    features_seed = seeds.derive_seed(config.seed, "clean features")
     objective, note = judging.make_objective(
         parts.objective, task, model, renderer, features_seed, config.ensemble
     )
@@ -470,7 +470,7 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
         task=task,
         make_facts=make_scene_facts,
         objective=objective,
-        spp=round_sample_count(config.pixel_sampler, config.search_spp),
+        search_spp=round_sample_count(config.pixel_sampler, config.search_spp),
         seed=config.seed,
         n_searched=len(parts.controls),
         aovs=parse_aovs(config.aov),
@@ -479,7 +479,7 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     if config.specialise:
         problem.shared_paths = find_shared_paths(problem)
     _check_objective_inputs(parts, problem)
-    problem.steps, problem.n_draws = choose_search_size(config, problem)
+    problem.steps, problem.conditions_per_evaluation = choose_search_size(config, problem)
     return problem
 
 
@@ -510,7 +510,7 @@ def _check_objective_inputs(parts: AttackParts, problem: Problem) -> None:
     `texture`.
     """
     for name in list_requested_inputs(parts.objective):
-        start = problem.add_conditions(problem.domain.start)
+        start = problem.make_full_configuration(problem.domain.start)
         get_input = problem.make_objective_inputs(start)
         get_input(name)  # only a check: raises where there is no such input
 
@@ -603,7 +603,7 @@ def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int
     return config.steps or default_steps, config.draws or default_draws
 
 
-def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
+def is_describable_by_setting(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
     """Return whether a setting can describe a task or a policy.
 
     It can if the setting makes an equal task or policy again. That fails, for example,
@@ -614,7 +614,7 @@ def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
         make: makes a task or policy from a setting.
     """
     try:
-        return bool(make(to_setting(entry)) == entry)
+        return bool(make(convert_to_setting(entry)) == entry)
     except InputError:
         return False
 
@@ -668,7 +668,7 @@ def _prepare_task(
             config.image_settings,
         )
     _, warnings = parts.model_and_warnings
-    warnings += [remark for remark in task.remarks if remark not in warnings]
+    warnings += [remark for remark in task.output_remarks if remark not in warnings]
     return task
 
 
@@ -691,13 +691,13 @@ def open_executor(
     # A worker gets the settings of the run, but must not start workers itself.
     in_process = {"workers": None, "cluster": None}
     worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
-    work = WorkerTask(function, worker_settings, FILES, config.used_threads or 1)
+    work = WorkerTask(function, worker_settings, FILES, config.n_used_threads or 1)
     workers = getattr(config, "workers", None)
     cluster = getattr(config, "cluster", None)
-    if (workers or cluster) and has_address(config.model):
+    if (workers or cluster) and has_model_url(config.model):
         setting = "workers" if workers else "cluster"
         raise InputError(
             f"{setting}: a model behind an address is called by a single process, which "
             "counts the calls; leave it out"
         )
-    return open_workers(work, workers=workers, cluster=cluster, tell=progress.message)
+    return open_workers(work, workers=workers, cluster=cluster, report_message=progress.message)

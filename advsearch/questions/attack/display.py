@@ -56,13 +56,13 @@ def _attack_claim(result: AttackSummary) -> Claim:
     extent = views.make_rate_extent("fresh renders that count as a success", rate)
     if result.ending == "found" and rate is not None and rate.successes:
         text = f"{verdict} How many such configurations exist is not known."
-        return views.claim("found", text, extent)
+        return views.make_claim("found", text, extent)
     if result.ending in views.FAILED_SEARCH_ENDINGS and rate is not None:
         searches = views.format_searches(
             result.renders, result.policy, random=result.baseline is not None
         )
         text = f"{verdict} Searched were {searches}. {views.NO_PROOF}"
-        return views.claim("not found", text, extent)
+        return views.make_claim("not found", text, extent)
     other_reason = (
         f"the search ended as {result.ending!r} without trials that support a claim"
     )
@@ -131,7 +131,7 @@ def _rates_part(summary: AttackSummary) -> ResultPart:
     clean = summary.clean
     baseline = summary.baseline
     average = summary.average
-    success = wording.success_name(summary)
+    success = wording.format_success_word(summary)
     prediction = words.format_prediction_cells(summary.task, clean)
     rows = [["clean", *prediction, *_rate_cells("right", clean.control)]]
     if summary.adversarial:
@@ -149,7 +149,7 @@ def _rates_part(summary: AttackSummary) -> ResultPart:
         rows.append(["average case", configurations, "", right, interval])
     number_head = "action" if summary.task == words.COMMAND else "probability"
     heads = ("", "prediction", number_head, "rate", "95 % interval")
-    return ResultPart(heads=heads, rows=rows)
+    return ResultPart(column_heads=heads, rows=rows)
 
 
 def _rate_cells(
@@ -183,7 +183,7 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     columns: Mapping[str, Column] = {
         "ambient light": "{0.lux:.3g} lux",
         "wrong": lambda point: words.format_tally(
-            wording.success_name(summary),
+            wording.format_success_word(summary),
             point.verified.successes,
             point.verified.trials,
         ),
@@ -304,7 +304,7 @@ def _view_curve(result: CurveResult) -> ShownResult:
         [f"Over epsilon with 95 % intervals: {points_text}."],
         draw=lambda axes: _draw_curve(result, points, axes),
         size=(5.6, 3.6),
-        only="page" if has_chart else "notebook",
+        only_medium="page" if has_chart else "notebook",
     )
     point_columns: Mapping[str, Column] = {
         "epsilon": lambda point: epsilon_text(point.epsilon) or "own",
@@ -454,7 +454,7 @@ def _curve_claims(result: CurveResult) -> Iterator[Claim]:
             f"{point.already_wrong} are wrong as they are. "
             f"{searches}{views.NO_PROOF}"
         )
-        yield views.claim("measured", text, extent)
+        yield views.make_claim("measured", text, extent)
     for row in result.table:
         if row.average is not None:
             yield views.make_average_claim(row.average, row.object)
@@ -466,7 +466,7 @@ def _view_matrix(result: MatrixResult) -> ShownResult:
     figure = ResultPart(
         draw=lambda axes: _draw_matrix(result, axes),
         size=(2.6 + 1.3 * len(result.models), 1.8 + 0.5 * n_rows),
-        only="notebook",
+        only_medium="notebook",
     )
     models = ", ".join(
         f"{tested.model} ({' x '.join(map(str, tested.input_size))})"
@@ -524,11 +524,11 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     )
     return ResultPart(
         "Attacked on, tested on",
-        heads=heads,
+        column_heads=heads,
         rows=rows,
         note=note,
         parts=runs,
-        shares=rate_of_cell,
+        cell_fractions=rate_of_cell,
     )
 
 

@@ -116,8 +116,8 @@ def make_result(
             photographs; None without one.
     """
     problem = journal.problem
-    search = findings.search
-    run = journal.run
+    search = findings.search_result
+    run = journal.run_directory
     stages.progress.stage("making the pictures and the report")
     u = problem.domain.start  # without a search, the adversarial scene is the clean one
     if search is not None:
@@ -143,7 +143,7 @@ def make_result(
         drive=drive,
         printability=_summarize_printability(problem, findings) if printable else None,
         warnings=[*warnings, *_make_remarks(findings, problem, journal)],
-        seconds={**stages.seconds, "total": stages.total},
+        seconds={**stages.seconds, "total": stages.total_seconds},
         command_line=command_line,
         python_only=python_only,
         twins=_find_twins(twins, problem, object_name),
@@ -210,7 +210,7 @@ def _find_twins(
 
 def is_in_photograph(problem: Problem) -> bool:
     """Return whether the scene is rendered into a photograph."""
-    description, _ = problem.renderer.scene.definition
+    description, _ = problem.renderer.scene.description_and_filter
     return description.backdrop_photograph is not None
 
 
@@ -267,7 +267,7 @@ def _summarize(
     task = problem.task
     max_depth = problem.renderer.scene.max_depth
     adversarial_prediction = None
-    if findings.search is not None:
+    if findings.search_result is not None:
         adversarial_prediction = _make_prediction(
             adversarial.judgement, adversarial.trial
         )
@@ -275,15 +275,15 @@ def _summarize(
         **fields,
         **_summarize_controls(problem),
         **_summarize_verification(problem, findings),
-        **_summarize_search(problem, findings.search),
+        **_summarize_search(problem, findings.search_result),
         model=problem.model.name,
         task=task.title,
         environment=problem.environment,
         label_set=list(task.truth_names(problem.find_truth())),
-        goal=task.goal,
+        goal=task.success_description,
         target=list(task.target_names) or None,
         image_formation=Formation.from_values(problem.renderer.formation),
-        gradient_plan=problem.summarize_plan(problem.plan),
+        gradient_plan=problem.summarize_plan(problem.gradient_plan),
         light_path_segments=PathSegments(
             search=problem.search_depth or max_depth, verification=max_depth
         ),
@@ -295,7 +295,7 @@ def _summarize(
         smallest=_summarize_bracket(problem, findings),
         failures=describe_failures(problem, findings),
         transport=findings.transport_summary,
-        shared=SharedWork.of_facts(journal.evaluator.worker_stats, journal.machines),
+        shared=SharedWork.from_worker_stats(journal.evaluator.worker_stats, journal.machines),
         renders=_count_renders(findings, problem),
         seed=problem.seed,
     )
@@ -309,10 +309,10 @@ def _summarize_controls(problem: Problem) -> dict[str, Any]:
     return {
         "controls": [control.name for control in controls],
         "epsilon": _unwrap_single(
-            {control.name: control.budget.epsilon for control in controls}
+            {control.name: control.largest_group_budget.epsilon for control in controls}
         ),
         "norm": _unwrap_single(
-            {control.name: control.budget.norm for control in controls}
+            {control.name: control.largest_group_budget.norm for control in controls}
         ),
         "over": [control.name for control in random_controls],
         "conditions": _describe_conditions(problem),
@@ -390,7 +390,7 @@ def _find_ending(problem: Problem, findings: RunState) -> Ending:
         return findings.verification.ending
     if findings.clean_trials:
         counts = count_right(findings.clean_trials, findings.spp)
-        if problem.rule.is_already_wrong(counts):
+        if problem.verification_rule.is_already_wrong(counts):
             return Ending.ALREADY_WRONG
     return Ending.INTERRUPTED
 
@@ -435,11 +435,11 @@ def _make_clean_prediction(
 
 def _summarize_baseline(problem: Problem, findings: RunState) -> BaselineSearch | None:
     """Return the summary of the random search; None if there was none."""
-    if findings.baseline is None:
+    if findings.random_search_result is None:
         return None
     return BaselineSearch(
         policy="random",
-        renders=findings.baseline.renders * problem.n_draws,
+        renders=findings.random_search_result.renders * problem.conditions_per_evaluation,
         verified=_make_rate(findings.baseline_verification),
     )
 
@@ -449,7 +449,7 @@ def _summarize_ambient(findings: RunState) -> AmbientLight | None:
 
     None if that was not tried.
     """
-    if not findings.ambient_verifications:
+    if not findings.verification_by_lux:
         return None
     points = [
         AmbientPoint(
@@ -457,7 +457,7 @@ def _summarize_ambient(findings: RunState) -> AmbientLight | None:
             holds=verification.ending is Ending.FOUND,
             verified=make_verified_rate(verification),
         )
-        for lux, verification in sorted(findings.ambient_verifications.items())
+        for lux, verification in sorted(findings.verification_by_lux.items())
     ]
     # The first point always holds: it is the scene's own light, in which the scene was
     # verified. Points count up to the first that does not hold, whatever follows it.
@@ -491,8 +491,8 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
     # A score is the negative of a margin. It is negated as `0.0 - x`, since -x of 0.0
     # would be -0.0.
     return AverageCase(
-        configurations=right.trials,
-        correct=right.successes,
+        configurations=right.n_trials,
+        correct=right.n_successes,
         accuracy=right.rate,
         interval=right.interval,
         margin=0.0 - mean_number(scores),
@@ -506,26 +506,26 @@ def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon 
     The bounds of the bracket are factors of the budgets: `high` is the smallest at
     which a wrong prediction was found, and `low` the largest at which none was found.
     """
-    bracket = findings.bracket
+    bracket = findings.smallest_change_bracket
     if bracket is None:
         return None
 
     def scale_budgets(factor: float) -> dict[str, float]:
         """Return the epsilon of each control times a factor."""
         return {
-            control.name: factor * float(control.budget.epsilon or 0.0)
+            control.name: factor * float(control.largest_group_budget.epsilon or 0.0)
             for control in problem.searched_space.controls
         }
 
     has_found = bracket.u is not None
-    has_failed = bracket.low > 0.0  # 0 until a search fails
+    has_failed = bracket.largest_failing_scale > 0.0  # 0 until a search fails
     return SmallestEpsilon(
-        epsilon=scale_budgets(bracket.high) if has_found else None,
-        not_found_at=scale_budgets(bracket.low) if has_failed else None,
+        epsilon=scale_budgets(bracket.smallest_passing_scale) if has_found else None,
+        not_found_at=scale_budgets(bracket.largest_failing_scale) if has_failed else None,
         closed=bracket.is_closed,
         confirmed=bracket.confirmed,
         searches=bracket.searches,
-        checks=bracket.checks,
+        checks=bracket.n_checks,
     )
 
 
@@ -625,7 +625,7 @@ def _summarize_printability(problem: Problem, findings: RunState) -> Printabilit
 
     cost = None
     verification = findings.verification
-    unprinted = findings.unprinted
+    unprinted = findings.result_without_print_terms
     unprinted_verification = findings.unprinted_verification
     unprinted_terms = measure_terms(unprinted)
     if verification and unprinted_verification and unprinted and unprinted_terms:
@@ -641,7 +641,7 @@ def _summarize_printability(problem: Problem, findings: RunState) -> Printabilit
         )
     clean = measure_print_terms(problem.searched_space, problem.domain.start)
     return Printability(
-        clean=clean, adversarial=measure_terms(findings.search), cost=cost
+        clean=clean, adversarial=measure_terms(findings.search_result), cost=cost
     )
 
 
@@ -728,7 +728,7 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
     ranges: dict[str, VariedValue] = {}
     if problem.conditions is None:
         return ranges
-    start = problem.add_conditions(problem.domain.start)
+    start = problem.make_full_configuration(problem.domain.start)
     domain = make_domain(problem.space.controls)
     # Each parameter has a group in the space and a block in the domain. The group knows
     # its first coordinate, the block how many options a choice has (0 for a number).
@@ -738,7 +738,7 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
         if group.size != 1 or not is_random:
             continue
         described = list[Value]()
-        for coordinate in _list_described_coordinates(block.options):
+        for coordinate in _list_described_coordinates(block.n_options):
             u = start.clone()
             u[group.begin] = coordinate
             # None if the control does not describe this parameter
@@ -746,7 +746,7 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
             if value:
                 described.append(value)
         if described:
-            ranges[group.name] = _to_range(described, is_choice=bool(block.options))
+            ranges[group.name] = _to_range(described, is_choice=bool(block.n_options))
     return ranges
 
 
@@ -800,13 +800,13 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
-    counts["verification"] = findings.verification_renders + len(findings.first_look)
+    counts["verification"] = findings.verification_renders + len(findings.first_look_trials)
     # Searches by the kind of their queries. The kind `UNPRINTED` is a sentence; its
     # count has the shorter key "unprinted".
     searches = {
-        "search": findings.search,
-        "baseline": findings.baseline,
-        UNPRINTED: findings.unprinted,
+        "search": findings.search_result,
+        "baseline": findings.random_search_result,
+        UNPRINTED: findings.result_without_print_terms,
     }
     for kind, search in searches.items():
         if search is None:
@@ -814,8 +814,8 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
         n_predicted = 0
         if predictor:
             n_predicted_steps = predictor.count_predicted(kind, len(search.history))
-            n_predicted = n_predicted_steps * problem.n_draws
-        n_rendered = search.renders * problem.n_draws - n_predicted
+            n_predicted = n_predicted_steps * problem.conditions_per_evaluation
+        n_rendered = search.renders * problem.conditions_per_evaluation - n_predicted
         # A predicted image has its gradient without further renders.
         n_gradients = max(0, search.gradients - n_predicted)
         counts["products"] += n_predicted
@@ -848,12 +848,12 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
         remarks.append(_make_samples_remark(samples.spp, has_conditions=has_conditions))
     n_in_searches = sum(
         search.non_finite_elements
-        for search in (findings.search, findings.baseline)
+        for search in (findings.search_result, findings.random_search_result)
         if search is not None
     )
     # The renderer counts those of rendered searches, too, so that the two counts
     # overlap: the larger one is stated, not the sum.
-    n_non_finite = max(problem.renderer.non_finite, n_in_searches)
+    n_non_finite = max(problem.renderer.n_non_finite, n_in_searches)
     if n_non_finite:
         remarks.append(
             f"{n_non_finite} values of pictures or gradients were not finite "
@@ -891,7 +891,7 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
         problem: problem of the attack.
         findings: findings of the attack, with the verifications of the first failures.
     """
-    known = findings.search.failures if findings.search else None
+    known = findings.search_result.failures if findings.search_result else None
     if known is None:
         return None
     verifications = findings.failure_verifications
@@ -906,7 +906,7 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     # A policy may divide the space of some parameters into cells, and count in cells.
     # `over` has the columns of u that span the cells.
     return DifferentFailures(
-        over=[problem.domain.names[column] for column in known.over],
+        over=[problem.domain.element_names[column] for column in known.cell_parameter_indices],
         found=known.n_failures,
         examined=known.n_visited,
         cells=known.n_cells,
@@ -979,13 +979,13 @@ def _describe_failure_ranges(
         values = list[Any]()
         for bound in bounds:
             u = failure.u.clone()
-            is_choice = bool(block.options)
+            is_choice = bool(block.n_options)
             if not is_choice:  # a choice stays as the failure has it
                 u[column] = bound
             described = problem.describe(u).get(block.name)
             values.append(bound if described is None else described["value"])
         option_names = [value for value in values if isinstance(value, str)]
-        name = problem.domain.names[column]
+        name = problem.domain.element_names[column]
         if option_names:
             ranges[name] = option_names[0]
         elif block.size == 1:

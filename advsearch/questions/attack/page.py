@@ -259,7 +259,7 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
     has_all_columns = len(columns) == len(heads)
     return ResultPart(
         "What was changed" if rows else "",
-        heads=[heads[column] for column in columns],
+        column_heads=[heads[column] for column in columns],
         rows=[[row[column] for column in columns] for row in rows],
         bars=bars if has_all_columns else (),  # type: ignore[arg-type]
     )
@@ -369,7 +369,7 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
     return replace(
         table,
         title="Verified rates",
-        heads=put_rate_first(table.heads),
+        column_heads=put_rate_first(table.column_heads),
         rows=[put_rate_first(row) for row in table.rows],
         bars=bars,
         note=note,
@@ -400,7 +400,7 @@ def _search_part(
     zero_means = ""
     if summary.objective in words.SUCCESS_ABOVE_ZERO:
         # With the setting `minimise` the search seeks a right prediction.
-        above = "right" if summary.minimises else wording.success_name(summary)
+        above = "right" if summary.minimises else wording.format_success_word(summary)
         zero_means = f"above: {above}"
     label = words.format_objective(summary.objective)
     return ResultPart(

@@ -17,13 +17,13 @@ from advsearch.config import SceneConfig
 from advsearch.engine import judging, loading, naming
 from advsearch.engine.judging import Metric
 from advsearch.engine.loading import Controls, Scene
-from advsearch.engine.naming import AnyModel, get_model_name, list_models
+from advsearch.engine.naming import AnyModel, get_model_name, to_model_list
 from advsearch.errors import InputError
-from advsearch.options import describe_value, to_setting
+from advsearch.options import describe_value, convert_to_setting
 from advsearch.progress import ProgressOption, as_progress
 from advsearch.questions.attack.carry_out import (
     AttackParts,
-    is_named,
+    is_describable_by_setting,
     load_ensemble,
     make_attack_controls,
     make_task_and_objective,
@@ -205,7 +205,7 @@ def _check_can_use_workers(
     """
     objects = [
         value
-        for value in (scene, *list_models(model))
+        for value in (scene, *to_model_list(model))
         if not isinstance(value, (str, Path))
     ]
     has_functions = callable(objective) or isinstance(task, FunctionTask)
@@ -244,12 +244,12 @@ def _make_config(
     objective_name = _name_objective(objective) if callable(objective) else objective
     described = {
         **loading.scene_to_settings(scene),
-        "model": ",".join(map(get_model_name, list_models(model))),
+        "model": ",".join(map(get_model_name, to_model_list(model))),
         "controls": loading.controls_to_settings(controls),
         "over": loading.controls_to_settings(over),
-        "task": to_setting(task) if isinstance(task, Task) else task,
+        "task": convert_to_setting(task) if isinstance(task, Task) else task,
         "objective": objective_name,
-        "policy": to_setting(policy) if isinstance(policy, Policy) else policy,
+        "policy": convert_to_setting(policy) if isinstance(policy, Policy) else policy,
         "metrics": judging.metrics_to_settings(metrics or {}),
     }
     if options.get("exposure"):  # this setting replaces the exposure of the scene
@@ -298,16 +298,16 @@ def _find_python_only(
     """
     parts = [
         PythonOnly("model", get_model_name(network))
-        for network in list_models(model)
+        for network in to_model_list(model)
         if naming.is_session_only(network)
     ]
     if scene.is_session_only:
         parts.append(PythonOnly("scene"))
-    if isinstance(task, Task) and not is_named(task, make_task):
+    if isinstance(task, Task) and not is_describable_by_setting(task, make_task):
         parts.append(PythonOnly("task", task.name))
     if callable(objective):
         parts.append(PythonOnly("objective", _name_objective(objective)))
-    if isinstance(policy, Policy) and not is_named(policy, _make_policy):
+    if isinstance(policy, Policy) and not is_describable_by_setting(policy, _make_policy):
         parts.append(PythonOnly("policy", policy.name))
     parts += [PythonOnly("control", name) for name in session_controls]
     parts += [

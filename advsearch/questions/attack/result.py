@@ -293,7 +293,7 @@ class AttackResult:
     def __repr__(self) -> str:
         summary = self.summary
         run = None if self.run is None else str(self.run)
-        verified = f", verified {summary.brief}" if summary.verified else ""
+        verified = f", verified {summary.outcome_summary}" if summary.verified else ""
         controls = ",".join(summary.controls)
         return (
             f"AttackResult({summary.object!r}, {controls!r}, "
@@ -348,17 +348,17 @@ class StoredImage:
                 the conditions.
         """
         if trial is None:
-            seed = seeds.stream(problem.seed, "pictures")
-            configuration = problem.add_conditions(u, None)
+            seed = seeds.derive_seed(problem.seed, "pictures")
+            configuration = problem.make_full_configuration(u, None)
             spp = UNTRIED_SPP
         else:
-            seed = seeds.stream(problem.seed, "verification", trial)
-            configuration = problem.add_conditions(u, seed)
+            seed = seeds.derive_seed(problem.seed, "verification", trial)
+            configuration = problem.make_full_configuration(u, seed)
             spp = findings.spp
         renderer = problem.renderer
         with torch.no_grad(), renderer.share_paths(problem.shared_paths):
             radiance = renderer.radiance(configuration, seed, spp)
-            display = renderer.formation.display(radiance)
+            display = renderer.formation.map_to_display(radiance)
             image = round_to_8_bit(problem.space.apply_to_image(configuration, display))
         return cls(
             full_configuration=configuration,
@@ -394,7 +394,7 @@ def choose_stored_trial(findings: RunState) -> int | None:
     ranks = list[tuple[bool, bool, bool]]()
     for label, outcome, clean_label in zip(
         _list_labels(verification.adversarial_trials),
-        verification.outcomes,
+        verification.trial_successes,
         clean_labels,
         strict=False,  # trials of one scene may have ended earlier
     ):
@@ -451,14 +451,14 @@ def save_images(
                 name=f"verification-{number:02d}",
                 u=verification.u,
             )
-    if findings.frames:
+    if findings.search_frames:
         last_frame = scene_images["adversarial"].image
-        if problem.conditions is not None and findings.search is not None:
+        if problem.conditions is not None and findings.search_result is not None:
             # That image may have the conditions of a trial. Frames of the search have
             # the start values of the conditions, and so must the last one.
-            u = problem.domain.project(findings.search.best_u)
+            u = problem.domain.project(findings.search_result.best_u)
             last_frame = StoredImage.render(problem, findings, u, None).image
-        run.save_animation("search", [*findings.frames, last_frame.numpy()])
+        run.save_animation("search", [*findings.search_frames, last_frame.numpy()])
 
 
 def _save_scene_image(
@@ -480,7 +480,7 @@ def _save_scene_image(
     marks = problem.find_marks(image.image, image.full_configuration)
     save_with_marks(run, name, image.image, marks)
     if problem.aovs:
-        surfaces = problem.renderer.surfaces(image.full_configuration)
+        surfaces = problem.renderer.find_surfaces(image.full_configuration)
         layers = surfaces.make_layers(problem.aovs, OBJECT)
         notes = surfaces.describe_layers(problem.aovs)
         files.write_layers(run.path / IMAGES / f"{name}.aov.exr", layers, notes)
@@ -507,13 +507,13 @@ def save_trial(
     """
     _, number = trial
     # Trials of the same number have the same seed in verifications of every kind.
-    seed = seeds.stream(problem.seed, "verification", number)
+    seed = seeds.derive_seed(problem.seed, "verification", number)
     image = findings.trial_images.get(trial)
     if image is None:
         image = problem.picture(u, seed, findings.spp)
     run.save_image(name, image)
     save_with_marks(
-        run, name, image, problem.find_marks(image, problem.add_conditions(u, seed))
+        run, name, image, problem.find_marks(image, problem.make_full_configuration(u, seed))
     )
 
 
@@ -592,8 +592,8 @@ def _describe_simplified(simplified: Sequence[Any]) -> str:
 def _assemble(problem: Problem, u: Tensor) -> Mapping[str, Tensor]:
     """Return the inputs of the scene for a configuration (d,): tensors by name."""
     with torch.no_grad():
-        inputs = problem.space.inputs(problem.add_conditions(u))
-        return problem.renderer.scene.assembly(inputs)
+        inputs = problem.space.inputs(problem.make_full_configuration(u))
+        return problem.renderer.scene.input_assembler(inputs)
 
 
 def _select_near(shapes: Mapping[str, Shape]) -> list[Shape]:
@@ -680,7 +680,7 @@ def _find_path(problem: Problem) -> tuple[Any, int]:
         # A time that a setting fixes has no coordinate.
         has_random_time = any(
             slot.parameter.name == "time" and slot.n_coordinates > 0
-            for slot in control.slots
+            for slot in control.parameter_slots
         )
         if control.travels and has_random_time:
             return control, column
@@ -702,7 +702,7 @@ def _make_frames(
         The names, empty if there is a single path; and (paths * FRAMES, d), the frames
         of one path after those of the other.
     """
-    start = problem.add_conditions(problem.domain.start)
+    start = problem.make_full_configuration(problem.domain.start)
     # A path with a weight comes several times among the choices.
     choices = _list_path_choices(path)
     names = list(dict.fromkeys(choices))
@@ -749,7 +749,7 @@ def _render_frames(
     images = list[npt.NDArray[np.float32]]()
     n_right = 0
     for number, configuration in enumerate(frames):
-        seed = seeds.stream(problem.seed, "drive", number)
+        seed = seeds.derive_seed(problem.seed, "drive", number)
         with torch.no_grad():
             image = round_to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
         is_right, marks = problem.predict_with_marks(image, configuration)

@@ -26,7 +26,7 @@ from advsearch.engine.record import RunState
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import Verifier, choose_ladder
 from advsearch.errors import InputError
-from advsearch.interrupts import interruptible
+from advsearch.interrupts import reraise_lost_interrupt
 from advsearch.models import Model, RemoteNetwork
 from advsearch.progress import NullProgress, Progress, Stages
 from advsearch.questions.attack.carry_out import (
@@ -186,7 +186,7 @@ def _report_search_size(
         progress.message(
             "One configuration for many conditions: "
             f"{format_count(problem.steps, 'step')}, each over "
-            f"{format_count(problem.n_draws, 'condition')}; `steps` and `draws` change "
+            f"{format_count(problem.conditions_per_evaluation, 'condition')}; `steps` and `draws` change "
             "that."
         )
 
@@ -282,18 +282,18 @@ def search_and_verify(
             search.
     """
     problem = journal.problem
-    first_spp = problem.spp  # `plan_renders` may choose another one for the search
+    first_spp = problem.search_spp  # `plan_renders` may choose another one for the search
     findings = RunState()
     looks = _choose_looks(problem, trials)
     verifier = Verifier(journal, ladder, stages, findings, looks)
     searches = Searches(
-        journal, stages, findings, printable=printable, close_looks=close_looks
+        journal, stages, findings, printable=printable, max_extra_repeats=close_looks
     )
     if smallest:
         # only a check: raises if there is no budget, before anything is rendered
         scale_domain(problem.domain, 1.0)
     try:
-        with interruptible():
+        with reraise_lost_interrupt():
             plan_renders(
                 policy,
                 journal,
@@ -303,7 +303,7 @@ def search_and_verify(
                 deterministic=deterministic,
                 chooses_spp=chooses_spp,
             )
-            findings.first_look = evaluate_clean_scene(journal, stages, first_spp)
+            findings.first_look_trials = evaluate_clean_scene(journal, stages, first_spp)
             if not is_already_wrong(verifier, in_any_case=smallest):
                 findings.predictor = choose_predictor(
                     policy,
@@ -359,37 +359,37 @@ def search_with_baselines(
         baseline: whether a random search is made.
     """
     problem = searches.problem
-    findings = searches.findings
+    findings = searches.run_state
     steps = problem.steps
-    searches.start(
+    searches.begin_stage(
         "search",
         f"searching with {policy.name}",
         steps,
         "`steps` or `seconds` shorten it",
     )
-    findings.search = searches.search(
-        "search", policy, steps, problem.seed, frames=findings.frames, seconds=seconds
+    findings.search_result = searches.run_search(
+        "search", policy, steps, problem.seed, frames=findings.search_frames, seconds=seconds
     )
     if seconds is not None:
         # The other searches get as many steps as the first one had renders for its steps
         # within the time. `history` lacks the ranking that follows the steps.
-        history = findings.search.history
+        history = findings.search_result.history
         steps = max(1, history[-1].renders) if history else 1
     if searches.printable:
         title = "searching without print terms, to see what they cost"
-        searches.start(
+        searches.begin_stage(
             "without print terms", title, steps, "`printable=false` leaves both out"
         )
-        findings.unprinted = searches.search(UNPRINTED, policy, steps, problem.seed)
+        findings.result_without_print_terms = searches.run_search(UNPRINTED, policy, steps, problem.seed)
     if baseline and policy.name != "random":
-        searches.start(
+        searches.begin_stage(
             "baseline",
             "searching at random, to compare",
             steps,
             "`baseline=false` leaves it out",
         )
-        seed = seeds.stream(problem.seed, "baseline")
-        findings.baseline = searches.search(
+        seed = seeds.derive_seed(problem.seed, "baseline")
+        findings.random_search_result = searches.run_search(
             "baseline", make_policy("random"), steps, seed
         )
 

@@ -13,8 +13,8 @@ from advsearch.config import (
     DerivativeConfig,
     RenderConfig,
     SceneConfig,
-    get_name,
-    read_named,
+    get_name_without_options,
+    parse_name_with_options,
 )
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, setting, setting_as_in, split_names
@@ -369,7 +369,7 @@ class AttackConfig(DerivativeConfig):
         among them: ``{name: pgd, steps: 80, momentum: 0.9}`` sets `steps`, too.
         """
         # Options without a name are those of "auto".
-        read_policy = partial(read_named, setting="policy", default_name="auto")
+        read_policy = partial(parse_name_with_options, setting="policy", default_name="auto")
         policy = read_policy(data.get("policy"))
         if policy is None:  # the setting is missing
             return data
@@ -385,7 +385,7 @@ class AttackConfig(DerivativeConfig):
     @property
     def policy_name(self) -> str:
         """Name of the policy."""
-        return get_name(self.policy)
+        return get_name_without_options(self.policy)
 
     @property
     def policy_options(self) -> JsonObject:

@@ -105,8 +105,8 @@ def plan_renders(
     problem = journal.problem
     stored = journal.get_note(PLAN_NOTE)
     if stored is not None:  # of a run that is continued
-        problem.plan = problem.plan.restore(stored["plan"])
-        problem.spp = stored["spp"]
+        problem.gradient_plan = problem.gradient_plan.restore(stored["plan"])
+        problem.search_spp = stored["spp"]
         problem.search_depth = stored["search_depth"]
         return
     is_full = measure == "full"
@@ -129,8 +129,8 @@ def plan_renders(
                 chooses_spp=chooses_spp,
             )
     choice = {
-        "plan": problem.plan.to_dict(),
-        "spp": problem.spp,
+        "plan": problem.gradient_plan.to_dict(),
+        "spp": problem.search_spp,
         "search_depth": problem.search_depth,
     }
     journal.set_note(PLAN_NOTE, choice)
@@ -177,31 +177,31 @@ def _measure_gradients(
     progress = stages.progress
     # A quick measurement is too short to measure times: it counts renders.
     counts_renders = not full or deterministic
-    seed = seeds.stream(problem.seed, "measure")
+    seed = seeds.derive_seed(problem.seed, "measure")
     bench = Bench(
         renderer,
         problem.compute_loss,
         find_interior_point(renderer),
         seed,
-        problem.spp,
+        problem.search_spp,
         tick=lambda samples: progress.advance(1),
     )
     n_gradients = planning.count_plan_gradients(renderer.plan, with_all=full)
     if n_gradients:
         hint = (
-            f"{n_gradients} gradients of {format_count(problem.spp, 'sample')} a "
+            f"{n_gradients} gradients of {format_count(problem.search_spp, 'sample')} a "
             "pixel; `measure=no` leaves it out"
         )
         stages.begin(
             "setup", "measuring which gradients are best here", n_gradients, hint=hint
         )
-    problem.plan = planning.choose_estimators(
+    problem.gradient_plan = planning.choose_estimators(
         bench, with_all=full, count_renders=counts_renders
     )
     if full:
         spp = _choose_gradient_steps(problem, bench, stages)
         if chooses_spp and spp is not None:
-            problem.spp = spp
+            problem.search_spp = spp
 
 
 def _choose_gradient_steps(
@@ -218,7 +218,7 @@ def _choose_gradient_steps(
         The samples per pixel that suffice for gradients; None if that is not known.
     """
     # The measurement compares gradients by their cosine; its cost is in samples.
-    samples = planning.count_cosine_samples(problem.plan)
+    samples = planning.count_cosine_samples(problem.gradient_plan)
     stages.begin(
         "setup",
         "choosing step and samples of gradients",
@@ -228,7 +228,7 @@ def _choose_gradient_steps(
     )
     measured = replace(bench, tick=stages.progress.advance)
     table = list(planning.measure_cosines(measured))
-    problem.plan, spp = planning.choose_steps(problem.plan, table)
+    problem.gradient_plan, spp = planning.choose_steps(problem.gradient_plan, table)
     return spp
 
 
@@ -243,7 +243,7 @@ def evaluate_clean_scene(
         spp: samples per pixel.
     """
     problem = journal.problem
-    seed = seeds.stream(problem.seed, "first look")
+    seed = seeds.derive_seed(problem.seed, "first look")
     start = problem.domain.start
     hint = "the first picture compiles the renderer's code"
     stages.begin("setup", "looking at the clean scene", N_FIRST_LOOKS, hint=hint)
@@ -270,17 +270,17 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
         in_any_case: whether the trials are made even if the model was right once.
     """
     problem = verifier.problem
-    findings = verifier.state
-    if not problem.rule.has_control:
+    findings = verifier.run_state
+    if not problem.verification_rule.has_control:
         return False
-    was_right_once = any(trial.right for trial in findings.first_look)
+    was_right_once = any(trial.right for trial in findings.first_look_trials)
     if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    min_trials = verifier.looks[0]  # trials after which a verdict is first possible
+    min_trials = verifier.look_sizes[0]  # trials after which a verdict is first possible
     verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
-    verifier.try_clean()
-    return problem.rule.is_already_wrong(
+    verifier.run_clean_trials()
+    return problem.verification_rule.is_already_wrong(
         count_right(findings.clean_trials, findings.spp)
     )
 
@@ -420,7 +420,7 @@ def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
         f"from here on the search {predictor.what_it_renders} (counted in samples a "
         "pixel); `specialise=false` leaves it out"
     )
-    stages.begin("transport", predictor.title, predictor.n_samples, hint=hint)
+    stages.begin("transport", predictor.title, predictor.preparation_spp, hint=hint)
     try:
         predictor.prepare(stages.progress.advance)
     except TransportTooLargeError as error:
@@ -443,23 +443,23 @@ class Searches:
     Attributes:
         journal: replays stored evaluations, and stores the others.
         stages: reports the progress.
-        findings: findings so far; their `predictor` predicts images.
+        run_state: findings so far; their `predictor` predicts images.
         printable: whether objectives include print terms.
-        close_looks: largest number of further renders of candidates that are close to
+        max_extra_repeats: largest number of further renders of candidates that are close to
             the best.
     """
 
     journal: Journal
     stages: Stages
-    findings: RunState
+    run_state: RunState
     printable: bool = False
-    close_looks: int = 0
+    max_extra_repeats: int = 0
 
     @property
     def problem(self) -> Problem:
         return self.journal.problem
 
-    def start(self, name: str, title: str, steps: int, shorter: str) -> None:
+    def begin_stage(self, name: str, title: str, steps: int, shorter: str) -> None:
         """Begin the stage of a search.
 
         Args:
@@ -468,10 +468,10 @@ class Searches:
             steps: steps of the search.
             shorter: sentence about the settings that shorten it.
         """
-        n_renders = count_planned_renders(steps, max_extra_repeats=self.close_looks)
-        samples = format_count(self.problem.spp, "sample")
+        n_renders = count_planned_renders(steps, max_extra_repeats=self.max_extra_repeats)
+        samples = format_count(self.problem.search_spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
-        predictor = self.findings.predictor
+        predictor = self.run_state.predictor
         # For the hint, a search is predicted if the main search ("search") is.
         if predictor is not None and predictor.count_predicted("search", steps):
             # A search ends with a ranking of the best configurations, always rendered.
@@ -490,16 +490,16 @@ class Searches:
             domain: domain to search.
             policy: policy that searches it.
         """
-        predictor = self.findings.predictor
+        predictor = self.run_state.predictor
         if predictor is None:
-            return replace(domain, exact=False, draws_conditions=False)
+            return replace(domain, is_noise_free=False, draws_conditions=False)
         return replace(
             domain,
-            exact=predictor.is_exact,
+            is_noise_free=predictor.is_exact,
             draws_conditions=predictor.draws_conditions and policy.uses_gradient,
         )
 
-    def search(
+    def run_search(
         self,
         kind: str,
         policy: Policy[Any],
@@ -536,7 +536,7 @@ class Searches:
             steps=steps,
             seed=seed,
             candidates=N_RANKED if ranked else 0,
-            max_extra_repeats=self.close_looks,
+            max_extra_repeats=self.max_extra_repeats,
             is_out_of_time=self.journal.make_time_check(kind, seconds),
             on_step=self._make_step_report(frames),
             kind=kind,
@@ -545,8 +545,8 @@ class Searches:
         if result.ending is Ending.INTERRUPTED:
             # The first search is the main one. The result of a later search that was
             # interrupted is dropped.
-            if self.findings.search is None:
-                self.findings.search = result
+            if self.run_state.search_result is None:
+                self.run_state.search_result = result
             raise KeyboardInterrupt
         return result
 
@@ -563,12 +563,12 @@ class Searches:
                 evenly spaced steps.
         """
         frame_interval = max(1, math.ceil(steps / MAX_FRAMES))
-        predictor = self.findings.predictor
+        predictor = self.run_state.predictor
 
         def request_image(query: Query) -> Query:
             """Return the query, with a request for an image if its step has one."""
-            is_due = query.phase == "search" and query.index % frame_interval == 0
-            return replace(query, with_image=is_due)
+            is_due = query.phase == "search" and query.row_index % frame_interval == 0
+            return replace(query, includes_image=is_due)
 
         def ignore_replay(query: Query) -> None:
             """Do nothing: rendering has no state that stored evaluations change."""
@@ -617,7 +617,7 @@ class Searches:
             queries: queries of a single phase, "search" or "ranking".
         """
         evaluate_rendered = self.journal.evaluator
-        predictor = self.findings.predictor
+        predictor = self.run_state.predictor
         if predictor is None or not queries:
             evaluations = evaluate_rendered(queries)
         elif queries[0].phase == "ranking":
@@ -646,10 +646,10 @@ def _choose_verification_samples(
     """
     problem = verifier.problem
     n_images = sum(
-        (result.renders + result.gradients) * problem.n_draws for result in results
+        (result.renders + result.gradients) * problem.conditions_per_evaluation for result in results
     )
     configurations = {"adversarial": adversarial, "clean": problem.domain.start}
-    verifier.choose_spp(configurations, search_samples=n_images * problem.spp)
+    verifier.choose_spp(configurations, search_samples=n_images * problem.search_spp)
 
 
 def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
@@ -668,10 +668,10 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         verifier: verifier of the attack, whose state gets the results.
         is_smallest: whether the smallest change was searched.
     """
-    findings = verifier.state
-    candidate = findings.search
-    baseline = findings.baseline
-    unprinted = findings.unprinted
+    findings = verifier.run_state
+    candidate = findings.search_result
+    baseline = findings.random_search_result
+    unprinted = findings.result_without_print_terms
     if candidate is None:
         raise RuntimeError("nothing was searched, so there is nothing to verify")
     adversarial = verifier.problem.domain.project(candidate.best_u)
@@ -691,13 +691,13 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         n_groups * verifier.n_trials,
         at_most=True,
     )
-    verifier.try_clean()
+    verifier.run_clean_trials()
     findings.verification = verifier.verify("verification", candidate)
     if findings.verification.ending is Ending.ALREADY_WRONG:
         # The clean scene is wrong at the sample count of the verification, which is
         # another one than in the search. So no change is needed at all, and bounds of
         # the smallest one (the bracket) mean nothing.
-        findings.bracket = None
+        findings.smallest_change_bracket = None
     if unprinted is not None:
         findings.unprinted_verification = verifier.verify(
             "unprinted verification", unprinted
@@ -732,7 +732,7 @@ def _replace_if_random_is_worse(
         result: result of the policy's search.
         baseline: result of the random search.
     """
-    findings = verifier.state
+    findings = verifier.run_state
     policy_verification = findings.verification
     random = findings.baseline_verification
     if policy_verification is None or random is None:
@@ -749,7 +749,7 @@ def _replace_if_random_is_worse(
     if _rank(random) > _rank(policy_verification):
         findings.outdone_verification = policy_verification
         findings.verification = random
-        findings.search = replace(
+        findings.search_result = replace(
             result,
             best_u=baseline.best_u,
             best_objective=baseline.best_objective,
@@ -782,9 +782,9 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         verifier: verifier that tries what was found.
     """
     problem = searches.problem
-    findings = searches.findings
+    findings = searches.run_state
     n_trials = verifier.n_trials
-    max_failures = problem.rule.count_allowed_failures(n_trials)
+    max_failures = problem.verification_rule.count_allowed_failures(n_trials)
     results: list[SearchResult] = []
     # A matrix of light transport predicts scores without noise. It estimates which
     # configurations are likely to pass, and learns from the trials how far it is off.
@@ -800,8 +800,8 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         results.append(result)
         # The first result is that of the attack until a configuration passes a check:
         # the attack may be interrupted before.
-        if findings.search is None:
-            findings.search = result
+        if findings.search_result is None:
+            findings.search_result = result
         verifier.begin_stage(
             "trying smaller changes", MAX_CHECKS * n_trials, at_most=True
         )
@@ -818,19 +818,19 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         if transport is not None:
             transport.update_score_bias(u, scores)
         if has_passed:
-            findings.search = replace(results[-1], best_u=u)
+            findings.search_result = replace(results[-1], best_u=u)
         return has_passed
 
     def passes_short_check(u: Tensor, check_index: int) -> bool:
         """Return whether a configuration (d,) passes a check that may end early."""
-        return passes_check(u, check_index, min_trials=problem.rule.min_trials)
+        return passes_check(u, check_index, min_trials=problem.verification_rule.min_trials)
 
     bracket = find_smallest_change(
         search_inside, passes_short_check, problem.domain, likely=is_likely
     )
     bracket = _confirm(bracket, passes_check, verifier, problem.domain)
-    findings.bracket = bracket
-    findings.search = _combine_results(results, bracket)
+    findings.smallest_change_bracket = bracket
+    findings.search_result = _combine_results(results, bracket)
 
 
 def _search_budget(
@@ -846,18 +846,18 @@ def _search_budget(
     """
     problem = searches.problem
     title = f"search {number + 1} of at most {MAX_SEARCHES}"
-    searches.start("search", title, problem.steps, "`steps` shortens each search")
+    searches.begin_stage("search", title, problem.steps, "`steps` shortens each search")
     # The first search has the kind "search", as the main search of every attack has.
     is_first = number == 0
     kind = "search" if is_first else f"search {number}"
     # The ranking renders the best configurations again. It is not needed with a matrix
     # of light transport (`Transport`), which predicts them without noise.
-    has_noise = not isinstance(searches.findings.predictor, Transport)
-    return searches.search(
+    has_noise = not isinstance(searches.run_state.predictor, Transport)
+    return searches.run_search(
         kind,
         policy,
         problem.steps,
-        seeds.stream(problem.seed, "smallest", number),
+        seeds.derive_seed(problem.seed, "smallest", number),
         domain=domain,
         ranked=has_noise,
     )
@@ -976,10 +976,10 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
         result: result of the search.
     """
     problem = verifier.problem
-    findings = verifier.state
+    findings = verifier.run_state
     known = result.failures
-    rule = problem.rule
-    if known is None or not known.examples or rule.is_conditional:
+    rule = problem.verification_rule
+    if known is None or not known.examples or rule.has_varying_conditions:
         return
     # If the model is wrong about the clean scene, a failure proves nothing. `spp` is
     # only recorded in the counts, and does not matter here.

@@ -80,13 +80,13 @@ class StudyAttack:
     Attributes:
         config: settings of the attack.
         name: name of its directory.
-        subject: the object, in a curve; the attacked model, in a matrix.
+        object_or_model: the object, in a curve; the attacked model, in a matrix.
         epsilon: epsilon of a curve; None in a matrix, or if each control has its own.
     """
 
     config: AttackConfig
     name: str
-    subject: str
+    object_or_model: str
     epsilon: float | None = None
 
 
@@ -218,15 +218,15 @@ def distribute_attacks(
         "advsearch.questions.attack.studies:make_chain_worker",
         worker_settings,
         FILES,
-        config.used_threads or 1,
-        seconds=MAX_ATTACK_SECONDS,
+        config.n_used_threads or 1,
+        min_timeout_seconds=MAX_ATTACK_SECONDS,
     )
     with open_workers(
         work,
         # without work no workers are started
         workers=config.workers if missing_chains else None,
         cluster=config.cluster if missing_chains else None,
-        tell=progress.message,
+        report_message=progress.message,
     ) as executor:
         if executor is None:  # none are requested: this process makes the attacks
             return
@@ -246,13 +246,13 @@ def _check_not_lost(chains: Sequence[Chain], result: BatchResult) -> None:
 
     The chain is named by its object, and in a matrix also by the attacked model.
     """
-    if result.lost:
+    if result.failure_reason:
         (chain_index,) = result.items
         first_attack = chains[chain_index][0]  # all have the same object and model
         title = first_attack.config.object
         if first_attack.subject != title:
             title += f" with {first_attack.subject}"
-        raise ClusterError(f"{title}: {result.lost}; leave it out, or go on without it")
+        raise ClusterError(f"{title}: {result.failure_reason}; leave it out, or go on without it")
 
 
 def _write_part(
@@ -421,7 +421,7 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
         The row of the last attack, with the renders of all. After an interrupt before
         the first attack, it has the object's name alone.
     """
-    row = ObjectRow(object=chain[0].subject, clean=None, flips_at=None)
+    row = ObjectRow(object=chain[0].object_or_model, clean=None, flips_at=None)
     clean = CleanMatrix()
     renders: Counter[str] = Counter()
     for attack in chain:
@@ -435,7 +435,7 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
         if summary.verified is not None:
             margin = summary.verified.margin
         row = ObjectRow(
-            object=attack.subject,
+            object=attack.object_or_model,
             clean=summary.clean.control,
             ending=summary.ending,
             epsilon=epsilon,
@@ -470,7 +470,7 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
         return True
     if row.clean is None:
         return False
-    min_correct = WORST_CASE.count_needed(row.clean.trials)
+    min_correct = WORST_CASE.count_needed_successes(row.clean.trials)
     if row.clean.correct < min_correct:
         return False
     return epsilon is None or (row.tried is not None and row.tried >= epsilon)
@@ -549,7 +549,7 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     for (attack,) in study.chains:  # a chain of a matrix is a single attack
         summary = study.run_attack(attack)
         if summary is not None:  # None: not made, after an interrupt
-            attacked[attack.subject] = summary
+            attacked[attack.object_or_model] = summary
     # `_try_on_models` fills these: an interrupt leaves what was done before it
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
@@ -626,7 +626,7 @@ def _try_on_models(
             study.run,
             study.progress,
             trials=config.trial_count,
-            seed=seeds.stream(config.seed, "matrix"),
+            seed=seeds.derive_seed(config.seed, "matrix"),
             executor=executor,
         )
         n_predictions = config.trial_count * len(names)
@@ -663,7 +663,7 @@ def _try_clean(retrials: Retrials, condition: RetrialCondition) -> MatrixModel:
         labels=list(problem.task.truth_names(problem.find_truth())),
         input_size=problem.renderer.formation.resolution,
         spp=condition.spp,
-        clean=make_control_group(retrials.try_clean(condition), condition.spp),
+        clean=make_control_group(retrials.run_clean_trials(condition), condition.spp),
     )
 
 

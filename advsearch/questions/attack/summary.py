@@ -458,7 +458,7 @@ class AttackSummary(SceneResult):
         return self.goal == "a right answer"
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """The verified rate, or the prediction that is not verified yet."""
         if self.verified is None:
             if self.is_unfinished and self.adversarial:
@@ -581,7 +581,7 @@ class MatrixResult(InNotebook, StudyResult):
     table: list[MatrixRow]
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """How many adversarial scenes hold on models that they were not searched on."""
         endings = list[str]()
         for row in self.table:

@@ -206,7 +206,7 @@ def _baseline_remark(summary: AttackSummary) -> str:
     return f"{text} as well: {successes}. The policy adds nothing here."
 
 
-def success_name(summary: AttackSummary) -> str:
+def format_success_word(summary: AttackSummary) -> str:
     """Return a word for the predictions that count as a success, such as "wrong"."""
     if summary.target:
         return "target"

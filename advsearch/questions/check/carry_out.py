@@ -137,7 +137,7 @@ class GradientCheck:
 
     def run(self) -> CheckResult:
         """Measure all parts, as far as the time allows, and return the result."""
-        return self.measurements.collect(self._measure_parts(), self._make_result)
+        return self.measurements.make_result_of_rows(self._measure_parts(), self._make_result)
 
     def _make_result(self, findings: list[Finding]) -> CheckResult:
         """Return the result of what is measured so far."""
@@ -164,7 +164,7 @@ class GradientCheck:
     def _measure_parts(self) -> Iterator[Finding]:
         """Yield what is stored of each part, or else measure it."""
         for part in self.parts:
-            stored = self.measurements.read(part.key)
+            stored = self.measurements.read_stored(part.key)
             if stored is not None:  # measured before: nothing is loaded
                 yield from FINDINGS.validate_python(stored)
             else:
@@ -248,7 +248,7 @@ class GradientCheck:
         config = part.config
         problem, _ = workbench.problem_from_config(config)
         renderer = problem.renderer
-        bench = self._make_bench(part, renderer, problem.compute_loss, problem.spp)
+        bench = self._make_bench(part, renderer, problem.compute_loss, problem.search_spp)
 
         renderer.plan = self._choose_plan(title, bench, config)
 
@@ -258,7 +258,7 @@ class GradientCheck:
             rows.append(row)
             yield part.make_row(row)
         renderer.plan, tuned_spp = planning.choose_steps(renderer.plan, rows)
-        spp = tuned_spp or problem.spp
+        spp = tuned_spp or problem.search_spp
 
         if not config.all:
             yield from self._plan_search(problem, part, spp)
@@ -281,7 +281,7 @@ class GradientCheck:
         n_gradients = planning.count_plan_gradients(bench.renderer.plan)
         stage_title = f"{title}: comparing ways to differentiate"
         self.progress.stage(stage_title, n_gradients, hint=HINT)
-        measure_bench = replace(bench, seed=seeds.stream(config.seed, "measure"))
+        measure_bench = replace(bench, seed=seeds.derive_seed(config.seed, "measure"))
         return planning.choose_estimators(measure_bench, count_renders=True)
 
     def _measure_cosines(
@@ -300,9 +300,9 @@ class GradientCheck:
         larger_counts = tuple(
             count
             for count in (*planning.SAMPLE_COUNTS, MAX_SPP)
-            if count >= problem.spp
+            if count >= problem.search_spp
         )
-        counts = larger_counts or (problem.spp,)
+        counts = larger_counts or (problem.search_spp,)
         self.progress.stage(
             f"{title}: the model's gradients",
             planning.count_cosine_samples(plan, counts=counts),
@@ -331,14 +331,14 @@ class GradientCheck:
 
         def get_or_measure(name: str, measure: Callable[[], Any]) -> Any:
             """Return what is stored under a name, or else measure and store it."""
-            return self.measurements.get(f"{part.key} {name}", measure)
+            return self.measurements.get_or_measure(f"{part.key} {name}", measure)
 
         return gradients.Bench(
             renderer,
             loss,
             # a point inside all bounds, where a parameter can move to both sides
             gradients.find_interior_point(renderer),
-            seeds.stream(part.config.seed, "check"),
+            seeds.derive_seed(part.config.seed, "check"),
             spp,
             get_or_measure,
             tick=lambda samples: self.progress.advance(1),
@@ -373,20 +373,20 @@ class GradientCheck:
         if not config.specialise:
             return
         # Each measurement is read if it is stored, or else made and stored.
-        length = self.measurements.get_row(
+        length = self.measurements.get_or_measure_row(
             f"{part.key} bounces",
             results.PathLength,
             lambda: self._measure_path_length(problem, config.seed),
         )
         yield length
         u = gradients.find_interior_point(renderer)
-        seed = seeds.stream(config.seed, "leaving out")
-        yield from self.measurements.get_rows(
+        seed = seeds.derive_seed(config.seed, "leaving out")
+        yield from self.measurements.get_or_measure_rows(
             f"{part.key} gains",
             GainRow,
             lambda: self._measure_gains(problem, u, seed, length.depth),
         )
-        yield from self.measurements.get_rows(
+        yield from self.measurements.get_or_measure_rows(
             f"{part.key} texels",
             TexelRow,
             lambda: measure_texels(renderer, u, seed=seed),
@@ -425,7 +425,7 @@ class GradientCheck:
             problem.compute_loss,
             u,
             seed=seed,
-            spp=problem.spp,
+            spp=problem.search_spp,
             depth=depth,
             tick=self.progress.advance,
         )

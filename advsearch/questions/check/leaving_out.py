@@ -84,7 +84,7 @@ def measure_gains(
     measurements = {item: _Measurements() for item in variants}
     # The first gradient of a variant compiles its kernels. That is done here, and not
     # timed.
-    other_seed = seeds.stream(seed, "another")
+    other_seed = seeds.derive_seed(seed, "another")
     for noise_seed in (seed, other_seed):
         for item, variant in variants.items():
             with torch.no_grad():
@@ -95,7 +95,7 @@ def measure_gains(
     for number in range(repeats):
         for item, variant in variants.items():
             begin = time.perf_counter()
-            variant.gradient(loss, u, seeds.stream(seed, "round", number), spp)
+            variant.gradient(loss, u, seeds.derive_seed(seed, "round", number), spp)
             measurements[item].seconds.append(time.perf_counter() - begin)
             tick()
     search = measurements.pop(SEARCH)
@@ -226,7 +226,7 @@ def measure_texels(
         if group.parameter != "texels":
             continue
         # names of the scene inputs (textures) that the group changes
-        input_names = renderer.routes.get(group.name, frozenset())
+        input_names = renderer.inputs_by_group.get(group.name, frozenset())
         for name in sorted(input_names):
             n_pixels = _count_pixels(renderer, inputs, name, seed, spp)
             n_visible = _count_visible_texels(renderer, inputs, name, seed, spp)

@@ -80,7 +80,7 @@ class CheckConfig(DerivativeConfig):
     )
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return "all" if self.all else self.object, self.command
 
     @property
@@ -174,7 +174,7 @@ class CheckResult(views.InNotebook, RunResult):
         return bool(find_inadequate(self.rows))
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """How many parts are measured."""
         return f"{self.measured} of {self.planned} parts"
 

@@ -130,7 +130,7 @@ class CompareConfig(SweepConfig):
         return self
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         names = settings.split_names(self.object or self.compared)
         return "-".join(Path(name).stem for name in names), self.command
 
@@ -239,8 +239,8 @@ def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, A
             "task": config.task_name,
         }
     environments = settings.join_names(side.sweep.summary.environment for side in sides)
-    objects = settings.join_names(side.labels["object"] for side in sides)
-    models = settings.join_names(side.labels["model"] for side in sides)
+    objects = settings.join_names(side.name_by_column["object"] for side in sides)
+    models = settings.join_names(side.name_by_column["model"] for side in sides)
     return {
         "environment": environments or config.environment_name,
         "controls": sides[0].sweep.summary.controls,
@@ -257,9 +257,9 @@ def count_side(side: Side) -> ComparedSide:
     return ComparedSide(
         name=side.name,
         run=str(side.sweep.folder),
-        object=side.labels["object"],
-        model=side.labels["model"],
-        adversarial_run=side.labels["answer"],
+        object=side.name_by_column["object"],
+        model=side.name_by_column["model"],
+        adversarial_run=side.name_by_column["answer"],
         configurations=len(side.rows),
         correct=int(side.is_right.sum()),
         accuracy=rules.estimate_rate(side.rows),

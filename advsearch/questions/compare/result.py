@@ -175,7 +175,7 @@ class CompareResult(views.InNotebook, RunResult):
     warnings: list[str] = Field(description="remarks that limit what the result shows")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         return ", ".join(
             f"{side.name} {side.accuracy:.1%}"
             for side in self.sides
@@ -311,7 +311,7 @@ def _make_pair_sections(
     yield ResultPart(
         f"{pair.first} and {pair.second}, pair by pair",
         text=sentences,
-        heads=heads,
+        column_heads=heads,
         rows=rows,
         note=note,
     )
@@ -347,13 +347,13 @@ def _make_parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
         rows = [_make_part_cells(part) for part in parts]
         # An empty `only` shows the table on the page and in a terminal.
         only = "" if title in titles_in_terminal else "page"
-        yield ResultPart(title, heads=heads, rows=rows, only=only)
+        yield ResultPart(title, column_heads=heads, rows=rows, only_medium=only)
     if len(titles_in_terminal) < len(parts_by_title):
         remark = (
             "The difference varies most over these; the page has all "
             f"{len(parts_by_title)} parameters."
         )
-        yield ResultPart(text=[remark], only="text")
+        yield ResultPart(text=[remark], only_medium="text")
 
 
 def _find_most_varying(parts_by_title: Mapping[str, Sequence[PairPart]]) -> list[str]:
@@ -469,8 +469,8 @@ def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     has_single_images = groups and all(len(group) == 1 for group in groups)
     if has_single_images:
         groups = [[group[0] for group in groups]]
-    yield ResultPart(title, rows=text_rows[:MAX_PICTURES], only="text")
-    yield ResultPart(title, lines_without_pictures, pictures=groups, only="page")
+    yield ResultPart(title, rows=text_rows[:MAX_PICTURES], only_medium="text")
+    yield ResultPart(title, lines_without_pictures, pictures=groups, only_medium="page")
 
 
 def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Picture]:

@@ -58,14 +58,14 @@ class Side:
     Attributes:
         name: what distinguishes it from the other sides.
         sweep: sweep that has its rows.
-        labels: its object, model and adversarial scene, by `SIDE_COLUMNS`.
+        name_by_column: its object, model and adversarial scene, by `SIDE_COLUMNS`.
         rows: one row for each image in order (`StoredSweep.read_rows`), with the
             `number` of the image.
     """
 
     name: str
     sweep: workbench.StoredSweep
-    labels: dict[str, str]
+    name_by_column: dict[str, str]
     rows: pd.DataFrame
 
     @property
@@ -136,7 +136,7 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
     for side in sides:
         # The label is empty for the clean scene, which has no adversarial run.
         labels = [
-            wording.shorten_names(side.labels[column]) or "as it is"
+            wording.shorten_names(side.name_by_column[column]) or "as it is"
             for column in columns
         ]
         names.append(", ".join(labels))
@@ -157,7 +157,7 @@ def _find_different_columns(sides: Sequence[Side]) -> list[str]:
     return [
         column
         for column in SIDE_COLUMNS
-        if len({side.labels[column] for side in sides}) > 1
+        if len({side.name_by_column[column] for side in sides}) > 1
     ]
 
 
@@ -200,7 +200,7 @@ def read_sweep_sides(path: Path, *, is_only_sweep: bool) -> Iterator[Side]:
             for column in SIDE_COLUMNS:
                 if column in side_rows:
                     labels[column] = ",".join(side_rows[column].unique())
-            yield Side(name="", sweep=sweep, labels=labels, rows=side_rows)
+            yield Side(name="", sweep=sweep, name_by_column=labels, rows=side_rows)
 
 
 def _read_finished_sweep(path: Path) -> tuple[workbench.StoredSweep, pd.DataFrame]:
@@ -253,7 +253,7 @@ def check_same_draws(first: Side, second: Side) -> None:
             f"and {len(second.rows)} in "
             f"{where}; sweep as many objects and environments in both"
         )
-    if first.labels["object"] != second.labels["object"]:
+    if first.name_by_column["object"] != second.name_by_column["object"]:
         return  # default ranges may follow from the object
     # The keys of "units" are the names of the parameters.
     for name in first.rows.attrs["units"]:

@@ -85,7 +85,7 @@ class ExplainConfig(Config):
     _different = settings.unique_names_validator("sweeps")
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return Path(settings.split_names(self.sweeps)[0]).name, self.command
 
 
@@ -109,7 +109,7 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     """
     # these import torch, scipy and pandas
     from advsearch.questions.explain import findings
-    from advsearch.questions.explain.renders import Renders
+    from advsearch.questions.explain.renders import SweepRunner
 
     config = context.config
     progress = context.progress
@@ -119,7 +119,7 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
 
     found_rules, importance, envelope = _analyze_rows(table, config, progress)
 
-    renders = Renders(context, sweeps, rows, table)
+    renders = SweepRunner(context, sweeps, rows, table)
     rule_rows = _confirm_rules(renders, found_rules)
     pairs = list(renders.find_pairs(found_rules.accepted))
     clusters = renders.find_clusters()

@@ -31,7 +31,7 @@ estimate is biased.
 
 
 def find_envelope(
-    choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float
+    selection_rows: pd.DataFrame, test_rows: pd.DataFrame, accuracy: float
 ) -> EnvelopeRow | None:
     """Find the largest box of values inside which a model has an accuracy.
 
@@ -40,28 +40,28 @@ def find_envelope(
     too.
 
     Args:
-        choosing: half of the rows, by which the box is chosen.
-        counting: the other half, which tests the box once.
+        selection_rows: half of the rows, by which the box is chosen.
+        test_rows: the other half, which tests the box once.
         accuracy: accuracy in (0, 1), the lower bound of a 95 % interval.
 
     Returns:
         The box with its counts; None if no box of enough rows has the accuracy.
     """
-    if choosing.empty:
+    if selection_rows.empty:
         return None
     # The choosing rows have to reach a little more than the accuracy, since their
     # estimate is biased. Near 1, where `ACCURACY_RESERVE` might exceed 1, the reserve
     # is half of the distance to 1.
     required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
     box: rules.RuleConditions = ()  # without conditions: everything
-    inside = choosing
+    inside = selection_rows
     while rules.estimate_interval(inside)[0] < required:
-        smaller_box = find_best_peel(box, inside, choosing)
+        smaller_box = find_best_peel(box, inside, selection_rows)
         if smaller_box is None:
             return None
         box = smaller_box
-        inside = choosing[rules.find_covered(box, choosing)]
-    counts = count_right(counting[rules.find_covered(box, counting)])
+        inside = selection_rows[rules.find_covered(box, selection_rows)]
+    counts = count_right(test_rows[rules.find_covered(box, test_rows)])
     conditions = [condition.row for condition in box]  # as a result stores them
     is_held = counts.interval[0] >= accuracy
     return EnvelopeRow(
@@ -70,7 +70,7 @@ def find_envelope(
 
 
 def find_best_peel(
-    box: rules.RuleConditions, inside: pd.DataFrame, choosing: pd.DataFrame
+    box: rules.RuleConditions, inside: pd.DataFrame, selection_rows: pd.DataFrame
 ) -> rules.RuleConditions | None:
     """Return the slightly smaller box with the highest accuracy.
 
@@ -81,13 +81,13 @@ def find_best_peel(
     Args:
         box: the conditions of the box.
         inside: the choosing rows inside it.
-        choosing: all choosing rows.
+        selection_rows: all choosing rows.
     """
-    is_independent = choosing["unit"].is_unique
+    is_independent = selection_rows["unit"].is_unique
     best_box = None
     best_accuracy = -1.0
     for smaller_box in list_peels(box, inside):
-        remaining = choosing[rules.find_covered(smaller_box, choosing)]
+        remaining = selection_rows[rules.find_covered(smaller_box, selection_rows)]
         n_draws = len(remaining) if is_independent else remaining["unit"].nunique()
         if n_draws >= MIN_BOX_UNITS and remaining["correct"].mean() > best_accuracy:
             best_box = smaller_box

@@ -55,14 +55,14 @@ them are left.
 
 
 @dataclass
-class Renders:
+class SweepRunner:
     """Runs sweeps in the directory of the run, until it is interrupted.
 
     Attributes:
         context: context of the experiment.
         sweeps: sweeps whose rows are explained.
         rows: their rows with all columns.
-        table: the same rows with the columns of the parameters that vary.
+        factor_table: the same rows with the columns of the parameters that vary.
             `attrs["units"]` maps these parameters, the factors, to their units.
         n_renders: number of images that were rendered.
         interrupted: whether Ctrl-C has ended the renders.
@@ -72,7 +72,7 @@ class Renders:
     context: RunContext[Any]
     sweeps: Sequence[workbench.StoredSweep]
     rows: pd.DataFrame
-    table: pd.DataFrame
+    factor_table: pd.DataFrame
     n_renders: int = 0
     interrupted: bool = False
     warnings: list[str] = field(default_factory=list)
@@ -89,7 +89,7 @@ class Renders:
         """The number of failures for which images were rendered to find a pair."""
         return len(self._tried_failures)
 
-    def render_rows(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
+    def run_sweep(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
         """Run a sweep and return its rows.
 
         If its scene is no longer available, a warning is added.
@@ -143,10 +143,10 @@ class Renders:
             return None
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
-        covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
+        covered_rows = self.factor_table[rules.find_covered(rule.conditions, self.factor_table)]
         # Fresh rows that earlier rules cover are left out afterwards. The smaller the
         # fraction of the others, the more configurations are rendered.
-        is_uncovered = is_outside(earlier_conditions, covered_rows)
+        is_uncovered = find_uncovered(earlier_conditions, covered_rows)
         uncovered_fraction = max(float(is_uncovered.mean()), MIN_UNCOVERED_FRACTION)
         fresh_frames = self._render_inside(
             index, rule, uncovered_fraction, earlier_conditions
@@ -191,16 +191,16 @@ class Renders:
             for arc in range(n_arcs):
                 # a number that is distinct for each rule, sweep and arc
                 number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
-                seed = seeds.stream(self.config.seed, "confirm", number)
+                seed = seeds.derive_seed(self.config.seed, "confirm", number)
                 self.progress.message(
                     f"rule {index + 1}: rendering about {samples} "
                     "configurations inside it"
                 )
                 config = make_sweep_inside(
-                    sweep.config, self.table, rule.conditions, samples, seed, arc
+                    sweep.config, self.factor_table, rule.conditions, samples, seed, arc
                 )
                 suffix = f"-{arc}" if arc else ""
-                rows = self.render_rows(
+                rows = self.run_sweep(
                     f"rule-{index + 1}-{sweep_index}{suffix}", config
                 )
                 if rows is None:
@@ -228,12 +228,12 @@ class Renders:
         Args:
             counted_rules: all rules, in their order.
         """
-        failures = find_typical_failures(self.table, counted_rules, self.config.pairs)
+        failures = find_typical_failures(self.factor_table, counted_rules, self.config.pairs)
         for number, (index, conditions) in enumerate(failures, start=1):
             rule_factors = [condition.factor for condition in conditions]
             other_factors = [
                 factor
-                for factor in self.table.attrs["units"]
+                for factor in self.factor_table.attrs["units"]
                 if factor not in rule_factors
             ]
             # groups to try: all factors of the rule, then each other factor by itself
@@ -252,7 +252,7 @@ class Renders:
 
         Names have no distance: the difference of two names is 1.
         """
-        column = self.table[pair.parameter]
+        column = self.factor_table[pair.parameter]
         if column.dtype == "category":
             return 1.0
         value_range = float(column.max() - column.min())
@@ -300,7 +300,7 @@ class Renders:
         return NearestRight(
             values=failure,
             parameter=factor,
-            unit=self.table.attrs["units"][factor],
+            unit=self.factor_table.attrs["units"][factor],
             wrong_at=wrong_value,
             right_at=values[nearest_row],
             failure_label=frame_a["label"][failure_row],
@@ -328,9 +328,9 @@ class Renders:
         """
         frames = []
         for repeat in range(2):
-            seed = seeds.stream(self.config.seed, f"{run_name} {repeat}")
-            sweep = make_sweep_along(config, failure, factor, self.table, seed)
-            rows = self.render_rows(f"{run_name}-{repeat}", sweep)
+            seed = seeds.derive_seed(self.config.seed, f"{run_name} {repeat}")
+            sweep = make_sweep_along(config, failure, factor, self.factor_table, seed)
+            rows = self.run_sweep(f"{run_name}-{repeat}", sweep)
             if rows is None:
                 return None
             frames.append(rows)
@@ -350,7 +350,7 @@ class Renders:
             wrong_value: the value of the failure, which is among them.
         """
         right_indices = np.flatnonzero(is_right).tolist()
-        if self.table[factor].dtype == "category":
+        if self.factor_table[factor].dtype == "category":
             return int(right_indices[0])
         nearest_index: int = min(
             right_indices,
@@ -463,7 +463,7 @@ class Renders:
 
     def _sample_failures(self, failing: pd.DataFrame) -> pd.DataFrame:
         """Sample at most `clusters` failures at random, in their order."""
-        generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
+        generator = np.random.default_rng(seeds.derive_seed(self.config.seed, "clusters"))
         sampled = generator.permutation(len(failing))[: self.config.clusters]
         return failing.iloc[np.sort(sampled)]
 
@@ -552,13 +552,13 @@ def select_inside(
 
     Rows in which the object is out of view are left out.
     """
-    is_inside = rules.find_covered(conditions, rows) & is_outside(
+    is_inside = rules.find_covered(conditions, rows) & find_uncovered(
         earlier_conditions, rows
     )
     return rows[is_inside & rules.is_in_view(rows)]
 
 
-def is_outside(
+def find_uncovered(
     rule_conditions: Sequence[rules.RuleConditions], rows: pd.DataFrame
 ) -> rules.Mask:
     """Return whether each row is covered by no rule, (n,) bool."""

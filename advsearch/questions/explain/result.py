@@ -220,7 +220,7 @@ class ExplainResult(RunResult, RightCounts):
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         return f"{len(self.rules)} rules over {self.total} rows"
 
 

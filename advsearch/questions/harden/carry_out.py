@@ -64,13 +64,13 @@ class Measurement(NamedTuple):
 
     Attributes:
         title: title in the progress.
-        weaker: name of the measurement with the usual search, if this one has a
+        weaker_measurement: name of the measurement with the usual search, if this one has a
             stronger search: where the usual one has found a wrong prediction, the
             stronger one is not run.
     """
 
     title: str
-    weaker: str | None = None
+    weaker_measurement: str | None = None
 
 
 MEASUREMENTS = {
@@ -240,7 +240,7 @@ class Hardening:
     """A run that measures a model, trains it, and measures it again.
 
     Attributes:
-        is_wrong: whether a search found a wrong prediction, by the kind of its row,
+        is_wrong_by_search: whether a search found a wrong prediction, by the kind of its row,
             such as "before texture", and the number of the scene.
         clean_is_right: whether the model is right about each plain image of the
             held-out scenes, "before" and "after".
@@ -253,11 +253,11 @@ class Hardening:
         """Prepare the run, with what an earlier session of it has measured."""
         self.run = run
         self.trainer = trainer
-        self.jobs = trainer.work
+        self.scene_jobs = trainer.scene_jobs
         self.config = trainer.config
         self.rounds = Rounds(run, trainer)
         # the step of a row is the number of its scene, see `_record`
-        self.is_wrong = {
+        self.is_wrong_by_search = {
             (row.kind, row.step): bool(row.success) for row in run.store.rows()
         }
         self.clean_is_right: dict[str, list[bool]] = {}
@@ -278,7 +278,7 @@ class Hardening:
 
         A run that was stopped continues: what it has stored is not computed again.
         """
-        splits = self.jobs.splits
+        splits = self.scene_jobs.splits
         # A scene that the model was trained on must not measure it.
         scenes.check_disjoint(
             splits[HELD_OUT], [splits[name] for name in (TRAINING, FURTHER, VALIDATION)]
@@ -316,7 +316,7 @@ class Hardening:
             for number in range(self.n_scenes[HELD_OUT])
         ]
         title = "looking at plain pictures of held-out scenes"
-        evaluations = [value for _, value in self.jobs.run_jobs(title, jobs)]
+        evaluations = [value for _, value in self.scene_jobs.run_jobs(title, jobs)]
         for when in ("before", "after"):
             is_right = list[bool]()
             outcome_counts = Counter[str]()
@@ -336,10 +336,10 @@ class Hardening:
         """
         measurement = MEASUREMENTS[name]
         steps_factor = 1
-        if measurement.weaker is not None:
+        if measurement.weaker_measurement is not None:
             steps_factor = scenes.STRONGER_STEPS_FACTOR
             # If the weaker search has found a failure, the stronger one is not run.
-            self._record_weaker(name, measurement.weaker)
+            self._record_weaker(name, measurement.weaker_measurement)
         to_attack = self._list_unmeasured(name)
         jobs = [
             partial(
@@ -352,7 +352,7 @@ class Hardening:
             for control, number in to_attack
         ]
         hint = "`measured` and `steps` shorten it"
-        for index, status in self.jobs.run_jobs(measurement.title, jobs, hint=hint):
+        for index, status in self.scene_jobs.run_jobs(measurement.title, jobs, hint=hint):
             control, number = to_attack[index]
             self._record(name, control, number, is_wrong=status != ROBUST)
 
@@ -363,7 +363,7 @@ class Hardening:
             for number, control in product(
                 range(self.config.measured), self.config.controls
             )
-            if (f"{name} {control}", number) not in self.is_wrong
+            if (f"{name} {control}", number) not in self.is_wrong_by_search
         ]
 
     def _record_weaker(self, name: str, weaker: str) -> None:
@@ -374,7 +374,7 @@ class Hardening:
             weaker: the measurement with the usual search.
         """
         for control, number in self._list_unmeasured(name):
-            if self.is_wrong[f"{weaker} {control}", number]:
+            if self.is_wrong_by_search[f"{weaker} {control}", number]:
                 self._record(name, control, number, is_wrong=True)
 
     def _record(
@@ -389,11 +389,11 @@ class Hardening:
             is_wrong: whether it found a wrong prediction.
         """
         kind = f"{measurement} {control}"
-        self.is_wrong[kind, number] = is_wrong
+        self.is_wrong_by_search[kind, number] = is_wrong
         self.run.append_row(
             kind,
             number,
-            seed=seeds.stream(self.config.seed, f"measured {control}", number),
+            seed=seeds.derive_seed(self.config.seed, f"measured {control}", number),
             spp=self.config.verify_spp,
             success=is_wrong,
         )
@@ -412,7 +412,7 @@ class Hardening:
         is_robust = []
         for number in range(self.config.measured):
             is_wrong = [
-                self.is_wrong.get((f"{measurement} {control}", number))
+                self.is_wrong_by_search.get((f"{measurement} {control}", number))
                 for control in controls
             ]
             is_unmeasured = None in is_wrong
@@ -430,7 +430,7 @@ class Hardening:
         """
         config = self.config
         is_done = context.ending == "done"
-        is_unchanged = self.rounds.best == 0  # round 0 is the original network
+        is_unchanged = self.rounds.best_round_number == 0  # round 0 is the original network
         if is_done and is_unchanged:
             text = (
                 "No round kept the clean accuracy, so the weights are the model's own."
@@ -438,7 +438,7 @@ class Hardening:
             warnings = [*warnings, text]  # a new list, to leave the caller's as it is
         before = self._find_robust("before", config.controls)
         after = self._find_robust("after", config.controls)
-        training_split = self.jobs.splits[TRAINING]
+        training_split = self.scene_jobs.splits[TRAINING]
         return context.result(
             HardenResult,
             **_compare_robustness(before, after),
@@ -464,9 +464,9 @@ class Hardening:
         """Return the rounds so far; once all are done, the best is marked."""
         return [
             training_round.model_copy(
-                update={"is_selected": is_done and number == self.rounds.best}
+                update={"is_selected": is_done and number == self.rounds.best_round_number}
             )
-            for number, training_round in enumerate(self.rounds.results)
+            for number, training_round in enumerate(self.rounds.finished_rounds)
         ]
 
     def _list_files(self, is_done: bool) -> dict[str, str | None]:
@@ -481,10 +481,10 @@ class Hardening:
 
     def _describe_workers(self) -> results.SharedWork | None:
         """Return how workers shared the scenes; None without workers."""
-        if not self.jobs.executor or not self.jobs.executor.facts:
+        if not self.scene_jobs.executor or not self.scene_jobs.executor.facts:
             return None
-        stats = self.jobs.executor.facts
-        return results.SharedWork.of_facts(stats, stats.machines)
+        stats = self.scene_jobs.executor.facts
+        return results.SharedWork.from_worker_stats(stats, stats.machines)
 
     def _make_clean_share(self, when: str) -> Share | None:
         """Return the fraction of right plain images; None if it is not measured.
@@ -526,7 +526,7 @@ class Hardening:
                 scenes=self.n_scenes[name],
                 views=n_views[name],
             )
-            for name, split in self.jobs.splits.items()
+            for name, split in self.scene_jobs.splits.items()
         }
 
     def _make_hardened_name(self) -> str | None:

@@ -69,7 +69,7 @@ class Example(NamedTuple):
     """An image with its ground truth.
 
     Attributes:
-        levels: the image (H, W, 3) uint8.
+        image_uint8: the image (H, W, 3) uint8.
         boxes: (K, 4), x0, y0, x1, y1 in pixels.
         labels: indices of the boxes' classes (K,).
         task: evaluates predictions of a rendered image; None for a custom image.
@@ -78,7 +78,7 @@ class Example(NamedTuple):
         is_adversarial: whether a search has found it.
     """
 
-    levels: Tensor
+    image_uint8: Tensor
     boxes: Tensor
     labels: Tensor
     task: Task | None = None
@@ -95,7 +95,7 @@ class Example(NamedTuple):
             u: (d,) the configuration that a search has found; None for the plain scene.
         """
         configuration = problem.domain.start if u is None else u
-        truth: Any = problem.find_truth(problem.add_conditions(configuration, seed))
+        truth: Any = problem.find_truth(problem.make_full_configuration(configuration, seed))
         # A region of segmentation has no box, nor has an object out of view.
         box = getattr(truth, "box", None)
         boxes = torch.zeros(0, 4, dtype=torch.float32)
@@ -104,7 +104,7 @@ class Example(NamedTuple):
         # If several labels are right, training uses the first.
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
         return cls(
-            levels=color.to_uint8(problem.picture(configuration, seed, SPP)),
+            image_uint8=color.to_uint8(problem.picture(configuration, seed, SPP)),
             boxes=boxes,
             labels=labels,
             task=problem.task,
@@ -116,7 +116,7 @@ class Example(NamedTuple):
         """Return whether a model is right about a rendered image."""
         assert self.task is not None
         with torch.no_grad():
-            output = model(self.levels[None] / 255.0)
+            output = model(self.image_uint8[None] / 255.0)
             return bool(self.task.loss(output, self.truth)[0] <= 0.0)
 
 
@@ -354,21 +354,21 @@ class DetectorTrainer(Trainer):
             split: name of the split that the scenes belong to.
             scene_numbers: numbers of the scenes.
         """
-        scene_split = self.work.splits[split]
+        scene_split = self.scene_jobs.splits[split]
         controls = tuple(self.config.controls)
         plain = list[Example]()
         worst = list[Example]()
-        self.work.progress.stage(title, len(scene_numbers) * len(controls))
+        self.scene_jobs.progress.stage(title, len(scene_numbers) * len(controls))
         for number in scene_numbers:
             name, scene = scene_split.load_scene(number)
             for control in controls:
                 # The seed is derived from control and scene number, so that a run that
                 # continues, or one with other controls, samples the same.
-                seed = seeds.stream(scene_split.seed, f"search {control}", number)
+                seed = seeds.derive_seed(scene_split.seed, f"search {control}", number)
                 plain_image, worst_image = self._attack(scene, name, control, seed)
                 plain.append(plain_image)
                 worst.append(worst_image)
-                self.work.progress.advance(1)
+                self.scene_jobs.progress.advance(1)
             plain += self._render_further_views(split, number, controls[-1])
         return plain + worst
 
@@ -385,11 +385,11 @@ class DetectorTrainer(Trainer):
             control: control that is searched, because a problem needs one; its search
                 has given the seed.
         """
-        scene_split = self.work.splits[split]
-        problem, _ = self.work.make_problem(scene_split, number, (control,))
-        seed = seeds.stream(scene_split.seed, f"search {control}", number)
+        scene_split = self.scene_jobs.splits[split]
+        problem, _ = self.scene_jobs.make_problem(scene_split, number, (control,))
+        seed = seeds.derive_seed(scene_split.seed, f"search {control}", number)
         return [
-            Example.render(problem, seeds.stream(seed, "plain", view))
+            Example.render(problem, seeds.derive_seed(seed, "plain", view))
             for view in range(1, N_VIEWS)
         ]
 
@@ -405,13 +405,13 @@ class DetectorTrainer(Trainer):
             seed: seed of the search and of the conditions of both images.
         """
         model = self.student.model
-        config = self.work.make_attack_config(
+        config = self.scene_jobs.make_attack_config(
             (control,), name, seed=seed, trials=TRIALS, verify_spp=SPP
         )
         u = workbench.attack_on(config, scene, model).u
         problem = workbench.make_problem_on(config, scene, model, differentiated=False)
-        plain = Example.render(problem, seeds.stream(seed, "plain", 0))
-        worst = Example.render(problem, seeds.stream(seed, "worst", 0), u)
+        plain = Example.render(problem, seeds.derive_seed(seed, "plain", 0))
+        worst = Example.render(problem, seeds.derive_seed(seed, "worst", 0), u)
         return plain, worst
 
     def uses_per_epoch(self, item: Example) -> int:
@@ -419,7 +419,7 @@ class DetectorTrainer(Trainer):
         return WORST_USES_PER_EPOCH if item.is_adversarial else 1
 
     @contextmanager
-    def gradient_context(self, new: Sequence[Example]) -> Iterator[ComputeGradient]:
+    def open_gradient_context(self, new: Sequence[Example]) -> Iterator[ComputeGradient]:
         """Put the network into training mode while gradients are computed.
 
         Many detectors return losses only in training mode. Batch normalization and
@@ -461,9 +461,9 @@ class DetectorTrainer(Trainer):
             item: the image and its boxes.
             is_mirrored: whether image and boxes are mirrored.
         """
-        levels = item.levels
+        levels = item.image_uint8
         boxes = item.boxes
-        height, width = item.levels.shape[:2]
+        height, width = item.image_uint8.shape[:2]
         if is_mirrored:
             levels = levels.flip(1)
             # A mirrored point has x' = width - x, so that the right edge becomes the
@@ -479,11 +479,11 @@ class DetectorTrainer(Trainer):
             "labels": item.labels.to(x.device),
         }
 
-    def score(self, held_back: Sequence[Example]) -> Score:
+    def evaluate_student(self, validation_items: Sequence[Example]) -> Score:
         """Evaluate the student on plain and on adversarial images."""
         plain = []
         worst = []
-        for item in held_back:
+        for item in validation_items:
             is_right = item.is_right(self.student.model)
             if item.is_adversarial:
                 worst.append(is_right)
@@ -506,7 +506,7 @@ class DetectorTrainer(Trainer):
         annotations = list[dict[str, Any]]()
         written_items = write_images(run, f"{directory}/images", new)
         for image_id, (item, name) in enumerate(written_items, start=1):
-            height, width = item.levels.shape[:2]
+            height, width = item.image_uint8.shape[:2]
             images.append(
                 {
                     "id": image_id,
@@ -586,7 +586,7 @@ def write_images(
     for number, item in enumerate(items, 1):
         (run.path / directory).mkdir(parents=True, exist_ok=True)
         name = f"{number:05d}-{'worst' if item.is_adversarial else 'plain'}"
-        run.save_image(name, item.levels / 255.0, directory)
+        run.save_image(name, item.image_uint8 / 255.0, directory)
         yield item, name
 
 
@@ -618,9 +618,9 @@ class SegmenterTrainer(DetectorTrainer):
             is_mirrored: whether image and target are mirrored.
         """
         region: Any = item.truth
-        levels = item.levels.flip(1) if is_mirrored else item.levels
+        levels = item.image_uint8.flip(1) if is_mirrored else item.image_uint8
         with torch.no_grad():
-            original_output = self.work.model(levels[None] / 255.0)
+            original_output = self.scene_jobs.model(levels[None] / 255.0)
         original_classes = original_output[0].argmax(dim=0)
         size = tuple(original_classes.shape)
         is_object = region.resize_mask(size).to(original_classes.device)

@@ -63,17 +63,17 @@ class Lesson:
 
     Attributes:
         right_classes: indices of the right classes.
-        levels: the plain image (H, W, 3) uint8, to save memory. If a scene is rendered
+        plain_image_uint8: the plain image (H, W, 3) uint8, to save memory. If a scene is rendered
             twice, a single control has changed in it.
     """
 
     right_classes: tuple[int, ...]
-    levels: Tensor
+    plain_image_uint8: Tensor
 
     @property
     def plain_image(self) -> Tensor:
         """The image of `levels` (H, W, 3), sRGB in [0, 1]."""
-        return self.levels / 255.0
+        return self.plain_image_uint8 / 255.0
 
     @property
     def worst_image(self) -> Tensor:
@@ -88,7 +88,7 @@ class TextureLesson(Lesson):
     Attributes:
         space: maps configurations to textures.
         domain: the configurations that are allowed.
-        linear: predicts the image of a texture by a matrix; its scene was released.
+        image_predictor: predicts the image of a texture by a matrix; its scene was released.
         conditions: the sampled conditions of the view.
         texture: the adversarial configuration (d,). Other lessons may share it, and it
             is changed in place.
@@ -96,7 +96,7 @@ class TextureLesson(Lesson):
 
     space: Any
     domain: policies.Domain
-    linear: Any
+    image_predictor: Any
     conditions: Tensor
     texture: Tensor
 
@@ -108,12 +108,12 @@ class TextureLesson(Lesson):
         """
         inputs = self.space.inputs(u)
         # The matrix belongs to the inputs of the scene in which images are linear.
-        linear_names = self.linear.linearized_at.keys()
+        linear_names = self.image_predictor.linearized_at.keys()
         texture_inputs = {name: inputs[name] for name in linear_names}
         # Some controls change the finished image, for which the full configuration is
         # needed, too.
         configuration = torch.cat([u, self.conditions])
-        image: Tensor = self.linear.predict_image(texture_inputs, configuration)
+        image: Tensor = self.image_predictor.predict_image(texture_inputs, configuration)
         return image
 
     @property
@@ -127,11 +127,11 @@ class RenderedLesson(Lesson):
     """A lesson with images of random configurations.
 
     Attributes:
-        images: the images (N, H, W, 3) uint8.
+        images_uint8: the images (N, H, W, 3) uint8.
         losses: the loss of each image (N,) when it was last evaluated; infinite before.
     """
 
-    images: Tensor
+    images_uint8: Tensor
     losses: Tensor
 
     @classmethod
@@ -157,7 +157,7 @@ class RenderedLesson(Lesson):
 
     @property
     def worst_image(self) -> Tensor:
-        return self.images[int(self.losses.argmax())] / 255.0
+        return self.images_uint8[int(self.losses.argmax())] / 255.0
 
 
 def make_lessons(
@@ -229,8 +229,8 @@ def _make_texture_lessons(
     shared_texture = _sample_texture(domain, seed)
     texture_lessons = []
     for number in range(views):
-        view_seed = seeds.stream(seed, "lesson", number)
-        configuration = problem.add_conditions(domain.start, view_seed)
+        view_seed = seeds.derive_seed(seed, "lesson", number)
+        configuration = problem.make_full_configuration(domain.start, view_seed)
         linear = problem.make_linear_renderer(configuration, view_seed, MATRIX_SPP)
         levels = color.to_uint8(linear(configuration))
         linear.release_scene(full_space)  # only the matrix is needed from here on
@@ -240,10 +240,10 @@ def _make_texture_lessons(
         texture_lessons.append(
             TextureLesson(
                 right_classes=right_classes,
-                levels=levels,
+                plain_image_uint8=levels,
                 space=searched_space,
                 domain=domain,
-                linear=linear,
+                image_predictor=linear,
                 # A slice would keep the full configuration in memory, a clone does not.
                 conditions=configuration[domain.dim :].clone(),
                 texture=texture,
@@ -279,9 +279,9 @@ def _make_rendered_lessons(
     domain = problem.domain
     rendered_lessons = []
     for number in range(views):
-        view_seed = seeds.stream(seed, "lesson", number)
+        view_seed = seeds.derive_seed(seed, "lesson", number)
         # A full configuration has the searched coordinates, then the conditions.
-        full_start = problem.add_conditions(domain.start, view_seed)
+        full_start = problem.make_full_configuration(domain.start, view_seed)
         conditions = full_start[domain.dim :].clone()
         plain_image, *images = [
             render(torch.cat([u, conditions]), seed=view_seed, spp=SPP)
@@ -322,8 +322,8 @@ def _make_plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]
     render = problem.renderer.copy_with(quick=True)
     plain_lessons = []
     for number in range(views):
-        view_seed = seeds.stream(seed, "plain lesson", number)
-        configuration = problem.add_conditions(problem.domain.start, view_seed)
+        view_seed = seeds.derive_seed(seed, "plain lesson", number)
+        configuration = problem.make_full_configuration(problem.domain.start, view_seed)
         image = render(configuration, seed=view_seed, spp=SPP)
         plain_lessons.append(Lesson(right_classes, color.to_uint8(image)))
     return plain_lessons
@@ -350,11 +350,11 @@ def sample_configurations(
     uses_bounds = torch.rand(count, 1, generator=generator) < 0.5
     is_at_bound = is_at_bound & uses_bounds
     for block, columns in domain.list_block_slices():
-        if block.options or block.periodic:
+        if block.n_options or block.periodic:
             is_at_bound[:, columns] = False
     is_unchanged = _alternate_controls(domain, count)
-    is_lower_nearer = samples - domain.lower < domain.upper - samples
-    nearer_bound = torch.where(is_lower_nearer, domain.lower, domain.upper)
+    is_lower_nearer = samples - domain.lower_bounds < domain.upper_bounds - samples
+    nearer_bound = torch.where(is_lower_nearer, domain.lower_bounds, domain.upper_bounds)
     samples = torch.where(is_at_bound, nearer_bound, samples)
     samples = torch.where(is_unchanged, domain.start, samples)
     return torch.stack([domain.project(u) for u in samples])
@@ -441,16 +441,16 @@ def _update_losses(batch: Sequence[Lesson], model: Model) -> None:
     rendered_lessons = [
         lesson
         for lesson in batch
-        if isinstance(lesson, RenderedLesson) and len(lesson.images) > 1
+        if isinstance(lesson, RenderedLesson) and len(lesson.images_uint8) > 1
     ]
     if not rendered_lessons:
         return
-    n_images = [len(lesson.images) for lesson in rendered_lessons]
+    n_images = [len(lesson.images_uint8) for lesson in rendered_lessons]
     right_classes = []
     for lesson in rendered_lessons:
-        right_classes += [lesson.right_classes] * len(lesson.images)
+        right_classes += [lesson.right_classes] * len(lesson.images_uint8)
     with torch.no_grad():
-        images = torch.cat([lesson.images for lesson in rendered_lessons]) / 255.0
+        images = torch.cat([lesson.images_uint8 for lesson in rendered_lessons]) / 255.0
         losses = negative_log_likelihood(model(images), right_classes)
     for lesson, lesson_losses in zip(
         rendered_lessons, losses.split(n_images), strict=True
@@ -491,7 +491,7 @@ def ascend_textures(
             gradient_sums[texture_id] = gradient + gradient_sums.get(texture_id, 0.0)
         for texture_id, lesson in lesson_of_texture.items():
             # one unit step uphill, in the norm of the domain
-            direction = lesson.domain.steepest(
+            direction = lesson.domain.compute_steepest_step(
                 lesson.texture, gradient_sums[texture_id]
             )
             moved_texture = lesson.texture + STEP_FRACTION * direction

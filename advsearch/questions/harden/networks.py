@@ -49,7 +49,7 @@ class Trainable:
             logits: Tensor = self.model(images)
         return logits
 
-    def make_twin(self) -> Trainable:
+    def copy_for_thread(self) -> Trainable:
         """Return the same weights with gradients of their own, for another thread."""
         # `with_network` copies a network whose weights stay shared. The copy's
         # parameters collect no gradients until `requires_grad_` is set again.
@@ -149,28 +149,28 @@ class Augmentation:
         flip: probability of a horizontal mirror image.
         smallest_crop, largest_crop: bounds of the crop's side, as a fraction of the
             image's side; 1 and 1 switch cropping off.
-        turn: bound of the angle that the crop is rotated by, in degrees.
+        max_rotation_degrees: bound of the angle that the crop is rotated by, in degrees.
         brightness: bound of the shift, display-referred.
         contrast: bound of the relative change of deviations from the image's mean.
-        colour: bound of the relative change of each channel.
+        max_channel_change: bound of the relative change of each channel.
         blur: probability of a 3 x 3 binomial blur.
-        noise: bound of the standard deviation of gaussian noise, display-referred.
-        noisy: probability of noise.
-        cutout: probability that a gray square hides a part.
+        max_noise_deviation: bound of the standard deviation of gaussian noise, display-referred.
+        noise_probability: probability of noise.
+        cutout_probability: probability that a gray square hides a part.
         largest_cutout: bound of the square's side, as a fraction of the image's side.
     """
 
     flip: float = 0.5
     smallest_crop: float = 0.8
     largest_crop: float = 1.0
-    turn: float = 0.0
+    max_rotation_degrees: float = 0.0
     brightness: float = 0.1
     contrast: float = 0.25
-    colour: float = 0.08
+    max_channel_change: float = 0.08
     blur: float = 0.15
-    noise: float = 0.04
-    noisy: float = 0.3
-    cutout: float = 0.2
+    max_noise_deviation: float = 0.04
+    noise_probability: float = 0.3
+    cutout_probability: float = 0.2
     largest_cutout: float = 0.3
 
     def __call__(self, images: Tensor, generator: Generator) -> Tensor:
@@ -201,7 +201,7 @@ class Augmentation:
         shift_x, shift_y = relative_shift.view(2, count) * max_shift
         is_mirrored = _choose(self.flip, count, generator)
         mirror = 1.0 - 2.0 * is_mirrored.float()  # -1 or 1
-        degrees = _uniform(-self.turn, self.turn, count, generator=generator)
+        degrees = _uniform(-self.max_rotation_degrees, self.max_rotation_degrees, count, generator=generator)
         angle = degrees * (math.pi / 180.0)
         cosine = scale * angle.cos()
         sine = scale * angle.sin()
@@ -221,7 +221,7 @@ class Augmentation:
         """Change contrast, brightness and color of images (N, 3, H, W)."""
         count = len(x)
         contrast = _uniform(-self.contrast, self.contrast, count, generator=generator)
-        color = _uniform(-self.colour, self.colour, count, 3, generator=generator)
+        color = _uniform(-self.max_channel_change, self.max_channel_change, count, 3, generator=generator)
         brightness = _uniform(
             -self.brightness, self.brightness, count, generator=generator
         )
@@ -244,17 +244,17 @@ class Augmentation:
 
     def _add_noise(self, x: Tensor, generator: Generator) -> None:
         """Add gaussian noise to some of the images (N, 3, H, W) in place."""
-        is_noisy = _choose(self.noisy, len(x), generator)
+        is_noisy = _choose(self.noise_probability, len(x), generator)
         n_noisy = int(is_noisy.sum())
         if n_noisy == 0:
             return
-        deviation = self.noise * torch.rand(n_noisy, generator=generator)
+        deviation = self.max_noise_deviation * torch.rand(n_noisy, generator=generator)
         noise = torch.randn((n_noisy, *x.shape[1:]), generator=generator)
         x[is_noisy] += deviation.view(n_noisy, 1, 1, 1) * noise
 
     def _cut_out(self, x: Tensor, generator: Generator) -> None:
         """Hide a part of some of the images (N, 3, H, W) by a gray square in place."""
-        is_hidden = _choose(self.cutout, len(x), generator).tolist()
+        is_hidden = _choose(self.cutout_probability, len(x), generator).tolist()
         height, width = x.shape[2:]
         samples = torch.rand((len(x), 4), generator=generator).tolist()
         for index, (size, top, left, gray) in enumerate(samples):

@@ -142,7 +142,7 @@ class HardenConfig(AttackConfig):
         return max(1, TEXTURE_USES_PER_EPOCH // self.views)
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return self.command, *self.controls
 
 
@@ -276,7 +276,7 @@ class HardenResult(views.InNotebook, RunResult):
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """How many scenes are robust after and before; empty if that is unknown."""
         if self.before is None or self.after is None:
             return ""
@@ -366,7 +366,7 @@ def _make_robustness_part(result: HardenResult) -> ResultPart:
         }
     return ResultPart(
         "Before and after",
-        heads=HEADS,
+        column_heads=HEADS,
         rows=[
             [name, *_share_cells(before), *_share_cells(after)]
             for name, (before, after) in shares.items()

@@ -59,7 +59,7 @@ class Trainer(ABC):
     """Trains models of one task on items, each of which has images of a scene.
 
     Attributes:
-        work: samples items from scenes; it has the original model.
+        scene_jobs: samples items from scenes; it has the original model.
         student: the copy that is trained.
         optimiser: creates the optimizer of the parameters, with a learning rate of its
             own; None for AdamW.
@@ -96,7 +96,7 @@ class Trainer(ABC):
                 AdamW.
             custom_items: the user's own items, which each round trains on.
         """
-        self.work = work
+        self.scene_jobs = work
         self.config = work.config
         self.student = student
         self.optimiser = optimiser
@@ -122,7 +122,7 @@ class Trainer(ABC):
         """Return how often an epoch uses an item."""
 
     @abstractmethod
-    def gradient_context(
+    def open_gradient_context(
         self, new: Sequence[Any]
     ) -> AbstractContextManager[ComputeGradient]:
         """Return a context in which gradients are computed.
@@ -132,7 +132,7 @@ class Trainer(ABC):
         """
 
     @abstractmethod
-    def score(self, held_back: Sequence[Any]) -> Score:
+    def evaluate_student(self, validation_items: Sequence[Any]) -> Score:
         """Evaluate the student on items of the validation, which are not changed."""
 
     @abstractmethod
@@ -144,10 +144,10 @@ class Trainer(ABC):
         n_items = sum(self.uses_per_epoch(item) for item in pool)
         return self.config.epochs * math.ceil(n_items / self.batch_size)
 
-    def round(
+    def train_round(
         self,
         number: int,
-        pool: Sequence[Any],
+        training_items: Sequence[Any],
         new: Sequence[Any] = (),
         tick: Callable[[], None] = lambda: None,
     ) -> None:
@@ -158,18 +158,18 @@ class Trainer(ABC):
 
         Args:
             number: number of the round, which decides the order of the items.
-            pool: all items of this and earlier rounds.
+            training_items: all items of this and earlier rounds.
             new: items that no earlier round has used.
             tick: function that is called after each step, for the progress.
         """
         parameters = self.student.parameters()
-        optimizer, schedule = self._make_optimizer(parameters, self.count_steps(pool))
+        optimizer, schedule = self._make_optimizer(parameters, self.count_steps(training_items))
         average = [parameter.detach().clone() for parameter in parameters]
         # Gradients draw from the same generator, so an epoch is shuffled when it
         # begins, and not before.
-        rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
-        with self.gradient_context(new) as compute_gradient:
-            for n_steps, batch in enumerate(self._iterate_batches(pool, rng), start=1):
+        rng = np.random.default_rng([seeds.derive_seed(self.config.seed, "order"), number])
+        with self.open_gradient_context(new) as compute_gradient:
+            for n_steps, batch in enumerate(self._iterate_batches(training_items, rng), start=1):
                 compute_gradient(batch, rng)
                 # Without a limit, a few very wrong images could make a step so large
                 # that it undoes others.
@@ -284,7 +284,7 @@ class Rounds:
     """The rounds of a run.
 
     Attributes:
-        results: the result of each round that has ended; the first is the original
+        finished_rounds: the result of each round that has ended; the first is the original
             model.
     """
 
@@ -293,8 +293,8 @@ class Rounds:
         self.run = run
         self.trainer = trainer
         self.config = trainer.config
-        self.progress = trainer.work.progress
-        self.results = [
+        self.progress = trainer.scene_jobs.progress
+        self.finished_rounds = [
             TrainingRound.from_values(fields)
             for fields in json.loads(run.store.read_note(ROUNDS_NOTE) or "[]")
         ]
@@ -308,7 +308,7 @@ class Rounds:
         return min(math.ceil(self.config.scenes / 3), MAX_VALIDATION_SCENES)
 
     @property
-    def best(self) -> int:
+    def best_round_number(self) -> int:
         """Number of the most robust round that has enough clean accuracy.
 
         If several are as robust, it is the last. It is 0, the original model, if there
@@ -316,29 +316,29 @@ class Rounds:
         """
         allowed = [
             number
-            for number, training_round in enumerate(self.results)
+            for number, training_round in enumerate(self.finished_rounds)
             if self.is_allowed(training_round.clean)
         ]
         return max(
-            allowed, key=lambda number: (self.results[number].robust, number), default=0
+            allowed, key=lambda number: (self.finished_rounds[number].robust, number), default=0
         )
 
     def is_allowed(self, clean: float) -> bool:
         """Return whether a clean accuracy has fallen by no more than allowed."""
         # 1e-9 is for rounding errors: a fall by exactly `clean_loss` is allowed.
-        return clean >= self.results[0].clean - self.config.clean_loss - 1e-9
+        return clean >= self.finished_rounds[0].clean - self.config.clean_loss - 1e-9
 
     def execute(self) -> None:
         """Run the rounds that are left, and write the best weights.
 
         Afterwards the student has the best weights.
         """
-        n_trained_rounds = len(self.results) - 1  # round 0 is the original model
+        n_trained_rounds = len(self.finished_rounds) - 1  # round 0 is the original model
         is_done = n_trained_rounds >= self.config.rounds
         if not is_done:
             self._run_rounds()
         network = self.trainer.student.network
-        network.load_state_dict(self.read_weights(self.best))
+        network.load_state_dict(self.read_weights(self.best_round_number))
         self.write_weights(WEIGHTS_FILE)
 
     def _run_rounds(self) -> None:
@@ -355,9 +355,9 @@ class Rounds:
             VALIDATION,
             range(self.n_validation_scenes),
         )
-        if not self.results:
+        if not self.finished_rounds:
             self.progress.stage("evaluating the original model")
-            original_score = trainer.score(held_back)
+            original_score = trainer.evaluate_student(held_back)
             self.store_round(0, [], original_score, n_trained=0, interpolation=0.0)
         pool = list(trainer.custom_items)
         n_used = 0  # items of the pool that an earlier round of this session has used
@@ -370,7 +370,7 @@ class Rounds:
                 range((number - 1) * n_scenes, number * n_scenes),
             )
             pool += new_items
-            is_done_before = number < len(self.results)  # in an earlier session
+            is_done_before = number < len(self.finished_rounds)  # in an earlier session
             if is_done_before:
                 continue
             score, interpolation = self._train(number, pool, n_used, held_back)
@@ -395,7 +395,7 @@ class Rounds:
         """
         self.progress.stage(f"round {number}: training", self.trainer.count_steps(pool))
         with workbench.all_for_torch():
-            self.trainer.round(
+            self.trainer.train_round(
                 number,
                 pool,
                 new=pool[n_used:],
@@ -435,7 +435,7 @@ class Rounds:
         allowed_scores = dict[float, Score]()  # those with enough clean accuracy
         for interpolation in INTERPOLATIONS:
             network.load_state_dict(_interpolate(original, trained, interpolation))
-            score = self.trainer.score(held_back)
+            score = self.trainer.evaluate_student(held_back)
             scores[interpolation] = score
             self.progress.advance(1, worst=score.robust)
             if self.is_allowed(score.clean):
@@ -473,7 +473,7 @@ class Rounds:
         # The result is stored last: a round that was stopped before is trained again.
         self.write_weights(ROUND_FILE.format(number))
         self.trainer.save_images(self.run, number, new_items)
-        self.results.append(
+        self.finished_rounds.append(
             TrainingRound(
                 lessons=n_trained,
                 part=interpolation,
@@ -483,7 +483,7 @@ class Rounds:
             )
         )
         stored_results = [
-            training_round.model_dump() for training_round in self.results
+            training_round.model_dump() for training_round in self.finished_rounds
         ]
         self.run.store.write_note(ROUNDS_NOTE, json.dumps(stored_results))
         clean = wording.percent(score.clean)

@@ -191,7 +191,7 @@ class SceneJobs:
         )
         # The seed does not depend on the weights: the models before and after the
         # training are attacked in the same way.
-        seed = seeds.stream(self.config.seed, f"measured {control}", number)
+        seed = seeds.derive_seed(self.config.seed, f"measured {control}", number)
         search: dict[str, Any] = {}
         if steps_factor > 1:
             # Its policies do not all use gradients, which a hardened model may mask.
@@ -227,7 +227,7 @@ class SceneJobs:
         for view in range(CLEAN_VIEWS):
             # Each view of each scene has its own seed, which is the same for both
             # models.
-            seed = seeds.stream(split.seed, "plain", number * CLEAN_VIEWS + view)
+            seed = seeds.derive_seed(split.seed, "plain", number * CLEAN_VIEWS + view)
             for when, evaluation in _evaluate_start(problem, seed, models).items():
                 evaluations.setdefault(when, []).append(evaluation.right)
                 if not evaluation.right and evaluation.outcome is not None:
@@ -242,7 +242,7 @@ class SceneJobs:
         return self.model.with_network(network)
 
     @cached_property
-    def linear_controls(self) -> tuple[str, ...]:
+    def matrix_controls(self) -> tuple[str, ...]:
         """The controls whose images a matrix of light transport predicts."""
         return tuple(
             control for control in self.config.controls if self._has_matrix(control)
@@ -254,7 +254,7 @@ class SceneJobs:
         return tuple(
             control
             for control in self.config.controls
-            if control not in self.linear_controls
+            if control not in self.matrix_controls
         )
 
     @cached_property
@@ -266,7 +266,7 @@ class SceneJobs:
         return tuple(
             name
             for name in self.rendered_controls
-            if all(self._has_matrix(other, name) for other in self.linear_controls)
+            if all(self._has_matrix(other, name) for other in self.matrix_controls)
         )
 
     def _has_matrix(self, control: str, varying_control: str | None = None) -> bool:
@@ -338,7 +338,7 @@ class SceneJobs:
         problem = workbench.make_problem_on(
             config, scene, self.model, differentiated=False
         )
-        return problem, seeds.stream(split.seed, "views", number)
+        return problem, seeds.derive_seed(split.seed, "views", number)
 
     def make_attack_config(
         self, controls: Sequence[str], name: str, **changes: object
@@ -411,7 +411,7 @@ def _evaluate_start(
     start = problem.domain.start
     # a batch of one image (1, H, W, 3)
     image = problem.picture(start, seed, CLEAN_SPP)[None]
-    truth = problem.find_truth(problem.add_conditions(start, seed))
+    truth = problem.find_truth(problem.make_full_configuration(start, seed))
     with torch.no_grad():
         return {
             name: problem.task.judge(model(image), truth)[0]
@@ -451,7 +451,7 @@ def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> 
     clean_trials = summary.clean.control
     if clean_trials is None:
         return "unsteady"
-    n_needed = workbench.WORST_CASE.count_needed(clean_trials.trials)
+    n_needed = workbench.WORST_CASE.count_needed_successes(clean_trials.trials)
     return ROBUST if clean_trials.correct >= n_needed else "unsteady"
 
 
@@ -527,7 +527,7 @@ class SceneSplit:
     def make_generator(self, number: int) -> np.random.Generator:
         """Return the random generator of a scene."""
         return np.random.default_rng(
-            [seeds.stream(self.seed, f"{self.name} scene", number)]
+            [seeds.derive_seed(self.seed, f"{self.name} scene", number)]
         )
 
     def generate_objects(self, count: int) -> Iterator[assets.ObjectAsset]:
@@ -588,7 +588,7 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
             name,
             objects,
             training_environments,
-            seeds.stream(config.seed, name),
+            seeds.derive_seed(config.seed, name),
             varied=True,
         )
         for name in (TRAINING, FURTHER, VALIDATION)
@@ -601,7 +601,7 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
         HELD_OUT,
         held_out_objects,
         _environments(config.held_out_environment, "heldout"),
-        seeds.stream(config.seed, HELD_OUT),
+        seeds.derive_seed(config.seed, HELD_OUT),
     )
     return splits
 

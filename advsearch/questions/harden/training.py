@@ -49,7 +49,7 @@ N_FIRST_STEPS = 4
 N_VALIDATION_STEPS = 8
 """Steps of the search for textures of the validation; it begins anew for all weights."""
 AUGMENTATION = Augmentation(
-    smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0
+    smallest_crop=0.75, largest_crop=1.15, max_rotation_degrees=15.0, cutout_probability=0.0
 )
 """Augmentation of training images. The search for worse images has the same."""
 ORIGINAL_MODEL_WEIGHT = 1.0
@@ -77,7 +77,7 @@ class ClassifierTrainer(Trainer):
     Attributes:
         n_views: number of views of a training scene, and of a validation scene, for
             controls with a matrix of light transport.
-        beside: batches of the user's own images and class indices; None without any.
+        user_examples: batches of the user's own images and class indices; None without any.
     """
 
     batch_size = 24
@@ -105,12 +105,12 @@ class ClassifierTrainer(Trainer):
         super().__init__(work, student, optimiser)
         # The validation only compares weights, for which two views suffice.
         self.n_views = (self.config.views, 2)
-        self.beside = beside
+        self.user_examples = beside
         self._example_batches: Iterator[tuple[Tensor, Tensor]] = iter(())
 
     @property
     def n_further_scenes(self) -> int:
-        return RENDERED_SCENES if self.work.rendered_controls else PLAIN_SCENES
+        return RENDERED_SCENES if self.scene_jobs.rendered_controls else PLAIN_SCENES
 
     def sample_items(
         self, title: str, split: str, scene_numbers: range
@@ -132,7 +132,7 @@ class ClassifierTrainer(Trainer):
         if split == TRAINING:
             jobs += self._further_jobs(scene_numbers)
         # Jobs end in any order; the lessons are returned in the order of the jobs.
-        lessons_of_job = dict(self.work.run_jobs(title, jobs))
+        lessons_of_job = dict(self.scene_jobs.run_jobs(title, jobs))
         sampled_lessons: list[Lesson] = []
         for index in range(len(jobs)):
             sampled_lessons += lessons_of_job[index]
@@ -151,7 +151,7 @@ class ClassifierTrainer(Trainer):
         training_views, validation_views = self.n_views
         jobs = list[Job]()
         for control, number in itertools.product(
-            self.work.linear_controls, scene_numbers
+            self.scene_jobs.matrix_controls, scene_numbers
         ):
             n_views = validation_views
             shares_texture = False
@@ -171,7 +171,7 @@ class ClassifierTrainer(Trainer):
                     plain=1,
                     shared=shares_texture,
                     varying_controls=(
-                        self.work.random_controls if varies_others else ()
+                        self.scene_jobs.random_controls if varies_others else ()
                     ),
                 )
             )
@@ -185,7 +185,7 @@ class ClassifierTrainer(Trainer):
         student should predict as the original model does. In the validation split it
         has only such views.
         """
-        controls = self.work.rendered_controls
+        controls = self.scene_jobs.rendered_controls
         if not controls:
             return []
         n_views = 1
@@ -211,13 +211,13 @@ class ClassifierTrainer(Trainer):
         # count the scenes of the split `FURTHER`.
         first = self.n_further_scenes * scene_numbers[0]
         end = self.n_further_scenes * (scene_numbers[-1] + 1)
-        if self.work.rendered_controls:
-            controls = self.work.rendered_controls
+        if self.scene_jobs.rendered_controls:
+            controls = self.scene_jobs.rendered_controls
             n_views = 1
             n_plain = 0
         else:
             # A scene needs a control, which a plain view does not change.
-            controls = self.work.linear_controls[:1]
+            controls = self.scene_jobs.matrix_controls[:1]
             n_views = 0
             n_plain = 1
         return [
@@ -239,7 +239,7 @@ class ClassifierTrainer(Trainer):
         Returns:
             Whether the views share a texture, and whether other controls vary.
         """
-        seed = seeds.stream(self.config.seed, f"views of {control}", number)
+        seed = seeds.derive_seed(self.config.seed, f"views of {control}", number)
         shared_sample, varied_sample = np.random.default_rng(seed).random(2)
         shares_texture = bool(shared_sample < SHARED_TEXTURE_PROBABILITY)
         varies_others = bool(varied_sample < RANDOM_CONTROLS_PROBABILITY)
@@ -252,7 +252,7 @@ class ClassifierTrainer(Trainer):
         return 1
 
     @contextmanager
-    def gradient_context(self, new: Sequence[Lesson]) -> Iterator[ComputeGradient]:
+    def open_gradient_context(self, new: Sequence[Lesson]) -> Iterator[ComputeGradient]:
         """Search for worse images of the new lessons, then open threads for gradients.
 
         Args:
@@ -263,7 +263,7 @@ class ClassifierTrainer(Trainer):
         lessons.search_worse_images(new, self.student.model, N_FIRST_STEPS)
         with open_single_threaded_pool() as pool:
             gradients = GradientComputer(
-                self.student, original_model=self.work.model, pool=pool
+                self.student, original_model=self.scene_jobs.model, pool=pool
             )
 
             def compute_gradient(
@@ -284,22 +284,22 @@ class ClassifierTrainer(Trainer):
 
         They begin again when they end.
         """
-        if self.beside is None:
+        if self.user_examples is None:
             return None
         batch = next(self._example_batches, None)
         if batch is None:
-            self._example_batches = iter(self.beside)
+            self._example_batches = iter(self.user_examples)
             batch = next(self._example_batches)
         return batch
 
-    def score(self, held_back: Sequence[Lesson]) -> Score:
+    def evaluate_student(self, validation_items: Sequence[Lesson]) -> Score:
         """Evaluate the student on held-back lessons, which are not changed.
 
         Textures are searched against the student. Plain lessons count only for the
         clean accuracy.
         """
         # copies, since a search changes the lessons
-        searched = [copy.copy(lesson) for lesson in held_back]
+        searched = [copy.copy(lesson) for lesson in validation_items]
         model = self.student.model
         for lesson in searched:
             if isinstance(lesson, TextureLesson):
@@ -497,7 +497,7 @@ class GradientComputer:
         # Threads cannot share a network whose gradients are computed, so each part has
         # a copy.
         n_missing = len(parts) - len(self._twins)
-        self._twins += [self._student.make_twin() for _ in range(n_missing)]
+        self._twins += [self._student.copy_for_thread() for _ in range(n_missing)]
         part_seeds = itertools.count(seed)
         return list(self._pool.map(function, parts, self._twins, part_seeds))
 

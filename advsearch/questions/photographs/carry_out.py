@@ -608,10 +608,10 @@ def _find_attack_truth(
     _, _, trial_number = (rendering or "").rpartition("verification-")
     seed = None
     if trial_number.isdecimal():
-        seed = seeds.stream(problem.seed, "verification", int(trial_number))
-    configuration = problem.add_conditions(u, seed)
+        seed = seeds.derive_seed(problem.seed, "verification", int(trial_number))
+    configuration = problem.make_full_configuration(u, seed)
     facts = problem.make_facts(
         lambda: problem.space.describe(configuration),
-        lambda: problem.renderer.surfaces(configuration),
+        lambda: problem.renderer.find_surfaces(configuration),
     )
     return task.truth(facts)

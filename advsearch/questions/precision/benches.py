@@ -70,12 +70,12 @@ class MeasuredRounds:
     """Measurements of settings.
 
     Attributes:
-        results: measurements of each setting.
+        results_by_setting: measurements of each setting.
         wall_seconds: seconds of each call of a setting.
         skipped: settings that did not fit into the time.
     """
 
-    results: dict[SampleSetting, list[Any]] = field(default_factory=dict)
+    results_by_setting: dict[SampleSetting, list[Any]] = field(default_factory=dict)
     wall_seconds: dict[SampleSetting, list[float]] = field(default_factory=dict)
     skipped: list[SampleSetting] = field(default_factory=list)
 
@@ -92,17 +92,17 @@ class MeasuredRounds:
             call_seconds = self.wall_seconds[setting]
             warm_calls = call_seconds[COLD_CALLS:] or call_seconds[-1:]
             return statistics.median(warm_calls[-3:])
-        by_cost = sorted(self.wall_seconds, key=lambda known: known.cost)
+        by_cost = sorted(self.wall_seconds, key=lambda known: known.relative_cost)
         # Later settings replace earlier ones, so that the most expensive one is left.
-        most_expensive = {known.line: known for known in by_cost}
+        most_expensive = {known.estimator_key: known for known in by_cost}
         seconds_per_cost = {
-            line: self.estimate_call_seconds(known) / known.cost
+            line: self.estimate_call_seconds(known) / known.relative_cost
             for line, known in most_expensive.items()
         }
         highest = max(seconds_per_cost.values(), default=0.0)
-        return setting.cost * seconds_per_cost.get(setting.line, highest)
+        return setting.relative_cost * seconds_per_cost.get(setting.estimator_key, highest)
 
-    def fits(self, setting: SampleSetting, seconds_left: float) -> bool:
+    def fits_in_time(self, setting: SampleSetting, seconds_left: float) -> bool:
         """Return whether a new setting fits into the remaining time."""
         return self.estimate_needed_seconds(setting, seconds_left) <= seconds_left
 
@@ -169,24 +169,24 @@ def measure_in_rounds(
 
     def measure_once(setting: SampleSetting) -> None:
         """Measure a setting with its next seed, and store the result and its time."""
-        measurements = measured.results.setdefault(setting, [])
+        measurements = measured.results_by_setting.setdefault(setting, [])
         start = budget.clock()
-        stream = f"precision {'/'.join(setting.line)}/{setting.spp}"
-        call_seed = seeds.stream(seed, stream, len(measurements))
+        stream = f"precision {'/'.join(setting.estimator_key)}/{setting.spp}"
+        call_seed = seeds.derive_seed(seed, stream, len(measurements))
         measurements.append(measure(setting, call_seed))
         measured.wall_seconds.setdefault(setting, []).append(budget.clock() - start)
         on_done(setting)
 
-    for setting in sorted(settings, key=lambda setting: setting.cost):
-        is_first = not measured.results
-        if is_first or measured.fits(setting, budget.seconds_left):
+    for setting in sorted(settings, key=lambda setting: setting.relative_cost):
+        is_first = not measured.results_by_setting
+        if is_first or measured.fits_in_time(setting, budget.seconds_left):
             for _ in range(COLD_CALLS):
                 measure_once(setting)
         else:
             measured.skipped.append(setting)
     # The first round is over: each setting was called twice.
     for _ in range(1, rounds):
-        for setting in measured.results:
+        for setting in measured.results_by_setting:
             if measured.estimate_call_seconds(setting) <= budget.seconds_left:
                 measure_once(setting)
     return measured
@@ -216,7 +216,7 @@ def take_reference_parts(
         if len(parts) >= 2 and expected_seconds >= budget.seconds_left:
             break
         start = budget.clock()
-        parts.append(take_part(seeds.stream(seed, "reference", len(parts))))
+        parts.append(take_part(seeds.derive_seed(seed, "reference", len(parts))))
         # The next part may be as slow as the slowest so far, whose influence halves
         # with each part.
         expected_seconds = max(budget.clock() - start, 0.5 * expected_seconds)
@@ -324,10 +324,10 @@ class PictureBench:
         self._space = renderer.space
         self._formation = renderer.formation
         # All samplers without denoiser, then two of them with a denoiser.
-        self._lines = list(samplers)
+        self._estimators = list(samplers)
         for name in ("independent", REFERENCE_SAMPLER):
             if name in samplers:
-                self._lines.append(name + OIDN)
+                self._estimators.append(name + OIDN)
         # references, by quantity ("picture" or "margin") and denoiser
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {
@@ -339,10 +339,10 @@ class PictureBench:
             line: renderer.copy_with(
                 scenes[line.removesuffix(OIDN)], denoiser=get_denoiser(line)
             )
-            for line in {*self._lines, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
+            for line in {*self._estimators, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
         }
         self.settings = [
-            setting for line in self._lines for setting in list_line_settings(line)
+            setting for line in self._estimators for setting in list_image_settings(line)
         ]
 
     def compute_references(
@@ -363,7 +363,7 @@ class PictureBench:
             A row of the result for each reference.
         """
         # "none" comes first, as in `_lines`: the other references need it.
-        denoisers = list(dict.fromkeys(map(get_denoiser, self._lines)))
+        denoisers = list(dict.fromkeys(map(get_denoiser, self._estimators)))
         rows = []
         for index, denoiser in enumerate(denoisers):
             # The remaining time is divided evenly: an earlier reference may have left
@@ -449,43 +449,43 @@ class PictureBench:
             numbers[quantity] = {**reference.compare(value), **times}
         return numbers
 
-    def _render_radiance(self, line: str, seed: int, spp: int) -> Tensor:
+    def _render_radiance(self, estimator: str, seed: int, spp: int) -> Tensor:
         """Render the linear image (H, W, 3) of a line."""
         with torch.no_grad():
-            return self._renderers[line].radiance(self._u, seed, spp)
+            return self._renderers[estimator].radiance(self._u, seed, spp)
 
     def _display(self, radiance: Tensor) -> Tensor:
         """Return the image (H, W, 3) in sRGB, as the model gets it."""
         with torch.no_grad():
             return self._space.apply_to_image(
-                self._u, self._formation.display(radiance)
+                self._u, self._formation.map_to_display(radiance)
             )
 
 
-def list_line_settings(line: str) -> list[SampleSetting]:
+def list_image_settings(estimator: str) -> list[SampleSetting]:
     """Return the settings of a line of images: one for each sample count.
 
     A line is a sampler, such as "independent", or a sampler with denoiser.
     """
     # The cost decides the order of measurements. Other lines have a higher cost so that
     # they come later.
-    cost_factor = 1.0 if line in PREFERRED_LINES else OTHER_LINES_COST
+    cost_factor = 1.0 if estimator in PREFERRED_LINES else OTHER_LINES_COST
     return [
         SampleSetting(
             quantity="picture",
-            estimator=line,
+            estimator=estimator,
             spp=count,
-            cost=count * cost_factor,
+            relative_cost=count * cost_factor,
             # settings with the same denoiser are compared with each other
-            family=get_denoiser(line),
+            family=get_denoiser(estimator),
         )
-        for count in SAMPLE_COUNTS.get(line, OTHER_SAMPLE_COUNTS)
+        for count in SAMPLE_COUNTS.get(estimator, OTHER_SAMPLE_COUNTS)
     ]
 
 
-def get_denoiser(line: str) -> str:
+def get_denoiser(estimator: str) -> str:
     """Return the denoiser of a line: "oidn" or "none"."""
-    return "oidn" if line.endswith(OIDN) else "none"
+    return "oidn" if estimator.endswith(OIDN) else "none"
 
 
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
@@ -640,7 +640,7 @@ class GradientBench:
             quantity="gradient",
             estimator=estimator,
             spp=spp,
-            cost=spp * renders,
+            relative_cost=spp * renders,
             control=self.part.name,
         )
 
@@ -857,8 +857,8 @@ def _make_row(
         control=control,
         reference=name,
         error=value.error,
-        parts=value.parts,
-        spp=spp * value.parts,
+        parts=value.n_parts,
+        spp=spp * value.n_parts,
     )
 
 

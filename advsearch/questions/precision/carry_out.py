@@ -50,7 +50,7 @@ from advsearch.questions.precision.rule import (
     confirm_recommendation,
     describe_disagreement,
     fit_line,
-    recommend_count,
+    recommend_spp,
     summarize_samples,
 )
 
@@ -84,10 +84,10 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     measurer = QuantityMeasurer(config, problem, context.progress)
     measurements = context.open_measurements()  # those of a resumed run are stored
     setup_seconds = time.perf_counter() - start_time
-    result = measurements.collect(
+    result = measurements.make_result_of_rows(
         measurer.measure_sittings(
             # a stored sitting is read; a new one is measured
-            lambda name, measure: measurements.get_row(name, Sitting, measure)
+            lambda name, measure: measurements.get_or_measure_row(name, Sitting, measure)
         ),
         # makes the result from the sittings so far, after each of them
         lambda sittings: _make_result(context, measurer, sittings, setup_seconds),
@@ -125,7 +125,7 @@ def _make_result(
         environment=problem.environment,
         depth=problem.renderer.scene.max_depth,
         loss=config.loss,
-        spp=problem.spp,
+        spp=problem.search_spp,
         goal=config.error,
         image_formation=results.Formation.from_values(problem.renderer.formation),
         machine=Machine(**context.machine, threads=count_threads()),
@@ -138,7 +138,7 @@ def _make_result(
             points,
             confirmations=join("confirmations"),
             goal=config.error,
-            round_up=measurer.round_up,
+            round_up=measurer.round_up_samples,
             or_steeper=measurer.may_be_steeper,
         ),
         figures=[],
@@ -198,7 +198,7 @@ class QuantityMeasurer:
 
     Attributes:
         problem: the attack whose scene, controls and model are measured.
-        sittings: the quantities, in the order in which they are measured.
+        planned_sittings: the quantities, in the order in which they are measured.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class QuantityMeasurer:
         self._config = config
         self.problem = problem
         self._progress = progress
-        self._seed = seeds.stream(config.seed, "precision")
+        self._seed = seeds.derive_seed(config.seed, "precision")
         self._is_linear = config.loss == "linear"
         self._renderer = problem.renderer
         self._loss = cast(gradients.Loss, problem.compute_loss)
@@ -230,7 +230,7 @@ class QuantityMeasurer:
             self._loss = gradients.make_smooth_loss(
                 self._renderer.formation.resolution, config.seed
             )
-        self.sittings = self._plan_sittings()
+        self.planned_sittings = self._plan_sittings()
 
     def _plan_sittings(self) -> list[PlannedSitting]:
         """Plan the sittings: the image first, then the gradient of each control.
@@ -274,16 +274,16 @@ class QuantityMeasurer:
                 that measures it.
         """
         seconds_left = self._config.seconds
-        for number, planned in enumerate(self.sittings):
+        for number, planned in enumerate(self.planned_sittings):
             fraction_left = math.fsum(
-                later.fraction for later in self.sittings[number:]
+                later.fraction for later in self.planned_sittings[number:]
             )
             budget = TimeBudget(seconds_left * planned.fraction / fraction_left)
             sitting = read_or_measure(planned.name, partial(planned.measure, budget))
             seconds_left = max(0.0, seconds_left - sitting.seconds)
             yield sitting
 
-    def round_up(self, point: PrecisionPoint, samples: float) -> int:
+    def round_up_samples(self, point: PrecisionPoint, samples: float) -> int:
         """Round up to a number of samples that the sampler of a point accepts.
 
         Args:
@@ -318,7 +318,7 @@ class QuantityMeasurer:
     def _measure_image(self, budget: TimeBudget) -> Sitting:
         """Measure images and the model's margin on them."""
         problem = self.problem
-        u = problem.add_conditions(problem.domain.start)
+        u = problem.make_full_configuration(problem.domain.start)
 
         def margin(image: torch.Tensor) -> float:
             """Return the model's margin on an image (H, W, 3)."""
@@ -355,7 +355,7 @@ class QuantityMeasurer:
             sitting.points,
             confirmations=[],
             goal=self._config.error,
-            round_up=self.round_up,
+            round_up=self.round_up_samples,
             or_steeper=self.may_be_steeper,
         )[0]
         warnings = []
@@ -405,10 +405,10 @@ class QuantityMeasurer:
             budget,
             rounds=MAX_CONFIRMATIONS,
             # seeds that the first measurements did not use
-            seed=seeds.stream(self._seed, "confirm"),
+            seed=seeds.derive_seed(self._seed, "confirm"),
             on_done=lambda _: advance(),
         )
-        samples = [numbers["gradient"] for numbers in measured.results[setting]]
+        samples = [numbers["gradient"] for numbers in measured.results_by_setting[setting]]
         if len(samples) < MIN_CONFIRMATIONS:
             return []
         reference_error = bench.get_reference_error(setting, "gradient")
@@ -479,7 +479,7 @@ def _summarize_settings(
     A measurement has numbers for each quantity: "picture" and "margin", or "gradient".
     """
     points = []
-    for setting, samples in measured.results.items():
+    for setting, samples in measured.results_by_setting.items():
         for quantity in samples[0]:
             numbers = [sample[quantity] for sample in samples]
             reference_error = bench.get_reference_error(setting, quantity)
@@ -544,7 +544,7 @@ def recommend_settings(
         first = line[0]
         key = (first.quantity, first.control, first.family)
         comparable = candidates.setdefault(key, [])
-        candidate = recommend_count(line, goal, round_up, or_steeper(first))
+        candidate = recommend_spp(line, goal, round_up, or_steeper(first))
         if candidate:
             comparable.append(candidate)
     recommended = []

@@ -116,7 +116,7 @@ class PrecisionConfig(DerivativeConfig):
         return value
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return self.object, self.command
 
     @property
@@ -146,7 +146,7 @@ class PrecisionPoint(results.Measured):
     )
 
     @property
-    def is_known(self) -> bool:
+    def has_known_error(self) -> bool:
         """Whether the error is known: clearly larger than that of the reference.
 
         Otherwise it is an upper limit.
@@ -154,7 +154,7 @@ class PrecisionPoint(results.Measured):
         return self.status == "ok"
 
     @property
-    def rms(self) -> float:
+    def rms_error(self) -> float:
         """The root mean square error; NaN if there is none."""
         return math.nan if self.error is None else self.error
 
@@ -337,7 +337,7 @@ def _make_parts(result: PrecisionResult) -> list[ResultPart]:
     return [
         ResultPart("Recommended", recommendations),
         # On a page this note is at the table of references instead.
-        ResultPart(text=[READING_NOTE], only="text"),
+        ResultPart(text=[READING_NOTE], only_medium="text"),
         *error_tables,
         ResultPart.make_table(
             result.slopes,
@@ -493,7 +493,7 @@ def draw_figures(result: PrecisionResult) -> figures.Figures:
     panels: dict[str, list[PrecisionPoint]] = {}
     for point in result.points:
         title = f"gradient: {point.control}" if point.control else point.quantity
-        if 0.0 < point.rms < math.inf:
+        if 0.0 < point.rms_error < math.inf:
             panels.setdefault(title, []).append(point)
     if not panels:
         return {}
@@ -541,7 +541,7 @@ def _make_caption(result: PrecisionResult) -> str:
     if any(point.interval for point in result.points):
         legend += ", with its 95 % interval"
     legend += "."
-    if not all(point.is_known for point in result.points):
+    if not all(point.has_known_error for point in result.points):
         legend += " Open, with an arrow: an upper limit, the reference is no better."
     return (
         f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are "
@@ -633,7 +633,7 @@ def _draw_theory(axes: Any, points: Sequence[PrecisionPoint]) -> None:
         return
     # the scale for which the line passes through the lowest point, relative to its
     # slope
-    smallest_scale = min(point.rms * math.sqrt(point.seconds) for point in points)
+    smallest_scale = min(point.rms_error * math.sqrt(point.seconds) for point in points)
     scale = PERCENT * smallest_scale * 0.8  # a little under that point
     # the middle of the range on a logarithmic axis
     center = math.sqrt(start * end)
@@ -671,7 +671,7 @@ def _draw_line(
     marker = MARKERS[number % len(MARKERS)]
     axes.plot(
         [point.seconds for point in line],
-        [PERCENT * point.rms for point in line],
+        [PERCENT * point.rms_error for point in line],
         color=color,
         linewidth=1.0,
         alpha=0.55,
@@ -701,7 +701,7 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
         color, marker: style of its estimator.
     """
     x = point.seconds
-    y = PERCENT * point.rms
+    y = PERCENT * point.rms_error
     lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
     # An interval is not drawn if it is missing (NaN), or if its upper bound is over
     # four times the error.
@@ -713,9 +713,9 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
         marker=marker,
         markersize=5,
         color=color,
-        markerfacecolor=color if point.is_known else "white",
+        markerfacecolor=color if point.has_known_error else "white",
     )
-    if not point.is_known:
+    if not point.has_known_error:
         arrow = {
             "arrowstyle": "-|>",
             "color": color,

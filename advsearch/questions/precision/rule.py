@@ -71,7 +71,7 @@ class SampleSetting:
         quantity: "picture", "margin" or "gradient".
         estimator: name of the sampler with the denoiser, or of the gradient estimator.
         spp: samples per pixel.
-        cost: expected time, in any unit.
+        relative_cost: expected time, in any unit.
         control: for a gradient, the name of its part, such as a control; else empty.
         family: for an image, its denoiser; only settings of the same family are
             compared for a recommendation. Empty for gradients.
@@ -80,12 +80,12 @@ class SampleSetting:
     quantity: str
     estimator: str
     spp: int
-    cost: float
+    relative_cost: float
     control: str = ""
     family: str = ""
 
     @property
-    def line(self) -> tuple[str, str, str]:
+    def estimator_key(self) -> tuple[str, str, str]:
         """The key of a line: settings that differ only in the number of samples."""
         return self.quantity, self.control, self.estimator
 
@@ -98,13 +98,13 @@ class ReferenceValue:
         value: (n,) the value.
         error: relative error of the value.
         norm: norm of the value.
-        parts: number of independent parts whose mean it is.
+        n_parts: number of independent parts whose mean it is.
     """
 
     value: Float64Array
     error: float
     norm: float
-    parts: int
+    n_parts: int
 
     def compare(self, value: Float64Array) -> dict[str, float]:
         """Compare a value (n,) with the reference.
@@ -180,7 +180,7 @@ def estimate_reference(
     norm = float(np.linalg.norm(value))
     error = math.hypot(scatter, bias_estimate, bias)
     return ReferenceValue(
-        value, error=relative_error(error, norm), norm=norm, parts=count
+        value, error=relative_error(error, norm), norm=norm, n_parts=count
     )
 
 
@@ -312,12 +312,12 @@ def fit_line(
         or_steeper: whether a steeper slope agrees with theory, too, as for stratified
             samples. None if theory predicts no slope; then `agrees` is None.
     """
-    known = [point for point in points if point.is_known]
+    known = [point for point in points if point.has_known_error]
     if len({point.spp for point in known}) < MIN_FIT_POINTS:
         return None
     line = linregress(
         np.log([float(point.spp) for point in known]),
-        np.log([point.rms for point in known]),
+        np.log([point.rms_error for point in known]),
     )
     slope = float(line.slope)
     # Student's t distribution; `len(known)` - 2, as the fit has two parameters
@@ -392,10 +392,10 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
     the steepest slope before.
     """
     known = sorted(
-        (point for point in points if point.is_known), key=lambda point: point.spp
+        (point for point in points if point.has_known_error), key=lambda point: point.spp
     )
     slopes = [
-        math.log(b.rms / a.rms) / math.log(b.spp / a.spp)
+        math.log(b.rms_error / a.rms_error) / math.log(b.spp / a.spp)
         for a, b in pairwise(known)
         if b.spp > a.spp
     ]
@@ -411,7 +411,7 @@ def round_up_exactly(point: PrecisionPoint, samples: float) -> int:
     return math.ceil(samples - 1e-9)  # rounding errors must not add a sample
 
 
-def recommend_count(
+def recommend_spp(
     points: Sequence[PrecisionPoint],
     goal: float,
     round_up: RoundUp = round_up_exactly,
@@ -485,7 +485,7 @@ def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) ->
     if not has_spare_points or not is_falling:
         return False
     for point in ordered:
-        if not point.is_known:
+        if not point.has_known_error:
             continue
         if not point.interval:
             return False
@@ -539,7 +539,7 @@ def _interpolate_error(
     slope = MONTE_CARLO_SLOPE
     if line:
         slope = max(line.slope, MIN_EXTRAPOLATED_SLOPE)
-    errors = [point.rms for point in ordered]
+    errors = [point.rms_error for point in ordered]
     return _interpolate_value(ordered, spp, errors, slope)
 
 
@@ -562,7 +562,7 @@ def confirm_recommendation(
         round_up: rounds up to a sample count that the estimator accepts.
     """
     assert recommendation.goal is not None and recommendation.spp is not None
-    needed_growth = max(1.0, (point.rms / recommendation.goal) ** 2)
+    needed_growth = max(1.0, (point.rms_error / recommendation.goal) ** 2)
     needed_spp = recommendation.spp * min(MAX_EXTRAPOLATION, needed_growth)
     spp = round_up(point, needed_spp)
     # Since the count is rounded up, it may grow by a little more than is needed.
@@ -570,7 +570,7 @@ def confirm_recommendation(
     update = {
         "spp": spp,
         "seconds": point.seconds * growth,
-        "error": point.rms / math.sqrt(growth),
+        "error": point.rms_error / math.sqrt(growth),
         "basis": "confirmed",
         "repeats": point.repeats,
     }
@@ -600,7 +600,7 @@ def _interpolate_count(
         The number of samples, or None if it cannot be extrapolated; and whether it is
         "measured", "interpolated" or "extrapolated".
     """
-    indices_above = [index for index, point in enumerate(ordered) if point.rms > goal]
+    indices_above = [index for index, point in enumerate(ordered) if point.rms_error > goal]
     if not indices_above:
         return float(ordered[0].spp), "measured"
     last_above = indices_above[-1]
@@ -609,7 +609,7 @@ def _interpolate_count(
     above = ordered[last_above]
     below = ordered[last_above + 1]
     # position of the goal between `above` (0) and `below` (1), on a logarithmic scale
-    fraction = math.log(above.rms / goal) / math.log(above.rms / below.rms)
+    fraction = math.log(above.rms_error / goal) / math.log(above.rms_error / below.rms_error)
     return above.spp * (below.spp / above.spp) ** fraction, "interpolated"
 
 
@@ -641,11 +641,11 @@ def _extrapolate_count(
         slope = MONTE_CARLO_SLOPE
     if slope is None or slope > MAX_FALLING_SLOPE:
         return None
-    if not last.is_known or has_leveled_off(ordered):
+    if not last.has_known_error or has_leveled_off(ordered):
         return None
     # error ~ samples^slope, so samples ~ error^(1 / slope). With a slope that is
     # steeper than the limit, the count would often be too small.
-    factor = (goal / last.rms) ** (1.0 / max(slope, MIN_EXTRAPOLATED_SLOPE))
+    factor = (goal / last.rms_error) ** (1.0 / max(slope, MIN_EXTRAPOLATED_SLOPE))
     return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
 
 

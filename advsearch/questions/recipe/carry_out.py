@@ -109,7 +109,7 @@ def run_recipe(context: RunContext[RecipeConfig]) -> RecipeResult:
     is_new = _read_noted_recipe(context) is None
     if is_new:  # a resumed run was checked when it began
         check_recipe(recipe, config)
-        check_figures(recipe, check_runs(runs), config.recipe)
+        check_figures(recipe, find_columns_of_parts(runs), config.recipe)
     # For a resumed run this writes the same note again.
     context.run.store.write_note(
         RECIPE_NOTE, json.dumps(recipe.model_dump(mode="json"))
@@ -137,7 +137,7 @@ def _read_noted_recipe(context: RunContext[RecipeConfig]) -> dict[str, Any] | No
 
     None for a new run, and for a run that was stopped before it noted its recipe.
     """
-    resumed = context.resumed
+    resumed = context.resumed_directory
     if resumed is None or not Store.is_in(resumed):
         return None
     with Store.open_to_read(resumed) as store:
@@ -150,7 +150,7 @@ def _load_recipe(context: RunContext[RecipeConfig]) -> Recipe:
     if noted is None:
         return description.read_recipe(context.config.recipe)
     return description.parse_recipe(
-        noted, f"{context.resumed}: the recipe that it began with"
+        noted, f"{context.resumed_directory}: the recipe that it began with"
     )
 
 
@@ -176,7 +176,7 @@ def _make_result(
     parts = [
         RecipePart(
             name=run.name,
-            part=run.part,
+            part=run.part_name,
             command=run.config.command,
             object=run.config.object,
             ending=run_result.ending,
@@ -199,8 +199,8 @@ def _make_result(
         warnings=list(dict.fromkeys(warnings)),
     )
     # A run that was killed has no summary, and its seconds are unknown.
-    if context.resumed is not None and (context.resumed / "summary.json").is_file():
-        previous = read_result(context.resumed)
+    if context.resumed_directory is not None and (context.resumed_directory / "summary.json").is_file():
+        previous = read_result(context.resumed_directory)
         previous_seconds = getattr(previous, "seconds", {"total": 0.0})
         result.seconds["total"] += previous_seconds["total"]
     return result
@@ -256,7 +256,7 @@ def check_recipe(recipe: Recipe, config: RecipeConfig) -> None:
             )
 
 
-def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
+def find_columns_of_parts(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
     """Load everything that the runs name, and return the columns of each part.
 
     Without this check, a wrong name might be found only after hours of rendering. Runs
@@ -276,14 +276,14 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
             if name not in ("seed", WORKERS_COLUMN)
         }
         # A mapping has no hash, so its text is the key.
-        key = f"{distinct_settings} {run.around}"
+        key = f"{distinct_settings} {run.search_run_name}"
         if key not in columns_of_settings:
             # the search around whose distribution this run samples
-            search = config_of_run[run.around] if run.around else None
+            search = config_of_run[run.search_run_name] if run.search_run_name else None
             columns_of_settings[key] = _check_run(run.config, search)
-        columns_of_part[run.part] |= columns_of_settings[key]
+        columns_of_part[run.part_name] |= columns_of_settings[key]
         if getattr(run.config, WORKERS_COLUMN, None) is not None:
-            columns_of_part[run.part].add(WORKERS_COLUMN)
+            columns_of_part[run.part_name].add(WORKERS_COLUMN)
     return columns_of_part
 
 
@@ -444,7 +444,7 @@ def _select_photographed(
     """
     selected = []
     for run in runs:
-        repeats_another = recipe.parts[run.part].drawn_as is not None
+        repeats_another = recipe.parts[run.part_name].drawn_as is not None
         if repeats_another or not isinstance(run.config, SweepConfig):
             continue
         if run.config.keep_pictures == "all":
@@ -473,17 +473,17 @@ def _run_parts(
     for number, run in enumerate(runs, start=1):
         config = run.config
         context.progress.message(
-            f"run {number} of {len(runs)}: {run.part}, {config.object}"
+            f"run {number} of {len(runs)}: {run.part_name}, {config.object}"
         )
-        if run.around is not None:
+        if run.search_run_name is not None:
             search: Any = read_result(
-                RunDirectory.locate_part(context.run.path, run.around)
+                RunDirectory.locate_part(context.run.path, run.search_run_name)
             )
             if search.distribution is None:
                 left_out.append(
                     f"{config.object}: the search ended with {search.ending!r} and no "
                     "distribution, so that the part "
-                    f"{run.part} is left out for it."
+                    f"{run.part_name} is left out for it."
                 )
                 continue
             search_ranges = search.configuration or {}
@@ -642,10 +642,10 @@ def _read_frame(
     for run, result in done:
         # The kinds of stored rows that count for each part.
         is_sweep = isinstance(run.config, SweepConfig)
-        row_kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIAL_NAMES)}
+        row_kinds: dict[str, Sequence[str]] = {run.part_name: tuple(TRIAL_NAMES)}
         if is_sweep:
             row_kinds = {
-                run.part: ("sweep",),
+                run.part_name: ("sweep",),
                 PHOTOGRAPHS: workbench.load_photographs().row_kinds,
             }
             if result.surface:

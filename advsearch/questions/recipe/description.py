@@ -260,16 +260,16 @@ class PlannedRun:
 
     Attributes:
         name: name of the run's directory.
-        part: name of the part that it belongs to.
+        part_name: name of the part that it belongs to.
         config: settings of the run.
-        around: name of the directory of the search that it samples around; None if it
+        search_run_name: name of the directory of the search that it samples around; None if it
             samples around none.
     """
 
     name: str
-    part: str
+    part_name: str
     config: SceneConfig
-    around: str | None
+    search_run_name: str | None
 
 
 def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
@@ -310,9 +310,9 @@ def plan_runs(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
             runs.append(
                 PlannedRun(
                     name=f"{name}-{suffix}",
-                    part=name,
+                    part_name=name,
                     config=run_config,
-                    around=search_directory,
+                    search_run_name=search_directory,
                 )
             )
     if len(runs) > MAX_RUNS:
@@ -369,7 +369,7 @@ def _make_run_config(
         **recipe.settings,
         **part.settings,
         **value_of_setting,
-        "seed": seeds.stream(config.seed, seed_name),
+        "seed": seeds.derive_seed(config.seed, seed_name),
     }
     if config.deterministic:
         run_settings["deterministic"] = True
@@ -417,7 +417,7 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
     if is_bundled:
         return
     for run in runs:
-        run.config.check_powers(f"{name}: parts: {run.part}")
+        run.config.check_no_effects(f"{name}: parts: {run.part_name}")
 
 
 def apply_command_settings(recipe: Recipe, config: RecipeConfig) -> Recipe:

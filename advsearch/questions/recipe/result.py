@@ -147,7 +147,7 @@ class RecipeConfig(Config):
         return value
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         """The names that a run's directory is named after: the recipe and an object."""
         objects = settings.split_names(self.object or "")
         return Path(self.recipe).stem, *(Path(name).stem for name in objects[:1])
@@ -217,13 +217,13 @@ class RecipeResult(views.InNotebook, RunResult):
     warnings: list[str] = Field(description="remarks that limit what the result shows")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         return f"{len(self.figures)} figures"
 
 
 def make_view(result: RecipeResult) -> ShownResult:
     """Lay out a result: each figure with its sentences and numbers, then the runs."""
-    sections = [ResultPart(text=[result.about], only="page")]
+    sections = [ResultPart(text=[result.about], only_medium="page")]
     sections += _list_figures(result)
     sections.append(_list_runs(result.parts))
     objects = ", ".join(map(wording.shorten_name, result.objects))
@@ -259,7 +259,7 @@ def _list_figures(result: RecipeResult) -> list[ResultPart]:
         rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
         sections.append(
             ResultPart(
-                "The numbers", heads=figure.columns, rows=rows, folded=True, only="page"
+                "The numbers", column_heads=figure.columns, rows=rows, folded=True, only_medium="page"
             )
         )
     return sections
@@ -270,11 +270,11 @@ def _list_runs(parts: Sequence[RecipePart]) -> ResultPart:
     rows = [[run.name, run.command, run.ending, str(run.renders)] for run in parts]
     return ResultPart(
         wording.format_count(len(parts), "run"),
-        heads=("run in parts/", "command", "ending", "renders"),
+        column_heads=("run in parts/", "command", "ending", "renders"),
         rows=rows,
         parts=[run.name for run in parts],
         folded=True,
-        only="page",
+        only_medium="page",
     )
 
 

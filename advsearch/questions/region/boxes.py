@@ -250,7 +250,7 @@ class GrowingBox:
     def _sample(self, low: Tensor, high: Tensor, count: int) -> Tensor:
         """Return points (count, d) uniform in a box; each call has new random numbers."""
         generator = torch.Generator().manual_seed(
-            seeds.stream(self._seed, "region", self._n_draws)
+            seeds.derive_seed(self._seed, "region", self._n_draws)
         )
         self._n_draws += 1
         unit_points = torch.rand(count, len(self._center), generator=generator)

@@ -42,23 +42,23 @@ class VariedParameters:
 
     Attributes:
         names: names of the parameters.
-        coordinates: their indices in u (k,).
+        coordinate_indices: their indices in u (k,).
         center: the configuration around which the box grows (d,).
     """
 
     names: tuple[str, ...]
-    coordinates: Tensor
+    coordinate_indices: Tensor
     center: Tensor
 
     @property
     def start(self) -> Tensor:
         """Their coordinates at the center (k,), in [0, 1]."""
-        return self.center[self.coordinates]
+        return self.center[self.coordinate_indices]
 
-    def with_values(self, values: Tensor) -> Tensor:
+    def make_configuration(self, values: Tensor) -> Tensor:
         """Return the center (d,) with other coordinates (k,) of these parameters."""
         u = self.center.clone()
-        u[self.coordinates] = values
+        u[self.coordinate_indices] = values
         return u
 
 
@@ -97,7 +97,7 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
         warnings=warnings,
         transport=_get_transport_summary(verifier),
         renders=count_renders(verifier),
-        seconds={**stages.seconds, "total": stages.total},
+        seconds={**stages.seconds, "total": stages.total_seconds},
     )
 
 
@@ -119,7 +119,7 @@ def _get_transport_summary(verifier: workbench.Verifier) -> Any:
 
     None if no prediction was tried, for example because no camera moves.
     """
-    state = verifier.state
+    state = verifier.run_state
     was_tried = state.predictor is not None or state.predictor_refusal is not None
     return state.transport_summary if was_tried else None
 
@@ -130,7 +130,7 @@ def count_renders(verifier: workbench.Verifier) -> dict[str, int]:
     The keys are those of all results: "verification" for rendered images, here also
     those that prepared a predictor, and "products" for predicted ones.
     """
-    state = verifier.state
+    state = verifier.run_state
     n_rendered = state.verification_renders
     if state.predictor is not None:
         n_rendered += state.predictor.n_traced
@@ -256,7 +256,7 @@ class RegionSearch:
             # only for enough images: those of growing, and those of the map.
             n_images = boxes.USUAL_PROBED * len(varied.names) + config.map**2
             workbench.prepare_surface_light(
-                verifier, varied.center, varied.coordinates, n_images
+                verifier, varied.center, varied.coordinate_indices, n_images
             )
         grown = self._grow_box()
         sides = describe_box(verifier.problem, grown, varied)
@@ -271,7 +271,7 @@ class RegionSearch:
             rate=grown.n_same / grown.samples,
             interval=grown.interval,
             volume=grown.volume,
-            spp=verifier.state.spp,
+            spp=verifier.run_state.spp,
             map=margin_map,
         )
 
@@ -279,10 +279,10 @@ class RegionSearch:
         """Grow the box and check it."""
         n_parameters = len(self._varied.names)
         hint = (
-            f"pictures of {self._verifier.state.spp} samples a pixel; fewer parameters "
+            f"pictures of {self._verifier.run_state.spp} samples a pixel; fewer parameters "
             "in `vary` or `verify_spp` shorten it"
         )
-        self._verifier.stages.begin(
+        self._verifier.progress_stages.begin(
             "search",
             "growing the box",
             boxes.MAX_PROBED * n_parameters,
@@ -292,7 +292,7 @@ class RegionSearch:
         return boxes.grow_box(
             self._is_same,
             self._varied.start,
-            seed=seeds.stream(self._config.seed, "region"),
+            seed=seeds.derive_seed(self._config.seed, "region"),
             samples=self._config.samples,
             on_check=self._begin_check,
         )
@@ -308,7 +308,7 @@ class RegionSearch:
             "exception; `samples` shortens it"
         )
         title = "checking the box with fresh samples"
-        self._verifier.stages.begin("search", title, limit, hint=hint, at_most=True)
+        self._verifier.progress_stages.begin("search", title, limit, hint=hint, at_most=True)
 
     def _is_same(self, values: Tensor, number: int) -> bool:
         """Return whether the verdict at a point is that of the center.
@@ -322,8 +322,8 @@ class RegionSearch:
         """
         # While the box grows, images may be predicted from the prepared light. Those of
         # the check are rendered, as its result is reported.
-        predictor = None if self._is_checking else self._verifier.state.predictor
-        u = self._varied.with_values(values)
+        predictor = None if self._is_checking else self._verifier.run_state.predictor
+        u = self._varied.make_configuration(values)
         # The stored rows have no success, since no prediction is sought.
         (trial,) = self._verifier.try_configurations(
             "region", {number: u}, has_success=False, predictor=predictor
@@ -341,7 +341,7 @@ def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
         InputError: the prediction depends on the noise, or is not a number, or the
             object is not in the image.
     """
-    verifier.stages.begin("verification", "looking at the centre", CENTER_TRIALS)
+    verifier.progress_stages.begin("verification", "looking at the centre", CENTER_TRIALS)
     same_configurations = dict.fromkeys(range(CENTER_TRIALS), center)
     trials = list(
         verifier.try_configurations("centre", same_configurations, has_success=False)
@@ -361,7 +361,7 @@ def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
         )
     n_wrong = sum(trial.success for trial in trials)
     # True or False, or None if both right and wrong are too frequent for a verdict
-    is_wrong = verifier.problem.rule.decide(n_wrong, CENTER_TRIALS)
+    is_wrong = verifier.problem.verification_rule.decide(n_wrong, CENTER_TRIALS)
     if is_wrong is None:
         raise InputError(
             f"the model is wrong in {n_wrong} of {CENTER_TRIALS} trials at the centre, "
@@ -385,9 +385,9 @@ def describe_box(
         grown: the box.
         varied: the parameters that the box has sides for.
     """
-    low_values = problem.describe(varied.with_values(grown.low))
-    high_values = problem.describe(varied.with_values(grown.high))
-    center_values = problem.describe(varied.with_values(grown.center))
+    low_values = problem.describe(varied.make_configuration(grown.low))
+    high_values = problem.describe(varied.make_configuration(grown.high))
+    center_values = problem.describe(varied.make_configuration(grown.center))
     sides = []
     for index, name in enumerate(varied.names):
         described_name = name
@@ -398,9 +398,9 @@ def describe_box(
             side = BoxSide(
                 name=name,
                 unit=str(low_values[described_name].get("unit", "")),
-                low=read_component(low_values[described_name], component),
-                high=read_component(high_values[described_name], component),
-                centre=read_component(center_values[described_name], component),
+                low=read_described_value(low_values[described_name], component),
+                high=read_described_value(high_values[described_name], component),
+                centre=read_described_value(center_values[described_name], component),
             )
         else:
             side = BoxSide(
@@ -414,7 +414,7 @@ def describe_box(
     return sides
 
 
-def read_component(described: Mapping[str, Any], component: str = "") -> float:
+def read_described_value(described: Mapping[str, Any], component: str = "") -> float:
     """Return the described value of a parameter, or one of its components.
 
     Args:
@@ -466,24 +466,24 @@ def _measure_margins(
         varied: the parameters; the first changes along a row.
     """
     hint = (
-        f"{size * size} pictures of {verifier.state.spp} samples a pixel; `map` "
+        f"{size * size} pictures of {verifier.run_state.spp} samples a pixel; `map` "
         "or `verify_spp` shorten it"
     )
-    verifier.stages.begin("map", "drawing the map", size * size, hint=hint)
+    verifier.progress_stages.begin("map", "drawing the map", size * size, hint=hint)
     # coordinates of the points; a single point is at the center of the range
     grid = torch.linspace(0.0, 1.0, size) if size > 1 else torch.tensor([0.5])
 
     def find_configuration(number: int) -> Tensor:
         """Return the configuration (d,) of a point."""
         row, column = divmod(number, size)
-        return varied.with_values(torch.stack([grid[column], grid[row]]))
+        return varied.make_configuration(torch.stack([grid[column], grid[row]]))
 
     trials = verifier.try_in_batches(
         "map",
         size * size,
         find_configuration,
         has_success=False,  # no prediction is sought
-        predictor=verifier.state.predictor,
+        predictor=verifier.run_state.predictor,
     )
     margins = [-trial.score for trial in trials]  # a score is a negative margin
     return [margins[begin : begin + size] for begin in range(0, len(margins), size)]
@@ -499,16 +499,16 @@ def find_ranges(
         varied: the two parameters.
         box: the sides of the box, whose names and units are used.
     """
-    low_values = problem.describe(varied.with_values(torch.full((2,), 0.0)))
-    high_values = problem.describe(varied.with_values(torch.full((2,), 1.0)))
+    low_values = problem.describe(varied.make_configuration(torch.full((2,), 0.0)))
+    high_values = problem.describe(varied.make_configuration(torch.full((2,), 1.0)))
     ranges = []
     for side in box:
         # a fraction of the range, if no control describes the parameter
         low = 0.0
         high = 1.0
         if side.name in low_values:
-            low = read_component(low_values[side.name])
-            high = read_component(high_values[side.name])
+            low = read_described_value(low_values[side.name])
+            high = read_described_value(high_values[side.name])
         ranges.append(AxisRange(name=side.name, unit=side.unit, low=low, high=high))
     return ranges
 

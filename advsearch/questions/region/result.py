@@ -149,7 +149,7 @@ class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
     )
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """The result in a few words."""
         return (
             f"{self.verdict} in {self.n_same} of {self.samples} samples of the box"

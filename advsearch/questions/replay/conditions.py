@@ -95,7 +95,7 @@ class ReplayCondition:
         image_key: key of the image that is made of the radiance (by tone curve and
             rounding). Conditions with the same key share it; None for a condition that
             shares none.
-        change: function that is applied to the image before the model gets it; None if
+        change_image: function that is applied to the image before the model gets it; None if
             there is none.
         unavailable_reason: why the condition cannot be rendered here; empty if it can.
     """
@@ -106,7 +106,7 @@ class ReplayCondition:
     spp: int
     radiance_key: Hashable = None
     image_key: Hashable = None
-    change: ImageChange | None = None
+    change_image: ImageChange | None = None
     unavailable_reason: str = ""
 
     def to_retrial(self) -> workbench.RetrialCondition:
@@ -120,7 +120,7 @@ class ReplayCondition:
             spp=self.spp,
             # The title is unique, so that no other condition shares the image.
             image_key=self.image_key or title,
-            change_image=self.change,
+            change_image=self.change_image,
             radiance_key=self.radiance_key,
         )
 
@@ -141,21 +141,21 @@ def list_conditions(
         spp: samples per pixel of the run's verification.
         resize: creates the same problem at another (height, width) in pixels.
     """
-    yield same_render(problem, AS_VERIFIED, AS_VERIFIED, spp)
+    yield make_image_condition(problem, AS_VERIFIED, AS_VERIFIED, spp)
     yield from sampling_conditions(problem, spp)
     yield from resolution_conditions(problem, spp, resize)
     yield from scene_conditions(problem, spp)
     yield from image_formation_conditions(problem, spp)
     for quality in JPEG_QUALITIES:
         compress = partial(compress_as_jpeg, quality)
-        yield same_render(problem, "jpeg", f"quality {quality}", spp, compress)
+        yield make_image_condition(problem, "jpeg", f"quality {quality}", spp, compress)
     for camera, sensor_values in SENSORS.items():
         apply = partial(apply_sensor, sensor_values)
-        yield same_render(problem, "sensor", camera, spp, apply)
+        yield make_image_condition(problem, "sensor", camera, spp, apply)
     yield blender_condition(problem, spp)
 
 
-def same_render(
+def make_image_condition(
     problem: Problem,
     name: str,
     description: str,
@@ -181,7 +181,7 @@ def same_render(
         spp=spp,
         radiance_key=RUN_RENDERS,
         image_key=RUN_RENDERS,
-        change=change,
+        change_image=change,
     )
 
 
@@ -189,7 +189,7 @@ def sampling_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]
     """Yield conditions with a quarter and with four times the samples."""
     for other_spp in (max(1, spp // 4), min(workbench.MAX_SPP, 4 * spp)):
         if other_spp != spp:
-            yield same_render(problem, "samples", f"{other_spp} a pixel", other_spp)
+            yield make_image_condition(problem, "samples", f"{other_spp} a pixel", other_spp)
 
 
 def resolution_conditions(
@@ -210,25 +210,25 @@ def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
     scene = problem.renderer.scene
     for max_depth in PATH_LENGTHS:
         if max_depth != scene.max_depth:
-            make_problem = partial(with_scene, problem, max_depth=max_depth)
+            make_problem = partial(replace_scene_options, problem, max_depth=max_depth)
             description = f"light paths of {max_depth} segments"
             yield ReplayCondition("depth", description, make_problem, spp)
 
     # Mitsuba's path integrator renders no volumes.
     if not scene.is_volumetric:
-        integrator = "prb" if scene.integrator == "path" else "path"
-        make_problem = partial(with_scene, problem, integrator=integrator)
-        description = f"Mitsuba's {integrator} in place of {scene.integrator}"
+        integrator = "prb" if scene.integrator_name == "path" else "path"
+        make_problem = partial(replace_scene_options, problem, integrator=integrator)
+        description = f"Mitsuba's {integrator} in place of {scene.integrator_name}"
         yield ReplayCondition("integrator", description, make_problem, spp)
 
     sampler = "independent"
     if problem.renderer.formation.sampler == "independent":
         sampler = "multijitter"
-    make_problem = partial(with_scene, problem, sampler=sampler)
+    make_problem = partial(replace_scene_options, problem, sampler=sampler)
     yield ReplayCondition("sampler", sampler, make_problem, spp)
 
 
-def with_scene(problem: Problem, **changes: Any) -> Problem:
+def replace_scene_options(problem: Problem, **changes: Any) -> Problem:
     """Return the problem with a new scene in which some of its options are changed."""
     scene = problem.renderer.scene.copy_with(**changes)
     renderer_changes = {}
@@ -248,10 +248,10 @@ def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCon
     denoiser = "none"
     if problem.renderer.formation.denoiser == "none":
         denoiser = "oidn"
-    make_problem = partial(with_renderer, problem, denoiser=denoiser)
+    make_problem = partial(replace_renderer_options, problem, denoiser=denoiser)
     yield ReplayCondition("denoiser", denoiser, make_problem, spp)
     for curve, text in CURVES.items():
-        make_problem = partial(with_renderer, problem, transfer=curve)
+        make_problem = partial(replace_renderer_options, problem, transfer=curve)
         description = f"{curve}, {text}"
         # It shares the radiance of the run, but not the image.
         yield ReplayCondition(
@@ -259,7 +259,7 @@ def image_formation_conditions(problem: Problem, spp: int) -> Iterator[ReplayCon
         )
 
 
-def with_renderer(problem: Problem, **changes: Any) -> Problem:
+def replace_renderer_options(problem: Problem, **changes: Any) -> Problem:
     """Return the problem with a renderer in which some of its options are changed."""
     return replace(problem, renderer=problem.renderer.copy_with(**changes))
 
@@ -281,7 +281,7 @@ def apply_sensor(
         seed: seed of the sensor's noise.
     """
     control = workbench.CONTROLS["sensor"]()
-    control.chosen["seed"] = seed  # the setting of its noise
+    control.choice_values["seed"] = seed  # the setting of its noise
     parameters = {
         parameter.name: torch.tensor(sensor_values.get(parameter.name, 0.0))
         for parameter in control.parameters
@@ -297,7 +297,7 @@ def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
     the reason, which the result reports.
     """
     renderer = problem.renderer
-    description, _ = renderer.scene.definition
+    description, _ = renderer.scene.description_and_filter
     condition = ReplayCondition(
         "blender", "Cycles, Blender's renderer", lambda: problem, spp
     )
@@ -310,7 +310,7 @@ def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
         )
     except BlenderError as error:
         return replace(condition, unavailable_reason=str(error))
-    make_problem = partial(with_renderer, problem, source=cycles.radiance)
+    make_problem = partial(replace_renderer_options, problem, source=cycles.radiance)
     return replace(condition, make_problem=make_problem)
 
 
@@ -493,7 +493,7 @@ def run_replay(
         u=workbench.read_stored_configuration(attack_directory, problem),
         trials=config.trials,
         # another stream of seeds, so that no noise of the attack is repeated
-        seed=seeds.stream(parts.config.seed, "replay"),
+        seed=seeds.derive_seed(parts.config.seed, "replay"),
         run=context.run,
         progress=context.progress,
     )
@@ -501,7 +501,7 @@ def run_replay(
         # Conditions that share renders are in the same batch, so that each image is
         # rendered once.
         for batch in batch_by_renders(conditions, spp):
-            table.fill(batch)
+            table.add_rows(batch)
     rows = table.list_rows(conditions)
     return context.result(
         ReplayResult,
@@ -623,7 +623,7 @@ class _Table:
     rows: dict[ReplayCondition, ReplayRow] = field(default_factory=dict)
     renders: int = 0
 
-    def fill(self, conditions: Sequence[ReplayCondition]) -> None:
+    def add_rows(self, conditions: Sequence[ReplayCondition]) -> None:
         """Add the rows of conditions that share their renders.
 
         A condition that is not available, or in which Blender fails, gets a row with
@@ -688,11 +688,11 @@ class _Table:
             for retrial in retrial_of_condition.values()
         }
         renderers = list(renderer_by_id.values())
-        renders_before = sum(renderer.renders for renderer in renderers)
+        renders_before = sum(renderer.n_renders for renderer in renderers)
         try:
             self._add_trials(retrial_of_condition)
         finally:
-            renders_after = sum(renderer.renders for renderer in renderers)
+            renders_after = sum(renderer.n_renders for renderer in renderers)
             self.renders += renders_after - renders_before
 
     def _add_trials(
@@ -712,7 +712,7 @@ class _Table:
         )
         clean_results = {
             condition: workbench.make_control_group(
-                retrials.try_clean(retrial), retrial.spp
+                retrials.run_clean_trials(retrial), retrial.spp
             )
             for condition, retrial in retrial_of_condition.items()
         }

@@ -117,7 +117,7 @@ class ReplayConfig(Config):
         return () if self.model is None else settings.split_names(self.model)
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return Path(self.attack).name, self.command
 
 
@@ -207,7 +207,7 @@ class ReplayResult(views.InNotebook, results.SceneResult):
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """Where the adversarial scene holds, in a few words for lists of runs."""
         if self.transfer is not None:
             return (
@@ -300,7 +300,7 @@ def make_replay_view(result: ReplayResult) -> ShownResult:
     """Return the table of conditions, for a terminal or a page."""
     table = ResultPart(
         "Under other conditions",
-        heads=HEADS,
+        column_heads=HEADS,
         rows=[make_cells(row) for row in result.table],
         note=TRIALS_NOTE,
     )

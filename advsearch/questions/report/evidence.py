@@ -37,7 +37,7 @@ from advsearch.questions.report.recorded import (
     collect_versions,
     find_read_attacks,
     find_read_sweeps,
-    join_values,
+    join_setting_values,
     read_noted_settings,
     read_run_settings,
 )
@@ -539,15 +539,15 @@ def _describe_fixed(
             that it is based on.
     """
     fixed = defaultdict[str, list[str]](list)
-    environment = getattr(result, "environment", "") or join_values(
+    environment = getattr(result, "environment", "") or join_setting_values(
         recorded, "environment"
     )
     fixed["place"].append(str(environment))
     object_name = str(getattr(result, "object", "") or "")
-    things = (object_name, join_values(recorded, "things"))
+    things = (object_name, join_setting_values(recorded, "things"))
     fixed[THINGS_PART].append("; ".join(filter(None, things)))
-    fixed[CAMERA_PART].append(join_values(recorded, "camera"))
-    fixed[CAMERA_PART].append(join_values(recorded, "backdrop"))
+    fixed[CAMERA_PART].append(join_setting_values(recorded, "camera"))
+    fixed[CAMERA_PART].append(join_setting_values(recorded, "backdrop"))
     # The setting `set` has fixed values of parameters by name. The keys of this dict
     # are a set that keeps the order, so that each pair is listed once.
     parameters = dict[tuple[str, str], None]()
@@ -605,8 +605,8 @@ def collect_claims(result: results.Result) -> list[views.Claim]:
     if result.is_unfinished:
         is_running = getattr(result, "ending", "") == results.RUNNING
         reason = "the run is running" if is_running else "the run is not finished"
-        if result.brief:
-            reason += f"; so far: {result.brief}"
+        if result.outcome_summary:
+            reason += f"; so far: {result.outcome_summary}"
         return [make_empty_claim(reason)]
     # the function of the command's experiment that makes claims of a result
     make_claims = workbench.get_experiment(result.command).claims
@@ -771,7 +771,7 @@ def _describe_subject(
     values = _get_fields(result)
     objects = values.get("object") or ", ".join(values.get("objects") or ())
     # The names that count as right: a list from the result, or a text from settings.
-    right_labels = values.get("label_set") or join_values(
+    right_labels = values.get("label_set") or join_setting_values(
         recorded, "label", otherwise="the object's own label"
     )
     if isinstance(right_labels, list):
@@ -780,11 +780,11 @@ def _describe_subject(
         "Object": str(objects or ""),
         "Environment": _describe_environment(result),
         "Model": str(values.get("model") or ""),
-        "Names of its classes": join_values(recorded, "labels"),
-        "Prompt": join_values(recorded, "prompt"),
-        "Range of its input": join_values(recorded, "value_range"),
+        "Names of its classes": join_setting_values(recorded, "labels"),
+        "Prompt": join_setting_values(recorded, "prompt"),
+        "Range of its input": join_setting_values(recorded, "value_range"),
         "Task": str(values.get("task") or ""),
-        "Judged thing": join_values(recorded, "judge"),
+        "Judged thing": join_setting_values(recorded, "judge"),
         "Counts as right": right_labels,
         "Sought": str(values.get("goal") or ""),
     }

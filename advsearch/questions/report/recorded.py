@@ -276,7 +276,7 @@ def read_noted_settings(
     return noted
 
 
-def join_values(
+def join_setting_values(
     recorded: Iterable[RecordedSettings], name: str, otherwise: str = ""
 ) -> str:
     """Return the different values of a setting as text, separated by semicolons.

@@ -113,26 +113,26 @@ class Check(results.Fields):
 
 
 def check_range(
-    what: str, value: float, least: float | None = None, most: float | None = None
+    description: str, value: float, min_value: float | None = None, max_value: float | None = None
 ) -> Check:
     """Check that a number is in a range; NaN is in no range.
 
     Args:
-        what: what the number is.
+        description: what the number is.
         value: the number.
-        least, most: inclusive bounds; None for no bound.
+        min_value, most: inclusive bounds; None for no bound.
     """
     ok = not math.isnan(value)
-    if least is not None:
-        ok = ok and least <= value
-    if most is not None:
-        ok = ok and value <= most
-    return Check(what=what, value=value, min_value=least, max_value=most, ok=ok)
+    if min_value is not None:
+        ok = ok and min_value <= value
+    if max_value is not None:
+        ok = ok and value <= max_value
+    return Check(what=description, value=value, min_value=min_value, max_value=max_value, ok=ok)
 
 
-def check_condition(what: str, truth: bool) -> Check:
+def check_condition(description: str, is_met: bool) -> Check:
     """Check that a condition is true, as a number that has to be 1."""
-    return check_range(what, float(truth), 1.0, 1.0)
+    return check_range(description, float(is_met), 1.0, 1.0)
 
 
 def make_failure(what: str) -> Check:
@@ -179,7 +179,7 @@ class StabilityResult(views.InNotebook, results.Result):
     command_line: str | None = Field(description="command that repeats the run")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         return f"{sum(row.status == OK for row in self.rows)} of {len(self.rows)} hold"
 
 

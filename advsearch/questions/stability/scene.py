@@ -241,7 +241,7 @@ def check_scene(
     is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
     return CaseOutcome(
         checks,
-        finite=is_finite and renderer.non_finite == 0,
+        finite=is_finite and renderer.n_non_finite == 0,
         relative_error=relative_error,
         ending=result.ending.value,
         measurements=measured,
@@ -259,7 +259,7 @@ def _check_finite(
         search: result of the search, with its objectives that were not finite.
     """
     in_range = float(image.min()) >= 0.0 and float(image.max()) <= 1.0
-    n_non_finite = float(renderer.non_finite)
+    n_non_finite = float(renderer.n_non_finite)
     n_objectives = float(search.non_finite_objectives)
     return [
         check_condition("the picture is in [0, 1]", in_range),
@@ -315,7 +315,7 @@ def _compare_images(
         other: renderer of the second image, at its own start.
         bounds: lower and upper bound of the mean absolute difference.
     """
-    difference = mean_difference(
+    difference = compute_mean_difference(
         render_image(renderer, start), render_image(other, other.start)
     )
     return check_range(
@@ -347,8 +347,8 @@ def _check_gradient(
     noise_name = f"noise of the comparison, {noisiest.name}"
     error_name = f"gradient error beyond the noise, {worst.name}"
     checks = [
-        check_range(noise_name, noisiest.doubt or 0.0, most=MAX_NOISE),
-        check_range(error_name, worst.excess, most=MAX_GRADIENT_ERROR),
+        check_range(noise_name, noisiest.doubt or 0.0, max_value=MAX_NOISE),
+        check_range(error_name, worst.excess, max_value=MAX_GRADIENT_ERROR),
     ]
     return checks, worst.bias
 
@@ -398,7 +398,7 @@ def render_image(
         return renderer(u, seed, spp)
 
 
-def mean_difference(image: Tensor, other: Tensor) -> float:
+def compute_mean_difference(image: Tensor, other: Tensor) -> float:
     """Return the mean absolute difference of two images."""
     return float((image - other).abs().mean())
 
@@ -501,25 +501,25 @@ def evaluate(
         query: the query, which may request a multiple of the samples.
     """
     query_spp = spp * query.samples
-    non_finite_before = renderer.non_finite
-    renders_before = renderer.renders
+    non_finite_before = renderer.n_non_finite
+    renders_before = renderer.n_renders
     gradient = None
     if query.gradient:
         # `query.gradient` is True or "free". The latter requests only derivatives that
         # cost no further render.
         value, gradient = renderer.gradient(
-            loss, query.u, query.index, query_spp, free=query.gradient == "free"
+            loss, query.u, query.row_index, query_spp, free=query.gradient == "free"
         )
     else:
-        value = loss(render_image(renderer, query.u, query.index, query_spp))
+        value = loss(render_image(renderer, query.u, query.row_index, query_spp))
     objective = float(value)
     return policies.Evaluation(
         objective=objective,
         gradient=gradient,
         success=objective > 0.0,
-        non_finite=renderer.non_finite - non_finite_before,
+        n_non_finite=renderer.n_non_finite - non_finite_before,
         # `samples` renders with `spp` samples each
-        cost=(renderer.renders - renders_before) * query.samples,
+        cost=(renderer.n_renders - renders_before) * query.samples,
     )
 
 

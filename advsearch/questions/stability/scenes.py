@@ -53,7 +53,7 @@ from advsearch.questions.stability.scene import (
     make_gray_environment,
     make_mesh,
     make_renderer,
-    mean_difference,
+    compute_mean_difference,
     measure_inward_slope,
     render_image,
     run_search,
@@ -69,7 +69,7 @@ FLASH = make_gray_environment(0.3, BRIGHT)
 DARKNESS = make_gray_environment(0.0)
 
 
-def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
+def make_exposure_arguments(control: str, low: float, high: float) -> dict[str, object]:
     """Return arguments of `check_scene` for the extreme end of a range of exposures.
 
     That is the upper end of a range of positive exposures (in stops), and the lower end
@@ -136,21 +136,21 @@ register_cases(
                 "mean": (0.01, None),
             },
         ),
-        ("camera-exposure-up", FINITE_AND_RIGHT, exposure_case("camera", 9.0, 10.0)),
+        ("camera-exposure-up", FINITE_AND_RIGHT, make_exposure_arguments("camera", 9.0, 10.0)),
         (
             "camera-exposure-down",
             FINITE_AND_RIGHT,
-            exposure_case("camera", -10.0, -9.0),
+            make_exposure_arguments("camera", -10.0, -9.0),
         ),
         (
             "environment-exposure-up",
             FINITE_AND_RIGHT,
-            exposure_case("environment", 9.0, 10.0),
+            make_exposure_arguments("environment", 9.0, 10.0),
         ),
         (
             "environment-exposure-down",
             FINITE_AND_RIGHT,
-            exposure_case("environment", -10.0, -9.0),
+            make_exposure_arguments("environment", -10.0, -9.0),
         ),
     ],
 )
@@ -282,7 +282,7 @@ def make_glass_ball() -> dict[str, dict[str, object]]:
     }
 
 
-def material_case(
+def make_material_arguments(
     parameters: tuple[str, ...], slow: bool = True, **values: float
 ) -> dict[str, object]:
     """Return arguments of `check_scene` for a material.
@@ -307,23 +307,23 @@ register_cases(
         (
             "roughness-0",
             "Finite, and the gradient by the roughness is right, at the polished end.",
-            material_case(("roughness",), slow=False, roughness=0.0),
+            make_material_arguments(("roughness",), slow=False, roughness=0.0),
         ),
         (
             "roughness-1",
             "Finite, and the gradient by the roughness is right, at the matt end.",
-            material_case(("roughness",), roughness=1.0, metallic=1.0),
+            make_material_arguments(("roughness",), roughness=1.0, metallic=1.0),
         ),
         (
             "metallic-1",
             "Finite, and the gradient has the right sign and size at a metallic "
             "of exactly 1.",
-            material_case(("metallic",), metallic=1.0),
+            make_material_arguments(("metallic",), metallic=1.0),
         ),
         (
             "perfect-mirror",
             "A metal of roughness 0 is finite, and both gradients are right.",
-            material_case(("roughness", "metallic"), roughness=0.0, metallic=1.0),
+            make_material_arguments(("roughness", "metallic"), roughness=0.0, metallic=1.0),
         ),
     ],
 )
@@ -370,20 +370,20 @@ def texels_at_the_ends() -> CaseOutcome:
         check_range(
             "gradient error along a direction that points inwards",
             error,
-            most=MAX_GRADIENT_ERROR,
+            max_value=MAX_GRADIENT_ERROR,
         ),
         check_range(
             "smallest texel of the adversarial configuration",
             float(best.min()),
-            least=0.0,
+            min_value=0.0,
         ),
         check_range(
             "largest texel of the adversarial configuration",
             float(best.max()),
-            most=1.0,
+            max_value=1.0,
         ),
         check_range(
-            "texels that the search moved", float((best != start).sum()), least=1.0
+            "texels that the search moved", float((best != start).sum()), min_value=1.0
         ),
         check_condition(
             "the start has both 0 and 1", set(start.tolist()) == {0.0, 1.0}
@@ -415,7 +415,7 @@ WHITE_PICTURE = [1.0] * (3 * SIDE**2)
 CENTER_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
 
 
-def projector_case(
+def make_projector_arguments(
     u: Sequence[float] | Mapping[int, float] = WHITE_PICTURE, **projector: float
 ) -> dict[str, object]:
     """Return arguments of `check_scene` for a projector whose texels have a gradient.
@@ -440,38 +440,38 @@ register_cases(
             "projector-black",
             "A black picture changes nothing, and texels have a gradient.",
             {
-                **projector_case({}),
+                **make_projector_arguments({}),
                 "other_scene": {"controls": {"lens": {}}},
                 "difference": (None, 0.02),
             },
         ),
-        ("projector-full", FINITE, projector_case()),
-        ("projector-one-texel", FINITE, projector_case(CENTER_TEXEL)),
-        ("projector-grazing", FINITE, projector_case(elevation=0.5)),
-        ("projector-behind-the-object", FINITE, projector_case(azimuth=220.0)),
+        ("projector-full", FINITE, make_projector_arguments()),
+        ("projector-one-texel", FINITE, make_projector_arguments(CENTER_TEXEL)),
+        ("projector-grazing", FINITE, make_projector_arguments(elevation=0.5)),
+        ("projector-behind-the-object", FINITE, make_projector_arguments(azimuth=220.0)),
         (
             "projector-inside-the-object",
             FINITE,
-            projector_case(distance=0.01, fov=30.0),
+            make_projector_arguments(distance=0.01, fov=30.0),
         ),
         (
             "projector-into-a-mirror",
             FINITE,
             {
-                **projector_case(),
+                **make_projector_arguments(),
                 "settings": {"material.metallic": 1.0, "material.roughness": 0.0},
             },
         ),
         (
             "projector-0-lumens",
             "Without light the gradient is zero.",
-            {**projector_case(lumens=0.0), "gradient": (0.0, 0.0)},
+            {**make_projector_arguments(lumens=0.0), "gradient": (0.0, 0.0)},
         ),
         (
             "projector-1e6-lumens",
             "The picture is white for the most part, and all is finite.",
             {
-                **projector_case(lumens=1e6),
+                **make_projector_arguments(lumens=1e6),
                 "gradient": (None, None),
                 "mean": (0.7, None),
             },
@@ -493,7 +493,7 @@ register_cases(
 @register_case("light", "projector-through-glass")
 def project_through_glass() -> CaseOutcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
-    arguments = projector_case(azimuth=describe_mug().get_number("camera.azimuth"))
+    arguments = make_projector_arguments(azimuth=describe_mug().get_number("camera.azimuth"))
     return check_scene(**arguments, plugins=make_glass_ball())  # type: ignore[arg-type]
 
 
@@ -525,7 +525,7 @@ SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
 NO_GROUND = {"ground.size": 0.0}
 
 
-def mesh_case(
+def make_mesh_arguments(
     thing: assets.ObjectAsset, other_object: assets.ObjectAsset | None = None
 ) -> dict[str, object]:
     """Return arguments of `check_scene` for a mesh that is painted and moved.
@@ -586,7 +586,7 @@ def _format_box(points: np.ndarray) -> list[str]:
     return lines
 
 
-def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
+def make_file_arguments(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
     """Return arguments of `check_scene` for a box in another file.
 
     Objects are scaled to a common size and position when they are imported. So the box
@@ -606,7 +606,7 @@ def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
     }
 
 
-def outline_case(controls: ControlSettings) -> dict[str, object]:
+def make_outline_arguments(controls: ControlSettings) -> dict[str, object]:
     """Return arguments of `check_scene` for a dark mug in front of nothing."""
     return {
         "controls": controls,
@@ -624,20 +624,20 @@ register_cases(
         (
             "degenerate-triangles",
             "Faces without area change neither the picture nor the gradient.",
-            mesh_case(DEGENERATE, SQUARE),
+            make_mesh_arguments(DEGENERATE, SQUARE),
         ),
         (
             "sliver-triangles",
             "A triangle a million times as long as wide leaves everything "
             "finite and right.",
-            mesh_case(SLIVER),
+            make_mesh_arguments(SLIVER),
         ),
         (
             "coincident-faces",
             "Two faces in one place look like one.",
-            mesh_case(COINCIDENT_SQUARES, SQUARE),
+            make_mesh_arguments(COINCIDENT_SQUARES, SQUARE),
         ),
-        ("one-triangle", "Finite, and both gradients are right.", mesh_case(TRIANGLE)),
+        ("one-triangle", "Finite, and both gradients are right.", make_mesh_arguments(TRIANGLE)),
         (
             "scale-0.01",
             FINITE,
@@ -659,18 +659,18 @@ register_cases(
         (
             "file-in-units-of-0.01",
             "A file in other units gives the same picture.",
-            file_case(0.01),
+            make_file_arguments(0.01),
         ),
         (
             "file-in-units-of-100",
             "A file in other units gives the same picture.",
-            file_case(100.0),
+            make_file_arguments(100.0),
         ),
         (
             "file-10000-sizes-off",
             "A mesh that its file puts 10,000 sizes from the origin "
             "gives the same picture.",
-            file_case(shift=1e4),
+            make_file_arguments(shift=1e4),
         ),
         (
             "translation-10000",
@@ -686,7 +686,7 @@ register_cases(
         (
             "grazing-view",
             "Looking along the ground, the gradient by the elevation is right.",
-            outline_case({"camera": {"elevation": [-10.0, 10.0]}}),
+            make_outline_arguments({"camera": {"elevation": [-10.0, 10.0]}}),
         ),
         (
             "near-plane",
@@ -709,7 +709,7 @@ register_cases(
         (
             "object-leaves-the-frame",
             "Half outside, the gradient by the shift is right.",
-            outline_case({"pose": {"x": [0.0, 2.0]}}),
+            make_outline_arguments({"pose": {"x": [0.0, 2.0]}}),
         ),
     ],
 )
@@ -729,20 +729,20 @@ def million() -> CaseOutcome:
     fine = make_renderer(SHIFT, make_checkered_object(fine_mesh))
     loss = gradients.make_smooth_loss(fine.formation.resolution)
     _, slope = fine.gradient(loss, fine.start, 0, SPP)
-    difference = mean_difference(
+    difference = compute_mean_difference(
         render_image(fine, fine.start, seed=0, spp=REFERENCE_SPP),
         render_image(coarse, coarse.start, seed=0, spp=REFERENCE_SPP),
     )
     scene = check_scene(TEXTURE, make_checkered_object(fine_mesh), evaluations=2)
     return scene.with_checks(
-        check_range("triangles", float(len(fine_mesh.faces)), least=1e6),
+        check_range("triangles", float(len(fine_mesh.faces)), min_value=1e6),
         check_condition(
             "the gradient by a shift is finite", bool(torch.isfinite(slope).all())
         ),
         check_range(
             "mean difference from a sphere of 16,000",
             difference,
-            most=MAX_PICTURE_DIFFERENCE,
+            max_value=MAX_PICTURE_DIFFERENCE,
         ),
     )
 
@@ -781,13 +781,13 @@ def gimbal() -> CaseOutcome:
     return scene.with_checks(
         check_range(
             "mean difference of yaw 36 and roll -36",
-            mean_difference(yawed, rolled),
-            most=MAX_PICTURE_DIFFERENCE,
+            compute_mean_difference(yawed, rolled),
+            max_value=MAX_PICTURE_DIFFERENCE,
         ),
         check_range(
             "gradient error of the rotation vector",
             max(row.excess for row in rows),  # the error that noise does not explain
-            most=MAX_GRADIENT_ERROR,
+            max_value=MAX_GRADIENT_ERROR,
         ),
     )
 
@@ -808,19 +808,19 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
     _, zero_slope = renderer.gradient(loss, zero, 0, SPP)
     _, full_slope = renderer.gradient(loss, full, 0, SPP)
     slope_difference = float((zero_slope - full_slope).abs().max())
-    difference = mean_difference(
+    difference = compute_mean_difference(
         render_image(renderer, zero), render_image(renderer, full)
     )
     # 1 in u is 360 degrees, which is the same as 0. So a step past it goes on from 0.
     past_end = make_domain(renderer).project(full + 0.01)
     return check_scene(controls, u=[0.0], compare=False).with_checks(
         check_range(
-            "mean difference of the pictures", difference, most=MAX_PICTURE_DIFFERENCE
+            "mean difference of the pictures", difference, max_value=MAX_PICTURE_DIFFERENCE
         ),
         check_range(
             "difference of the gradients",
             slope_difference / float(zero_slope.abs().max()),
-            most=0.05,
+            max_value=0.05,
         ),
         # The configuration is one angle.
         check_range(
@@ -868,8 +868,8 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
         hint = "`case` and `group` select some, `seconds` stops before the next one"
         progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
         for case in cases:
-            is_stored = measurements.read(case.name) is not None
-            row = measurements.get_row(case.name, CaseRow, case.run)
+            is_stored = measurements.read_stored(case.name) is not None
+            row = measurements.get_or_measure_row(case.name, CaseRow, case.run)
             # The caller may stop here if the time is over. Then nothing is reported.
             yield row
             if not is_stored:
@@ -884,7 +884,7 @@ def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
             not_run=[case.name for case in cases[len(rows) :]],
         )
 
-    return measurements.collect(measure_rows(), make_result)
+    return measurements.make_result_of_rows(measure_rows(), make_result)
 
 
 def sentences() -> dict[str, str]:
@@ -971,7 +971,7 @@ def wide_range() -> CaseOutcome:
     narrow_slope = _measure_shift_slope(half_width=0.3)
     error = abs(wide_slope / narrow_slope - 1.0)
     error_check = check_range(
-        "error of the derivative per object size", error, most=0.2
+        "error of the derivative per object size", error, max_value=0.2
     )
     scene = check_scene({"pose": {"x": [-1e4, 1e4]}}, compare=False)
     return scene.with_checks(error_check, relative_error=error)
@@ -1022,11 +1022,11 @@ def light_rotation_texel() -> CaseOutcome:
     path_difference = float((path - scaled_path).abs().max())
     scene = check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False)
     return scene.with_checks(
-        check_range("how far the power moved", float(distances[0]), least=0.05),
-        check_range("how far the rotation moved", float(distances[1]), least=0.05),
-        check_range("how far the texels moved", float(distances[2:].max()), least=0.05),
+        check_range("how far the power moved", float(distances[0]), min_value=0.05),
+        check_range("how far the rotation moved", float(distances[1]), min_value=0.05),
+        check_range("how far the texels moved", float(distances[2:].max()), min_value=0.05),
         check_range(
-            "distance from the path of the objective x 1e6", path_difference, most=1e-3
+            "distance from the path of the objective x 1e6", path_difference, max_value=1e-3
         ),
         ending=ending,
         measurements={
@@ -1136,7 +1136,7 @@ def heavy_render(count: int = 24) -> CaseOutcome:
         check_range(
             "farthest over the median distance",
             float(distance.max() / distance.median()),
-            most=12.0,
+            max_value=12.0,
         ),
         check_condition(
             "the plan takes secant", renderer.plan.groups[0].estimator == "secant"

@@ -28,5 +28,5 @@ def sweep(context: RunContext[SweepConfig]) -> SweepSummary:
     from advsearch.questions.sweep.carry_out import sweep_from_config  # imports torch
 
     return sweep_from_config(
-        context.config, progress=context.progress, resumed=context.resumed
+        context.config, progress=context.progress, resumed=context.resumed_directory
     ).summary

@@ -63,26 +63,26 @@ class Axis:
     """A parameter and its values.
 
     Attributes:
-        control: kind of the control.
-        instance: name of the control; that of its kind unless it has another.
+        control_kind: kind of the control.
+        control_name: name of the control; that of its kind unless it has another.
         parameter: the parameter that varies.
         values: numbers or names.
     """
 
-    control: str
-    instance: str
+    control_kind: str
+    control_name: str
     parameter: Parameter
     values: tuple[ParameterValue, ...]
 
     @property
     def name(self) -> str:
         """The stored name: ``pose.yaw``, or ``key.power`` of a light named key."""
-        return f"{self.instance}.{self.parameter.name}"
+        return f"{self.control_name}.{self.parameter.name}"
 
     @property
     def is_time(self) -> bool:
         """Whether the values are times of the frames of a path."""
-        return (self.control, self.parameter.name) == ("path", "time")
+        return (self.control_kind, self.parameter.name) == ("path", "time")
 
     @property
     def unit(self) -> str:
@@ -112,10 +112,10 @@ def parse_axes(
             raise InputError(
                 f"`grid` {name}: {axis.name} is given twice; leave one of the two out"
             )
-        sampled = instances.get(axis.instance)
+        sampled = instances.get(axis.control_name)
         if sampled is not None and axis.parameter.name in sampled.specs:
             raise InputError(
-                f"`grid` {name}: `controls` {axis.instance} sets {axis.parameter.name} "
+                f"`grid` {name}: `controls` {axis.control_name} sets {axis.parameter.name} "
                 "too; leave it out of one "
                 "of the two"
             )
@@ -475,12 +475,12 @@ def add_grid_axes(
     """
     control_by_name = {control.name: control for control in controls}
     # Axes of one control have the same `instance`, the name of that control.
-    for instance in dict.fromkeys(axis.instance for axis in axes):
-        instance_axes = [axis for axis in axes if axis.instance == instance]
+    for instance in dict.fromkeys(axis.control_name for axis in axes):
+        instance_axes = [axis for axis in axes if axis.control_name == instance]
         sampled = control_by_name.get(instance)
         if sampled is None:
             # Any: the type of `CONTROLS` does not have the arguments of its classes.
-            control_type: Any = CONTROLS[instance_axes[0].control]
+            control_type: Any = CONTROLS[instance_axes[0].control_kind]
             settings = dict[str, object]()
         else:
             control_type = type(sampled)
@@ -505,7 +505,7 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
         for name, value in control.to_settings().items()
         if name not in ("kind", "name")
     }
-    if control.has_requested_search:
+    if control.has_requested_range:
         return settings  # the user stated its ranges: no default ones
     resolve_in_scene = control.with_scene(scene).resolve_parameter
     for parameter in map(resolve_in_scene, control.parameters):
@@ -530,17 +530,17 @@ class SampledNumber:
     Attributes:
         name: name of the parameter, with the index of a component.
         unit: unit of the values.
-        column: its column among the draws.
-        parts: parts of the range as lists [lower, upper], or the options of a choice.
-        same_in_all_scenes: whether `parts` are the same in every scene.
+        draw_column: its column among the draws.
+        range_parts: parts of the range as lists [lower, upper], or the options of a choice.
+        same_in_all_scenes: whether `range_parts` are the same in every scene.
         part_of_bin: for each bin the index of its part, if options have weights; else
             empty, and each part has one bin.
     """
 
     name: str
     unit: str
-    column: int
-    parts: tuple[Any, ...]
+    draw_column: int
+    range_parts: tuple[Any, ...]
     same_in_all_scenes: bool = True
     part_of_bin: tuple[int, ...] = ()
 
@@ -548,22 +548,22 @@ class SampledNumber:
     def varied_value(self) -> VariedValue:
         """The range or the options that the value was sampled from."""
         bounds = [
-            bound for part in self.parts if isinstance(part, list) for bound in part
+            bound for part in self.range_parts if isinstance(part, list) for bound in part
         ]
         if bounds:
             return VariedValue(unit=self.unit, low=min(bounds), high=max(bounds))
-        return VariedValue(unit=self.unit, names=[str(part) for part in self.parts])
+        return VariedValue(unit=self.unit, names=[str(part) for part in self.range_parts])
 
     @property
-    def edges(self) -> list[float] | None:
+    def part_bounds(self) -> list[float] | None:
         """The bounds of the parts, ascending.
 
         None for a choice, and for parts that differ between scenes.
         """
-        are_ranges = all(isinstance(part, list) for part in self.parts)
+        are_ranges = all(isinstance(part, list) for part in self.range_parts)
         if not self.same_in_all_scenes or not are_ranges:
             return None
-        return sorted({bound for part in self.parts for bound in part})
+        return sorted({bound for part in self.range_parts for bound in part})
 
 
 def choose_n_parts(n_images: int) -> int:
@@ -607,7 +607,7 @@ class _GridCoordinate(NamedTuple):
     axis: int
 
 
-class Points:
+class SceneConfigurations:
     """The configurations of one scene of a sweep.
 
     Images are numbered with the points of the grid, its last axis fastest, then the
@@ -617,7 +617,7 @@ class Points:
         space: the controls, bound to the scene; it starts from the scene as it is.
         domain: the budgets of the controls.
         axes: axes of the grid.
-        samples: number of samples at each point of the grid.
+        samples_per_grid_point: number of samples at each point of the grid.
         sampler: how the draws are made, "sobol" or "random".
         seed: seed of the draws.
         repeat_after_scenes: number of scenes after which the draws repeat, so that
@@ -627,14 +627,14 @@ class Points:
             one. The sweep then has a scene for each photograph.
 
     Attributes:
-        count: number of images of the scene.
-        n_parts: number of parts into which tables divide the range of a sampled number.
+        n_images: number of images of the scene.
+        parts_per_range: number of parts into which tables divide the range of a sampled number.
         sampled_numbers: the sampled numbers that tables count by.
         sampled_layout: describes which numbers are sampled: the number of draws of
             small blocks, and name, column and number of parts of each sampled number.
         is_sampled: whether anything is sampled. A control may have all its values from
             the grid, as a path has its time.
-        units: maps images to draws.
+        independent_units: maps images to draws.
     """
 
     def __init__(
@@ -652,13 +652,13 @@ class Points:
         """Assign every coordinate to an axis or to draws; arguments: see the class."""
         # Attributes are set in the order in which the methods below need them.
         self.grid = ProductIndex(tuple(len(axis.values) for axis in axes))
-        self.samples = samples
-        self.count = self.grid.count * samples
-        self.n_parts = choose_n_parts(self.count * n_scenes)
+        self.samples_per_grid_point = samples
+        self.n_images = self.grid.count * samples
+        self.parts_per_range = choose_n_parts(self.n_images * n_scenes)
         self.space = space
         self._start = domain.start.numpy().astype(np.float64)
-        self._lower = domain.lower.numpy()
-        self._upper = domain.upper.numpy()
+        self._lower = domain.lower_bounds.numpy()
+        self._upper = domain.upper_bounds.numpy()
         self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
         # `_assign_blocks` fills these lists. Small blocks, those of few numbers, share
         # the sequence of the sampler. Large ones have random draws, since Sobol
@@ -674,15 +674,15 @@ class Points:
         self.is_sampled = n_small + n_large > 0
         self.sampled_layout = (n_small, self._list_sampled_layout())
 
-        self.units = self._make_units(
+        self.independent_units = self._make_units(
             axes,
-            images_until_repeat=repeat_after_scenes * self.count,
+            images_until_repeat=repeat_after_scenes * self.n_images,
             n_photographs=n_photographs,
         )
         # of each sampled number: its column among the draws, and its number of bins
-        self._columns = [number.column for number in self.sampled_numbers]
+        self._columns = [number.draw_column for number in self.sampled_numbers]
         n_bins = [
-            len(number.part_of_bin or number.parts) for number in self.sampled_numbers
+            len(number.part_of_bin or number.range_parts) for number in self.sampled_numbers
         ]
         self._n_bins = np.array(n_bins, dtype=np.int64)
         self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
@@ -693,7 +693,7 @@ class Points:
         If two scenes have the same layout, their draws can be counted together.
         """
         return tuple(
-            (number.name, number.column, len(number.parts))
+            (number.name, number.draw_column, len(number.range_parts))
             for number in self.sampled_numbers
         )
 
@@ -711,18 +711,18 @@ class Points:
         """
         # If nothing is sampled, the samples of a grid point are repeats of one draw,
         # each with its own noise.
-        n_draws = self.samples if self.is_sampled else 1
+        n_draws = self.samples_per_grid_point if self.is_sampled else 1
         time_axis = next(
             (index for index, axis in enumerate(axes) if axis.is_time), None
         )
         # `Units` uses the number of images per scene only with photographs.
-        images_per_scene = self.count if n_photographs > 1 else 1
+        images_per_scene = self.n_images if n_photographs > 1 else 1
         return Units(
             self.grid.sizes,
             frames=time_axis,
             samples=n_draws,
             again=images_until_repeat,
-            noise=self.samples // n_draws,
+            noise=self.samples_per_grid_point // n_draws,
             photographs=n_photographs,
             scene=images_per_scene,
         )
@@ -764,7 +764,7 @@ class Points:
             control = controls[group.control]
             # The range of a component is known unless it is in a ball, or the control
             # declares no slots (parameters with a range).
-            has_ranges = bool(control.slots) and not is_ball
+            has_ranges = bool(control.parameter_slots) and not is_ball
             if has_ranges and block.size <= MAX_TABLE_COMPONENTS:
                 yield from self._describe_sampled(
                     control, group.parameter, coordinates, first_column
@@ -795,8 +795,8 @@ class Points:
             yield SampledNumber(
                 name=full_name,
                 unit=_stored_unit(parameter),
-                column=first_column,
-                parts=options,
+                draw_column=first_column,
+                range_parts=options,
                 part_of_bin=part_of_bin,
             )
             return
@@ -808,8 +808,8 @@ class Points:
             yield SampledNumber(
                 name=full_name + suffix,
                 unit=parameter.unit,
-                column=first_column + component,
-                parts=self._divide_range(coordinate, spec, log=parameter.log),
+                draw_column=first_column + component,
+                range_parts=self._divide_range(coordinate, spec, log=parameter.log),
             )
 
     def _divide_range(
@@ -827,7 +827,7 @@ class Points:
         edges = torch.linspace(
             float(self._lower[column]),
             float(self._upper[column]),
-            self.n_parts + 1,
+            self.parts_per_range + 1,
             dtype=torch.float64,
         )
         edge_values: list[float] = spec.interpolate(edges, log=log).tolist()
@@ -855,13 +855,13 @@ class Points:
                 parts[:, column] = np.take(number.part_of_bin, bins[:, column])
         return parts
 
-    def noise_number(self, number: int) -> int:
+    def find_noise_index(self, number: int) -> int:
         """Return the index of the noise seed of an image, by its number in the sweep.
 
         In a comparison, the images with the adversarial scene repeat the draws of those
         without it. They have the same noise, too, so that only the scene differs.
         """
-        images_until_repeat = self.units.again  # 0 if draws never repeat
+        images_until_repeat = self.independent_units.again  # 0 if draws never repeat
         return number % images_until_repeat if images_until_repeat else number
 
     def _sample(self, draws: SampleSequence, first: int, count: int) -> Float64Array:
@@ -875,10 +875,10 @@ class Points:
             first: number of the first image in the full sweep.
             count: count of images.
         """
-        if self.units.frames is None:
-            return draws.points(self.units.find_draw(first), count)
+        if self.independent_units.frames is None:
+            return draws.points(self.independent_units.find_draw(first), count)
         points = [
-            draws.points(self.units.find_draw(number), 1)
+            draws.points(self.independent_units.find_draw(number), 1)
             for number in range(first, first + count)
         ]
         return np.concatenate(points) if points else draws.points(0, 0)
@@ -892,7 +892,7 @@ class Points:
         """
         if not self._axes:
             return ()
-        grid_points = np.arange(first, first + count) // self.samples
+        grid_points = np.arange(first, first + count) // self.samples_per_grid_point
         return np.unravel_index(grid_points, self.grid.sizes)
 
     def make_configurations(self, first: int, count: int, before: int = 0) -> Tensor:
@@ -940,10 +940,10 @@ class Points:
             (n, k).
         """
         block = sampled.block
-        if block.options:
+        if block.n_options:
             # a uniform number of exactly 1 belongs to the last option
-            option = np.minimum(np.floor(uniform * block.options), block.options - 1)
-            return np.asarray((option + 0.5) / block.options)
+            option = np.minimum(np.floor(uniform * block.n_options), block.n_options - 1)
+            return np.asarray((option + 0.5) / block.n_options)
         # Only a ball has an epsilon; the type checker needs the second condition.
         if block.norm != "l2" or block.epsilon is None:
             lower = self._lower[sampled.coordinates].astype(np.float64)
@@ -966,7 +966,7 @@ class Points:
         """
         # A group is the coordinates of one parameter.
         varies = any(group.setting == ENVIRONMENT for group in self.space.groups)
-        return None if varies else self.space.environment
+        return None if varies else self.space.environment_name
 
     def describe_images(self, u: Tensor, first_image: int) -> list[dict[str, Value]]:
         """Return the stored values of consecutive images: parameter to value and unit.
@@ -980,7 +980,7 @@ class Points:
         """
         rows = [dict[str, Value]() for _ in u]
         indices = self._axis_indices(first_image, len(u))
-        coordinates = u.split(self.space.sizes, dim=1)
+        coordinates = u.split(self.space.coordinate_counts, dim=1)
         for control, control_u in zip(self.space.controls, coordinates, strict=True):
             if _is_described_by_base(control):
                 # all images at once, which is sixty times as fast
@@ -1010,7 +1010,7 @@ class Points:
         return [
             (axis, int(indices[axis_index][image]))
             for axis_index, axis in self._axes.values()
-            if axis.instance == control.name
+            if axis.control_name == control.name
         ]
 
     def _describe_control(
@@ -1119,6 +1119,6 @@ def _stored_unit(parameter: Parameter) -> str:
 
 def _find_spec(bound: Control, name: str) -> tuple[Parameter, Range | OneOf]:
     """Return a parameter of a bound control, and the range that it varies over."""
-    slot = next(slot for slot in bound.slots if slot.parameter.name == name)
-    assert not isinstance(slot.spec, Fixed)
-    return slot.parameter, slot.spec
+    slot = next(slot for slot in bound.parameter_slots if slot.parameter.name == name)
+    assert not isinstance(slot.parameter_spec, Fixed)
+    return slot.parameter, slot.parameter_spec

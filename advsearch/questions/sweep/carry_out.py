@@ -27,14 +27,14 @@ from advsearch.engine.naming import (
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.options import to_setting
+from advsearch.options import convert_to_setting
 from advsearch.progress import NullProgress, Progress, ProgressOption, as_progress
-from advsearch.questions.attack.carry_out import LOADING, is_named, open_executor
+from advsearch.questions.attack.carry_out import LOADING, is_describable_by_setting, open_executor
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import load_attack_summary
 from advsearch.questions.sweep.axes import Axis, add_grid_axes, parse_axes
-from advsearch.questions.sweep.drives import add_frames
+from advsearch.questions.sweep.drives import add_frame_axis
 from advsearch.questions.sweep.job import (
     Job,
     NamedScene,
@@ -172,7 +172,7 @@ def sweep(
     # The settings as `run.yaml` states them, with names in place of objects.
     described: dict[str, object] = {
         "model": ",".join(get_model_name(network) for network in networks),
-        "task": to_setting(task) if isinstance(task, Task) else task,
+        "task": convert_to_setting(task) if isinstance(task, Task) else task,
         "controls": loading.controls_to_settings(controls),
         "grid": dict(grid or {}),
         "samples": samples,
@@ -383,8 +383,8 @@ def _find_python_only(
     ]
     if any(scene.scene.is_session_only for scene in scenes):
         parts.append(PythonOnly("scene"))
-    # `is_named` compares the task with the one that is made from its setting.
-    if isinstance(task, Task) and not is_named(task, make_task):
+    # `is_describable_by_setting` compares the task with the one that is made from its setting.
+    if isinstance(task, Task) and not is_describable_by_setting(task, make_task):
         parts.append(PythonOnly("task", task.name))
     parts += [
         PythonOnly("metric", name)
@@ -458,7 +458,7 @@ def _run_config(
     with context as directory:
         named_scenes = expand_photographs(config, scenes) or load_scenes(config)
         job = _make_job(
-            config, named_scenes, naming.list_models(models), task, controls
+            config, named_scenes, naming.to_model_list(models), task, controls
         )
         job = replace(
             job,
@@ -558,7 +558,7 @@ def _add_adversarial_arm(
         replace(named_scene, fixed_controls=fixed_controls, arm=CLEAN)
         for named_scene in named_scenes
     ]
-    adversarial = [replace(named_scene, u=u, arm=arm) for named_scene in clean]
+    adversarial = [replace(named_scene, adversarial_configuration=u, arm=arm) for named_scene in clean]
     return (*clean, *adversarial)
 
 
@@ -617,7 +617,7 @@ def _check_not_varied(
         InputError: a control is both fixed and varied.
     """
     varied_names = {control.name for control in sampled}
-    varied_names |= {axis.instance for axis in axes}
+    varied_names |= {axis.control_name for axis in axes}
     fixed_names = {control.name for control in fixed_controls}
     clashes = sorted(varied_names & fixed_names)
     if clashes:
@@ -651,14 +651,14 @@ def _make_job(
         InputError: something in the settings does not fit together.
     """
     # These settings need a control that travels along the path. With a `path`, they are
-    # set to None for the check, since `add_frames` adds such a control if there is
+    # set to None for the check, since `add_frame_axis` adds such a control if there is
     # none.
     unchecked = ("path", "shutter", "rolling") if config.path is not None else ()
     naming.check_run_settings(config.model_copy(update=dict.fromkeys(unchecked)))
     sampled = make_configured_controls(config, controls)
     grid = config.grid
     if config.path is not None:
-        sampled, grid = add_frames(config, sampled)
+        sampled, grid = add_frame_axis(config, sampled)
     axes = parse_axes(grid, sampled)
     _check_something_varies(
         config, axes, sampled, n_combinations=len(named_scenes) * len(models)
@@ -729,7 +729,7 @@ def _set_camera_units(
     )
     return tuple(
         replace(axis, parameter=adapt_length_unit(axis.parameter, are_sized))
-        if axis.control == CameraControl.kind
+        if axis.control_kind == CameraControl.kind
         else axis
         for axis in axes
     )
@@ -773,11 +773,11 @@ def _load_models_and_tasks(
         for network in networks
     )
     # A task of each thing has no remarks itself, so they are collected before.
-    warnings += [remark for network_task in tasks for remark in network_task.remarks]
+    warnings += [remark for network_task in tasks for remark in network_task.output_remarks]
     if config.judge == ALL_THINGS:
         tasks = tuple(map(make_each_thing_task, tasks))
     labels = {
-        named_scene.object: named_scene.scene.description.object.label
+        named_scene.object_name: named_scene.scene.description.object.label
         for named_scene in named_scenes
     }
     warnings += judging.find_label_warnings(networks, config.label, labels)
@@ -829,7 +829,7 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
     object has the environment of its own scene. A scene that a Python caller passed is
     the only one. If `backdrop` is a folder, each scene is in its first photograph.
     """
-    session_scene: Scene | None = config.python_object(naming.SCENE, config.object)
+    session_scene: Scene | None = config.get_python_object(naming.SCENE, config.object)
     if session_scene is not None:  # passed by a Python caller
         name = session_scene.description.environment_name
         return [NamedScene(config.object, name, session_scene)]
@@ -895,8 +895,8 @@ def expand_photographs(
                 replace(
                     named_scene,
                     scene=scene,
-                    environment=description.environment_name,
-                    photograph=name,
+                    environment_name=description.environment_name,
+                    photograph_name=name,
                 )
             )
     return tuple(expanded)

@@ -49,7 +49,7 @@ from advsearch.report.views import (
     Extent,
     ResultPart,
     ShownResult,
-    claim,
+    make_claim,
     format_extent,
     make_rate_extent,
 )
@@ -289,8 +289,8 @@ SURFACE_COLUMNS: dict[str, Column] = {
     "middle (u, v)": "{0.u:.3f}, {0.v:.3f}",
     "place (x, y, z)": lambda part: ", ".join(f"{x:.3g}" for x in part.center),
     "face": "{0.face}",
-    "wrong where seen": lambda part: wrong_text(part.visible),
-    "wrong where not": lambda part: wrong_text(part.hidden),
+    "wrong where seen": lambda part: format_error_rate(part.visible),
+    "wrong where not": lambda part: format_error_rate(part.hidden),
     "difference": _difference_text,
     "p": "{0.p:.2g}",
 }
@@ -306,10 +306,10 @@ def make_sweep_view(summary: SweepSummary) -> ShownResult:
             ResultPart(
                 draw=lambda figure_axes: draw_sweep_on(summary, figure_axes),
                 size=size,
-                only="notebook",
+                only_medium="notebook",
             )
         )
-    sections += (replace(part, only="page") for part in _make_page_parts(summary, axes))
+    sections += (replace(part, only_medium="page") for part in _make_page_parts(summary, axes))
     run_images = f"{summary.run}/images"
     has_drive_file = bool(summary.drives and summary.run)
     # Facts with an empty text are left out.
@@ -351,9 +351,9 @@ def _make_text_sections(
             yield _make_arms_table(summary.arms.adversarial_run, pair, summary.task)
     distance = find_detection_distance(summary)
     if distance:
-        yield ResultPart(text=[distance_sentence(distance)])
+        yield ResultPart(text=[describe_detection_distance(distance)])
     for rates in summary.drives or ():
-        yield ResultPart(drive_title(rates), heads=DRIVE_HEADS, rows=drive_rows(rates))
+        yield ResultPart(drive_title(rates), column_heads=DRIVE_HEADS, rows=make_drive_rows(rates))
     yield ResultPart.make_table(
         summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
     )
@@ -439,7 +439,7 @@ def _make_page_parts(
     """
     distance = find_detection_distance(summary)
     if distance:
-        sentence = distance_sentence(distance)
+        sentence = describe_detection_distance(distance)
         yield ResultPart(
             "How far away it is seen",
             [sentence],
@@ -453,8 +453,8 @@ def _make_page_parts(
         yield ResultPart(
             "Whole drives" if is_first else "",
             [drive_title(rates)],
-            heads=DRIVE_HEADS,
-            rows=drive_rows(rates),
+            column_heads=DRIVE_HEADS,
+            rows=make_drive_rows(rates),
             figure="images/drive.png" if is_first else "",
         )
     yield ResultPart.make_table(
@@ -495,8 +495,8 @@ def _verdict(summary: SweepSummary) -> str:
         if summary.out_of_view:
             return "The object is in no picture."
         return "Interrupted before the first configuration."
-    rate = rate_text(summary)
-    outcomes = outcomes_clause(summary)
+    rate = format_accuracy(summary)
+    outcomes = describe_wrong_outcomes(summary)
     if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
         return (
             f"Interrupted after {summary.looked_at} of {summary.planned} "
@@ -510,11 +510,11 @@ def _verdict(summary: SweepSummary) -> str:
     configurations = format_count(summary.configurations, "configuration")
     return (
         f"The model is right in {summary.correct} of {configurations} "
-        f"({rate}){grid_clause(summary)}{outcomes}."
+        f"({rate}){format_grid_caution(summary)}{outcomes}."
     )
 
 
-def outcomes_clause(summary: SweepSummary) -> str:
+def describe_wrong_outcomes(summary: SweepSummary) -> str:
     """Return the outcomes of wrong predictions, as the end of a sentence.
 
     Empty for tasks without outcomes; only detection has them.
@@ -523,7 +523,7 @@ def outcomes_clause(summary: SweepSummary) -> str:
     return f"; of the others, {text}" if text else ""
 
 
-def grid_clause(summary: SweepSummary) -> str:
+def format_grid_caution(summary: SweepSummary) -> str:
     """Return a caution that an accuracy depends on the grid; empty if it does not."""
     if summary.sampler is not None or not summary.grid:
         return ""
@@ -603,14 +603,14 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
     yield from _make_accuracy_claims(result, population, note)
     distance = find_detection_distance(result)
     if distance:
-        yield claim("measured", distance_sentence(distance), None)
+        yield make_claim("measured", describe_detection_distance(distance), None)
     for rates in result.drives or ():
         heads = "mean, with its interval over drives, then the worst drive"
-        values = "; ".join(_format_drive_clause(*row) for row in drive_rows(rates))
-        yield claim("measured", f"{drive_title(rates)} ({heads}): {values}.", None)
+        values = "; ".join(_format_drive_clause(*row) for row in make_drive_rows(rates))
+        yield make_claim("measured", f"{drive_title(rates)} ({heads}): {values}.", None)
     verified = result.worst.verified if result.worst else None
     if verified is not None:
-        yield claim(
+        yield make_claim(
             "measured",
             "In the worst of these configurations the model is wrong in "
             f"{wording.format_rate(verified)}. No search looked for a worse one.",
@@ -690,12 +690,12 @@ def _make_arm_claims(
             f"configurations of {arm} in which {pair.model} is right", counts
         )
         accuracy = format_extent(extent)
-        yield claim(
+        yield make_claim(
             "measured",
             f"With {arm} {pair.model} is right in {accuracy} {population}.{note}",
             extent,
         )
-    yield claim("measured", format_paired_rates(answer, pair), None)
+    yield make_claim("measured", format_paired_rates(answer, pair), None)
 
 
 def _make_accuracy_claims(
@@ -730,7 +730,7 @@ def _make_accuracy_claims(
         )
         outcomes = wording.format_outcomes(counts.outcomes, result.task)
         others = f" Of the others: {outcomes}." if outcomes else ""
-        yield claim(
+        yield make_claim(
             "measured",
             f"{model} is right in {format_extent(extent)} {population}.{others}{note}",
             extent,
@@ -738,7 +738,7 @@ def _make_accuracy_claims(
 
 
 def _format_drive_clause(name: str, mean: str, interval: str, worst: str) -> str:
-    """Return a row of `drive_rows` as a clause."""
+    """Return a row of `make_drive_rows` as a clause."""
     interval_text = "" if interval == "-" else f" (95 % interval {interval})"
     return f"{name}: {mean}{interval_text}, {worst}"
 
@@ -759,7 +759,7 @@ DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")
 PERCENT = " %"  # the unit of rates that are fractions, and written in percent
 
 
-def rate_text(summary: SweepSummary) -> str:
+def format_accuracy(summary: SweepSummary) -> str:
     """Return the accuracy with its interval, and whether that is over drives."""
     over = ", over drives" if summary.drives else ""
     return (
@@ -782,7 +782,7 @@ def drive_title(rates: DriveRates) -> str:
     return title
 
 
-def drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
+def make_drive_rows(drive_rates: DriveRates) -> list[tuple[str, str, str, str]]:
     """Return the rates over drives: name, mean, 95 % interval and worst drive.
 
     An unknown rate has no row; a missing interval is a dash.
@@ -864,15 +864,15 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
                 first = table.strongest[0]
                 text += (
                     f" The clearest, at u {first.u:.2f} and v {first.v:.2f}: wrong in "
-                    f"{wrong_text(first.visible)} that see it, "
-                    f"{wrong_text(first.hidden)} that do not."
+                    f"{format_error_rate(first.visible)} that see it, "
+                    f"{format_error_rate(first.hidden)} that do not."
                 )
         names = f"{shorten_name(table.object)}, {shorten_name(table.model)}"
         sentences.append(f"{names}: {text}")
     return sentences
 
 
-def wrong_text(counts: CountedPredictions) -> str:
+def format_error_rate(counts: CountedPredictions) -> str:
     n_wrong = counts.configurations - counts.correct
     return f"{n_wrong} of {counts.configurations}"
 
@@ -1072,7 +1072,7 @@ def _count_loose(rows: Sequence[AxisRow]) -> tuple[int, ...]:
     return tuple(counts.get(Outcome.LOOSE.value, 0) for counts in outcomes)
 
 
-def distance_sentence(estimate: DetectionDistance) -> str:
+def describe_detection_distance(estimate: DetectionDistance) -> str:
     """Return the detection distance as text: "Seen from 38 m, 31 to 44 m ...".
 
     Sentences about dips (distances with fewer detections than farther away) and about

@@ -54,7 +54,7 @@ HIDDEN = 2  # nothing of the object is in the image
 Flags = npt.NDArray[np.int8]
 
 
-def add_frames(
+def add_frame_axis(
     config: SweepConfig, sampled: tuple[Control, ...]
 ) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls and the grid of a sweep over the frames of a path.
@@ -132,12 +132,12 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
     lowest = math.inf
     highest = -math.inf
     for scene in range(len(job.scenes)):
-        for points in job.load_points(scene).values():
+        for points in job.load_configurations_by_size(scene).values():
             control: Any = next(
                 (
                     control
                     for control in points.space.controls
-                    if control.name == axis.instance
+                    if control.name == axis.control_name
                 ),
                 None,
             )
@@ -154,20 +154,20 @@ class _CompleteDrives(NamedTuple):
     """The n drives whose frames are all known and that show the object in some frame.
 
     Attributes:
-        flags: (n, frames) RIGHT, WRONG or HIDDEN.
+        outcomes: (n, frames) RIGHT, WRONG or HIDDEN.
         distance: (n, frames) distance of the object; NaN if unknown.
-        steps: (n, frames) numbers of the rows.
+        row_numbers: (n, frames) numbers of the rows.
     """
 
-    flags: Flags
+    outcomes: Flags
     distance: npt.NDArray[np.float64]
-    steps: npt.NDArray[np.int64]
+    row_numbers: npt.NDArray[np.int64]
 
 
 class Drives:
     """The frames of every drive of a sweep.
 
-    The private arrays `_flags` (WRONG, RIGHT, ...) and `_steps` (numbers of the rows)
+    The private arrays `_outcomes` (WRONG, RIGHT, ...) and `_row_numbers` (numbers of the rows)
     have the axes (scenes, axes of the grid without the time ..., samples, models,
     frames), with the frames in the order of their times. `_distance` has no axis for
     models, since all get the same images. `_path_of_step` has the name of the path of a
@@ -195,15 +195,15 @@ class Drives:
         self._job = job
         axis = job.axes[axis_index]
         # The units are the same in all scenes and for all sizes of images.
-        points_of_first_scene = job.load_points(0)
-        self._units = next(iter(points_of_first_scene.values())).units
+        points_of_first_scene = job.load_configurations_by_size(0)
+        self._units = next(iter(points_of_first_scene.values())).independent_units
         self._distance_bounds = compute_distance_bounds(job, axis)
         # An array of this shape has an element for each row; the row's number is its
         # index in the flat array.
         shape = (
             len(job.scenes),
             *(len(axis.values) for axis in job.axes),
-            job.samples,
+            job.samples_per_grid_point,
             len(job.models),
         )
         flags: Flags = np.full(shape, UNKNOWN, np.int8)
@@ -213,7 +213,7 @@ class Drives:
         self._frame_of_step: dict[int, DetectedFrame] = {}
         self._distance_unit = "object sizes"
         # fills `flags` and `distance`, and the attributes above
-        self._read_rows(rows, axis.instance, flags, distance)
+        self._read_rows(rows, axis.control_name, flags, distance)
 
         times = np.array([float(value) for value in axis.values])
         order = np.argsort(times)
@@ -223,8 +223,8 @@ class Drives:
         # The time becomes the last axis, in ascending order. In `shape`, the axis of
         # the scenes comes before those of the grid.
         time_axis = axis_index + 1
-        self._flags = np.moveaxis(flags, time_axis, -1)[..., order]
-        self._steps = np.moveaxis(steps, time_axis, -1)[..., order]
+        self._outcomes = np.moveaxis(flags, time_axis, -1)[..., order]
+        self._row_numbers = np.moveaxis(steps, time_axis, -1)[..., order]
         self._distance = np.moveaxis(distance, time_axis, -1)[..., order]
 
     def _read_rows(
@@ -273,7 +273,7 @@ class Drives:
         for scene, named_scene in enumerate(job.scenes):
             for model, task in enumerate(job.tasks):
                 if isinstance(task, Detection):
-                    classes = task.find_right_classes(job.make_facts(named_scene, {}))
+                    classes = task.find_right_classes(job.make_ground_truth_facts(named_scene, {}))
                     right_names[scene, model] = task.get_class_names(classes)
         return right_names
 
@@ -288,8 +288,8 @@ class Drives:
         """
         n_frames = len(self.times)
         # Axes of the scenes' arrays: (scenes, grid ..., samples, models, frames).
-        flags = self._flags[scenes][..., model, :].reshape(-1, n_frames)
-        steps = self._steps[scenes][..., model, :].reshape(-1, n_frames)
+        flags = self._outcomes[scenes][..., model, :].reshape(-1, n_frames)
+        steps = self._row_numbers[scenes][..., model, :].reshape(-1, n_frames)
         # Without the axis of models, it has the shape of one model's flags.
         distance = self._distance[scenes].reshape(flags.shape)
         is_known = (flags != UNKNOWN).all(axis=1)
@@ -316,7 +316,7 @@ class Drives:
             ]
             for model in range(len(self._job.models)):
                 drives = self._select_complete(scenes, model)
-                if len(drives.flags):
+                if len(drives.outcomes):
                     rates.append(self._compute_rates(drives, model, arm))
         return rates
 
@@ -335,11 +335,11 @@ class Drives:
         first_distance = _first_right_distance(drives)
         drive_records = self._describe_drives(drives, first_distance)
         # Only drives with a right frame have a distance of first detection.
-        has_right = np.asarray((drives.flags == RIGHT).any(axis=1))
+        has_right = np.asarray((drives.outcomes == RIGHT).any(axis=1))
 
         # Drives of one draw differ only in noise and count as one. All frames of a
         # drive have the same draw, so that of the first frame is looked up.
-        first_images = drives.steps[:, 0] // len(self._job.models)
+        first_images = drives.row_numbers[:, 0] // len(self._job.models)
         drive = np.asarray(self._units.find_draw(first_images))  # (n,) draw of each
         n_drives = len(np.unique(drive))
         n_right_drives = len(np.unique(drive[has_right]))
@@ -351,16 +351,16 @@ class Drives:
             model=self._job.models[model].name,
             adversarial_run=arm or None,  # the name is empty without a comparison
             drives=n_drives,
-            repeats=math.ceil(len(drives.flags) / n_drives),
+            repeats=math.ceil(len(drives.outcomes) / n_drives),
             frames=n_frames,
             seconds=self.seconds,
             # `min` or `max` selects the worst drive: it has the fewest right frames,
             # the longest gap, the smallest distance of the first detection.
             right=summarize_drives(
-                _right_fraction(drives.flags), min, drive_of_value=drive
+                _right_fraction(drives.outcomes), min, drive_of_value=drive
             ),
             longest_gap=summarize_drives(
-                self._longest_gaps(drives.flags),
+                self._longest_gaps(drives.outcomes),
                 max,
                 bounds=(0.0, max_gap),
                 drive_of_value=drive,
@@ -371,12 +371,12 @@ class Drives:
             unit=self._distance_unit,
             never_right=n_drives - n_right_drives,
             flicker=summarize_drives(
-                self._changes_per_second(drives.flags),
+                self._changes_per_second(drives.outcomes),
                 max,
                 bounds=(0.0, max_flicker),
                 drive_of_value=drive,
             ),
-            tracks=self._compute_track_rates(model, drives.steps, drive),
+            tracks=self._compute_track_rates(model, drives.row_numbers, drive),
             per_drive=drive_records,
         )
 
@@ -390,11 +390,11 @@ class Drives:
             first_distance: (n,) distance at the first right frame; NaN if there is
                 none.
         """
-        right_fraction = _right_fraction(drives.flags)
-        longest_gap = self._longest_gaps(drives.flags)
-        flicker = self._changes_per_second(drives.flags)
+        right_fraction = _right_fraction(drives.outcomes)
+        longest_gap = self._longest_gaps(drives.outcomes)
+        flicker = self._changes_per_second(drives.outcomes)
         # A drive is identified by the row of its first frame.
-        first_steps = drives.steps[:MAX_LISTED_DRIVES, 0].tolist()
+        first_steps = drives.row_numbers[:MAX_LISTED_DRIVES, 0].tolist()
         return [
             DriveRecord(
                 row=step,
@@ -507,11 +507,11 @@ class Drives:
         """
         all_scenes = [*range(len(self._job.scenes))]
         drives = self._select_complete(all_scenes, 0)
-        if not len(drives.flags):
+        if not len(drives.outcomes):
             return
-        worst = _right_fraction(drives.flags).argmin()
+        worst = _right_fraction(drives.outcomes).argmin()
         # rows are numbered by image, then model
-        image_numbers = drives.steps[worst] // len(self._job.models)
+        image_numbers = drives.row_numbers[worst] // len(self._job.models)
         animated_frames = []
         selected = select_evenly(len(image_numbers), MAX_ANIMATED_FRAMES)
         for number in image_numbers[selected].tolist():
@@ -556,7 +556,7 @@ def find_longest_run(flags: npt.NDArray[np.bool_]) -> int:
 
 def _first_right_distance(drives: _CompleteDrives) -> npt.NDArray[np.float64]:
     """Return the distance (n,) at the first right frame; NaN if there is none."""
-    is_right = drives.flags == RIGHT
+    is_right = drives.outcomes == RIGHT
     first_frame = is_right.argmax(axis=1)
     distance = drives.distance[np.arange(len(first_frame)), first_frame]
     return np.where(is_right.any(axis=1), distance, np.nan)

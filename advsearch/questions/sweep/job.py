@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluation, Query, Trials, run_trials
+from advsearch.attacks import Evaluation, Query, TrialCounts, run_trials
 from advsearch.attacks.domain import SeedSequence
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.engine.image_changes import WITHOUT_OBJECT, change_image, meets_claim
@@ -28,7 +28,7 @@ from advsearch.models import Model
 from advsearch.models.features import Features, features_of
 from advsearch.options import Value
 from advsearch.progress import Stages
-from advsearch.questions.sweep.axes import Axis, Points, SampledNumber, add_grid_axes
+from advsearch.questions.sweep.axes import Axis, SceneConfigurations, SampledNumber, add_grid_axes
 from advsearch.questions.sweep.predicting import SweepPredictor, SweptImage
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified
@@ -51,32 +51,32 @@ class NamedScene:
     """One of the scenes of a sweep.
 
     Attributes:
-        object: name of the object.
-        environment: name of the environment.
+        object_name: name of the object.
+        environment_name: name of the environment.
         scene: the loaded scene.
         fixed_controls: controls of an attack, which are fixed in the sweep.
-        u: (d,) the adversarial configuration of these; None leaves them at their values
+        adversarial_configuration: (d,) the adversarial configuration of these; None leaves them at their values
             in the clean scene.
         arm: name of the arm if clean and adversarial scenes are compared: "clean", or
             the name of the attack's run; empty if nothing is compared.
-        photograph: name of the scene's photograph in a folder of photographs; empty
+        photograph_name: name of the scene's photograph in a folder of photographs; empty
             without a folder.
     """
 
-    object: str
-    environment: str
+    object_name: str
+    environment_name: str
     scene: Scene
     fixed_controls: tuple[Control, ...] = ()
-    u: Tensor | None = None
+    adversarial_configuration: Tensor | None = None
     arm: str = ""
-    photograph: str = ""
+    photograph_name: str = ""
 
     @property
-    def names(self) -> dict[str, str]:
+    def value_of_scene_axis(self) -> dict[str, str]:
         """The scene's values of the axes that are not controls, as a new dict."""
-        names = {"object": self.object, "environment": self.environment}
-        if self.photograph:
-            names["backdrop"] = self.photograph
+        names = {"object": self.object_name, "environment": self.environment_name}
+        if self.photograph_name:
+            names["backdrop"] = self.photograph_name
         if self.arm:
             names["answer"] = self.arm
         return names
@@ -86,7 +86,7 @@ class NamedScene:
 class Job:
     """Everything that a sweep needs, loaded.
 
-    Images are numbered by scene, then as `Points` numbers them; rows by image, then by
+    Images are numbered by scene, then as `SceneConfigurations` numbers them; rows by image, then by
     model.
 
     Attributes:
@@ -113,12 +113,12 @@ class Job:
     warnings: tuple[str, ...] = ()
     metrics: Metrics = field(default_factory=dict)
     tracker: Tracker = ConstantVelocity
-    _points_by_scene: dict[int, dict[ImageSize, Points]] = field(
+    _points_by_scene: dict[int, dict[ImageSize, SceneConfigurations]] = field(
         default_factory=dict, init=False, repr=False
     )
 
     @property
-    def samples(self) -> int:
+    def samples_per_grid_point(self) -> int:
         """Number of samples at each point of the grid: by default 1, or more without a
         grid.
         """
@@ -149,14 +149,14 @@ class Job:
     @cached_property
     def images_per_scene(self) -> int:
         """Number of images of a scene, which is the same for all scenes and sizes."""
-        return next(iter(self.load_points(0).values())).count
+        return next(iter(self.load_configurations_by_size(0).values())).n_images
 
     @cached_property
     def seeds(self) -> SeedSequence:
         """The seeds of the noise, by the number of the image."""
         return SeedSequence(self.config.seed, KIND)
 
-    def load_points(self, scene: int) -> dict[ImageSize, Points]:
+    def load_configurations_by_size(self, scene: int) -> dict[ImageSize, SceneConfigurations]:
         """Return the configurations of a scene, by the size of the images.
 
         Those of the last scene are cached.
@@ -166,7 +166,7 @@ class Job:
             named_scene = self.scenes[scene]
             sizes = dict.fromkeys(self.image_sizes)
             self._points_by_scene[scene] = {
-                size: self.make_points(self.bind_controls(named_scene, size))
+                size: self.make_scene_configurations(self.bind_controls(named_scene, size))
                 for size in sizes
             }
         return self._points_by_scene[scene]
@@ -189,7 +189,7 @@ class Job:
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
         # The configurations may differ between sizes, since framing depends on them.
-        for size, points in self.load_points(scene).items():
+        for size, points in self.load_configurations_by_size(scene).items():
             configurations = points.make_configurations(
                 first_in_scene, len(numbers), images_before
             )
@@ -203,14 +203,14 @@ class Job:
                     if model_size == size
                 ]
         # The loop above is by size; rows are by image, then by model.
-        queries.sort(key=lambda query: query.index)
+        queries.sort(key=lambda query: query.row_index)
         return [(str(scene), None, query) for query in queries]
 
     def _make_query(
         self,
         number: int,
         model: int,
-        points: Points,
+        points: SceneConfigurations,
         u: Tensor,
         values: Mapping[str, Value],
     ) -> Query:
@@ -225,17 +225,17 @@ class Job:
         """
         scene = number // self.images_per_scene
         # an environment that a control or an axis chooses instead of the scene's
-        environment = points.space.find_environment(values)
+        environment = points.space.find_environment_name(values)
         return Query(
             u.clone(),
-            seed=self.seeds(points.noise_number(number)),
+            seed=self.seeds(points.find_noise_index(number)),
             kind=KIND,
-            index=number * len(self.models) + model,
+            row_index=number * len(self.models) + model,
             spp=self.spp,
             draws_conditions=False,  # what is sampled is in `u` already
             values=self._make_row_values(scene, model, environment, values),
             has_success=False,  # a sweep counts right predictions, not successes
-            with_image=self.config.keep_pictures != "none",
+            includes_image=self.config.keep_pictures != "none",
         )
 
     def _make_row_values(
@@ -258,7 +258,7 @@ class Job:
         """
         named_scene = self.scenes[scene]
         fixed_names = {control.name for control in named_scene.fixed_controls}
-        names = named_scene.names  # a new dict, which may be changed
+        names = named_scene.value_of_scene_axis  # a new dict, which may be changed
         if environment is not None:
             names["environment"] = environment
         names["model"] = self.models[model].name
@@ -308,7 +308,7 @@ class Job:
                 )
         return space
 
-    def make_points(self, space: Space) -> Points:
+    def make_scene_configurations(self, space: Space) -> SceneConfigurations:
         """Return the configurations of a space.
 
         In a comparison without and with an adversarial configuration, the second half
@@ -319,19 +319,19 @@ class Job:
         is_comparison = bool(self.scenes[0].arm)
         if is_comparison:
             repeat_after_scenes = len(self.scenes) // 2
-        return Points(
+        return SceneConfigurations(
             space,
             make_domain(space.controls),
             self.axes,
-            samples=self.samples,
+            samples=self.samples_per_grid_point,
             sampler=self.config.sampler,
             seed=self.config.seed,
             repeat_after_scenes=repeat_after_scenes,
             n_scenes=len(self.scenes),
-            n_photographs=len({scene.photograph for scene in self.scenes}),
+            n_photographs=len({scene.photograph_name for scene in self.scenes}),
         )
 
-    def make_facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
+    def make_ground_truth_facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
         """Return what a task needs to know about a scene.
 
         Args:
@@ -341,7 +341,7 @@ class Job:
         """
         return make_facts(
             named_scene.scene.description,
-            named_scene.object,
+            named_scene.object_name,
             label=self.config.label,
             describe=lambda: values,  # called only by tasks that need the values
             judge=self.config.judge,
@@ -361,16 +361,16 @@ def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     # These are bound to the scene; those of `named_scene` are not.
     fixed_controls = space.controls[: len(named_scene.fixed_controls)]
     start = torch.cat([control.start for control in fixed_controls])
-    if named_scene.u is None:
+    if named_scene.adversarial_configuration is None:
         return space.fix_first_controls(start)
-    if len(named_scene.u) != len(start):
+    if len(named_scene.adversarial_configuration) != len(start):
         raise InputError(
             "adversarial_of: the adversarial configuration of "
-            f"{named_scene.arm} has {len(named_scene.u)} "
-            f"numbers, and {named_scene.object} takes {len(start)}: it is "
+            f"{named_scene.arm} has {len(named_scene.adversarial_configuration)} "
+            f"numbers, and {named_scene.object_name} takes {len(start)}: it is "
             "another object, or it has changed since; do the run again"
         )
-    return space.fix_first_controls(named_scene.u)
+    return space.fix_first_controls(named_scene.adversarial_configuration)
 
 
 def check_scenes(
@@ -411,10 +411,10 @@ def check_scenes(
         for parameter in control.parameters:
             # A control's settings contain the parameters that it varies.
             is_varied = parameter.name in control.to_settings()
-            if control.setting_name(parameter) == ENVIRONMENT and is_varied:
+            if control.get_setting_name(parameter) == ENVIRONMENT and is_varied:
                 environment_choices.append(f"`controls` {control.name}")
     environments = list(
-        dict.fromkeys(named_scene.environment for named_scene in named_scenes)
+        dict.fromkeys(named_scene.environment_name for named_scene in named_scenes)
     )
     if len(environments) > 1 and environment_choices:
         raise InputError(
@@ -430,16 +430,16 @@ def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
     For example, an axis over "environment.which" varies "environment".
     """
     control = next(
-        (control for control in controls if control.name == axis.instance), None
+        (control for control in controls if control.name == axis.control_name), None
     )
     if control is None:
         # Any value of the axis is used, since the setting does not depend on it.
-        settings = {"kind": axis.control, axis.parameter.name: axis.values[0]}
-        control = make_control(axis.instance, settings)
-    return control.setting_name(axis.parameter)
+        settings = {"kind": axis.control_kind, axis.parameter.name: axis.values[0]}
+        control = make_control(axis.control_name, settings)
+    return control.get_setting_name(axis.parameter)
 
 
-def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
+def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]:
     """Check a job by binding every scene, so that errors come before any rendering.
 
     Returns:
@@ -450,12 +450,12 @@ def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
     Raises:
         InputError: controls sample other numbers in one scene than in another.
     """
-    scenes_and_points = list[tuple[NamedScene, Points]]()
+    scenes_and_points = list[tuple[NamedScene, SceneConfigurations]]()
     for scene, named_scene in enumerate(job.scenes):
         scenes_and_points += [
-            (named_scene, points) for points in job.load_points(scene).values()
+            (named_scene, points) for points in job.load_configurations_by_size(scene).values()
         ]
-        facts = job.make_facts(named_scene, {})
+        facts = job.make_ground_truth_facts(named_scene, {})
         for task, model in zip(job.tasks, job.models, strict=True):
             check_truth(
                 task, model, named_scene.scene, facts, job.config.image_settings
@@ -464,14 +464,14 @@ def check_job(job: Job) -> tuple[Points, tuple[SampledNumber, ...]]:
     for named_scene, points in scenes_and_points:
         if points.sampled_layout != first_points.sampled_layout:
             raise InputError(
-                f"`object` {named_scene.object}: its controls draw other numbers than "
-                f"those of {job.scenes[0].object}; sweep "
+                f"`object` {named_scene.object_name}: its controls draw other numbers than "
+                f"those of {job.scenes[0].object_name}; sweep "
                 "the two by themselves"
             )
     # Each number has a version in each scene, whose range may be another.
     numbers_of_scene = [points.sampled_numbers for _, points in scenes_and_points]
     sampled = [
-        _merge_versions(versions, first_points.n_parts)
+        _merge_versions(versions, first_points.parts_per_range)
         for versions in zip(*numbers_of_scene, strict=True)
     ]
     return first_points, tuple(sampled)
@@ -488,11 +488,11 @@ def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledN
         n_parts: number of parts of its range.
     """
     number = versions[0]
-    if all(version.parts == number.parts for version in versions):
+    if all(version.range_parts == number.range_parts for version in versions):
         return number
     fractions = tuple([k / n_parts, (k + 1) / n_parts] for k in range(n_parts))
     return replace(
-        number, unit="of its range", parts=fractions, same_in_all_scenes=False
+        number, unit="of its range", range_parts=fractions, same_in_all_scenes=False
     )
 
 
@@ -506,7 +506,7 @@ class SweptScene:
     Attributes:
         number: index of the scene in the sweep.
         job: the job of the sweep.
-        points_of_size: configurations of the scene, by image size.
+        configurations_by_size: configurations of the scene, by image size.
         renderer_of_size: renderer of the scene, by image size.
         problems: a problem for each model.
         predictor_of_size: predictor of the scene's images, by image size.
@@ -516,15 +516,15 @@ class SweptScene:
         """Make renderers, problems and predictors of the scene with this number."""
         self.number = number
         self.job = job
-        self.points_of_size = job.load_points(number)
+        self.configurations_by_size = job.load_configurations_by_size(number)
         # renderers of the scene without its object, by size, made on demand
         self._empty_renderers: dict[ImageSize, Renderer] = {}
         self.renderer_of_size = {
-            size: self._make_renderer(size) for size in self.points_of_size
+            size: self._make_renderer(size) for size in self.configurations_by_size
         }
         self.problems = tuple(map(self._make_problem, range(len(job.models))))
         self.predictor_of_size = {
-            size: self._make_predictor(size) for size in self.points_of_size
+            size: self._make_predictor(size) for size in self.configurations_by_size
         }
 
     def _make_problem(self, model: int) -> Problem:
@@ -535,18 +535,18 @@ class SweptScene:
         make_scene_facts = partial(
             make_facts,
             named_scene.scene.description,
-            named_scene.object,
+            named_scene.object_name,
             job.config.label,
             judge=job.config.judge,
         )
         return Problem(
             renderer=self.renderer_of_size[size],
-            space=self.points_of_size[size].space,
+            space=self.configurations_by_size[size].space,
             model=job.models[model],
             task=job.tasks[model],
             make_facts=make_scene_facts,
             objective=None,
-            spp=job.spp,
+            search_spp=job.spp,
             seed=job.config.seed,
             metrics=job.metrics,
         )
@@ -554,23 +554,23 @@ class SweptScene:
     def _make_predictor(self, size: ImageSize) -> SweepPredictor:
         """Return the predictor of the images of a size; all its models share it."""
         config = self.job.config
-        points = self.points_of_size[size]
+        points = self.configurations_by_size[size]
         first_model_of_size = self.job.image_sizes.index(size)
         return SweepPredictor(
             problem=self.problems[first_model_of_size],
-            points=points,
+            configurations=points,
             axes=self.job.axes,
-            seed=seeds.stream(config.seed, "sweep light", self.number),
+            seed=seeds.derive_seed(config.seed, "sweep light", self.number),
             specialise=config.specialise,
             # the number of images in the scenes before this one
-            images_before=self.number * points.count,
+            images_before=self.number * points.n_images,
         )
 
     @property
     def n_non_finite(self) -> int:
         """Number of values of images that were not finite and were set to 0."""
         rendered = sum(
-            renderer.non_finite for renderer in self.renderer_of_size.values()
+            renderer.n_non_finite for renderer in self.renderer_of_size.values()
         )
         predicted = sum(
             images.n_non_finite for images in self.predictor_of_size.values()
@@ -594,7 +594,7 @@ class SweptScene:
         not_finite_before = self.n_non_finite
         n_models = len(self.job.models)
         images = {
-            size: self._make_images(size, queries) for size in self.points_of_size
+            size: self._make_images(size, queries) for size in self.configurations_by_size
         }
         judgements = self._make_judgements(queries, images)
         # queries are numbered by image, then by model
@@ -614,10 +614,10 @@ class SweptScene:
         n_new_non_finite = max(0, self.n_non_finite - not_finite_before)
         evaluations[-1] = replace(
             evaluations[-1],
-            light=[
+            collected_light=[
                 predictor.summarize() for predictor in self.predictor_of_size.values()
             ],
-            non_finite=n_new_non_finite,
+            n_non_finite=n_new_non_finite,
         )
         return evaluations
 
@@ -643,12 +643,12 @@ class SweptScene:
         """
         evaluations = list[Evaluation]()
         for query in queries:
-            number, model = divmod(query.index, len(self.job.models))
+            number, model = divmod(query.row_index, len(self.job.models))
             image = images[self.job.image_sizes[model]][number]
             # Models of one size share the image: its cost counts for the first.
             cost = image.n_traced if self.job.is_first_of_size[model] else 0
             evaluation = Evaluation.from_judgement(
-                judgements[query.index],
+                judgements[query.row_index],
                 cost=cost,
                 predicted=image.prediction_spp,  # 0 if the image was rendered
                 seconds=seconds,
@@ -679,12 +679,12 @@ class SweptScene:
         for model, problem in enumerate(self.problems):
             size = job.image_sizes[model]
             model_queries = [
-                query for query in queries if query.index % n_models == model
+                query for query in queries if query.row_index % n_models == model
             ]
             if not model_queries:
                 continue
             batch = torch.stack(
-                [images[size][query.index // n_models].image for query in model_queries]
+                [images[size][query.row_index // n_models].image for query in model_queries]
             )
             judgements = problem.judge_images(
                 batch,
@@ -695,7 +695,7 @@ class SweptScene:
                 problem, size, model_queries, batch, judgements
             )
             for query, judgement in zip(model_queries, judgements, strict=True):
-                judgement_of_query[query.index] = judgement
+                judgement_of_query[query.row_index] = judgement
         return judgement_of_query
 
     def _attach_images(
@@ -712,11 +712,11 @@ class SweptScene:
             is_wrong: whether the prediction of any model is wrong.
         """
         job = self.job
-        if query.with_image and (job.config.keep_pictures == "all" or is_wrong):
+        if query.includes_image and (job.config.keep_pictures == "all" or is_wrong):
             thumbnail = thumbnails.make_thumbnail(image.image)
             evaluation = replace(evaluation, jpeg=thumbnail)
         if job.aovs:
-            surfaces = self.renderer_of_size[job.image_sizes[0]].surfaces(query.u)
+            surfaces = self.renderer_of_size[job.image_sizes[0]].find_surfaces(query.u)
             layers = {
                 name: layer.numpy()
                 for name, layer in surfaces.make_layers(job.aovs, OBJECT).items()
@@ -778,7 +778,7 @@ class SweptScene:
         if size not in self._empty_renderers:
             self._empty_renderers[size] = self._make_renderer(size)
         renderer = self._empty_renderers[size]
-        renderer.scene.assembly.is_object_hidden = True
+        renderer.scene.input_assembler.is_object_hidden = True
         with torch.no_grad():
             rendered = [renderer(query.u, query.seed, query.spp) for query in queries]
         return torch.stack(list(map(round_to_8_bit, rendered)))
@@ -789,7 +789,7 @@ class SweptScene:
         description = fit_camera(self.job.scenes[self.number].scene.description, size)
         return make_renderer(
             description,
-            self.points_of_size[size].space,
+            self.configurations_by_size[size].space,
             size,
             config.denoise,
             config.seed,
@@ -806,12 +806,12 @@ class SweptScene:
             queries: queries of all models, which are numbered by image, then by model.
         """
         n_models = len(self.job.models)
-        images_before = self.number * self.points_of_size[size].count
+        images_before = self.number * self.configurations_by_size[size].n_images
         # The predictor numbers the images of this scene from 0.
         query_of_image = {
-            query.index // n_models - images_before: query
+            query.row_index // n_models - images_before: query
             for query in queries
-            if self.job.image_sizes[query.index % n_models] == size
+            if self.job.image_sizes[query.row_index % n_models] == size
         }
         with torch.no_grad():
             images = self.predictor_of_size[size].make_images(query_of_image)
@@ -831,14 +831,14 @@ class SceneLoader:
 
     def __init__(self, job: Job) -> None:
         self.job = job
-        self.scene: SweptScene | None = None
+        self.loaded_scene: SweptScene | None = None
 
-    def load(self, number: int) -> SweptScene:
+    def load_scene(self, number: int) -> SweptScene:
         """Load the scene with this number, and release the one before."""
-        if self.scene is None or self.scene.number != number:
-            self.scene = None
-            self.scene = SweptScene(self.job, number)
-        return self.scene
+        if self.loaded_scene is None or self.loaded_scene.number != number:
+            self.loaded_scene = None
+            self.loaded_scene = SweptScene(self.job, number)
+        return self.loaded_scene
 
     def load_by_name(self, name: str) -> SweptScene:
         """Load a scene by its number as text.
@@ -846,7 +846,7 @@ class SceneLoader:
         That is the name of its problem: see
         `advsearch.engine.journal.make_worker_call`.
         """
-        return self.load(int(name))
+        return self.load_scene(int(name))
 
     def make_queries(self, number: int) -> tuple[SweptScene, list[Query]]:
         """Load the scene of an image; return it and the queries of all models."""
@@ -925,18 +925,18 @@ def verify_worst(
     verifier.begin_stage(
         "checking the worst configuration with fresh renders", config.trials
     )
-    spp = verifier.state.spp
-    sample_count = verifier.state.sample_count
+    spp = verifier.run_state.spp
+    sample_count = verifier.run_state.sample_count
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
     # For an attack, a wrong prediction is a success.
     wrong_trials = [trial for trial in trials if trial.success]
-    counts = Trials(len(wrong_trials), len(trials), spp)
+    counts = TrialCounts(len(wrong_trials), len(trials), spp)
     verified_rate = make_rate(counts, trials, wrong_trials)
     has_converged = sample_count is not None and sample_count.converged
     return WorstVerified(
         **vars(verified_rate),
-        converged=len(verifier.ladder) == 1 or has_converged,
-        renders=verifier.state.verification_renders,
+        converged=len(verifier.spp_ladder) == 1 or has_converged,
+        renders=verifier.run_state.verification_renders,
     )

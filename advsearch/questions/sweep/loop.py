@@ -31,7 +31,7 @@ from advsearch.engine.journal import (
 from advsearch.engine.loading import fit_camera
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import LOST_LABEL, make_lost_remarks, read_judgement
-from advsearch.interrupts import interruptible
+from advsearch.interrupts import reraise_lost_interrupt
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress, Stages
 from advsearch.questions.attack.result import save_with_marks
@@ -51,7 +51,7 @@ from advsearch.questions.sweep.result import (
     Predictions,
     SweepResult,
     TableAxis,
-    count_by_unit,
+    count_predictions,
     make_map,
 )
 from advsearch.questions.sweep.settings import BLIND
@@ -109,10 +109,10 @@ class Sweep:
     Rows are numbered by image, then by model.
 
     Attributes:
-        points: the configurations of the first scene.
+        first_scene_configurations: the configurations of the first scene.
         images_per_scene: number of images of a scene.
         n_models: number of models, all of which predict every image.
-        units: the independent units that rows belong to: rows of the same draw share
+        independent_units: the independent units that rows belong to: rows of the same draw share
             one.
         n_rows: number of rows of the full sweep.
     """
@@ -129,10 +129,10 @@ class Sweep:
         self.run = run
         self.stages = Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
-        self.points, self._sampled_numbers = check_job(job)
-        self.images_per_scene = self.points.count
+        self.first_scene_configurations, self._sampled_numbers = check_job(job)
+        self.images_per_scene = self.first_scene_configurations.n_images
         self.n_models = len(job.models)
-        self.units = replace(self.points.units, models=self.n_models)
+        self.independent_units = replace(self.first_scene_configurations.independent_units, models=self.n_models)
         self.n_rows = len(job.scenes) * self.images_per_scene * self.n_models
         if run is not None:
             self._write_notes(run)
@@ -164,12 +164,12 @@ class Sweep:
     def _write_notes(self, run: RunDirectory) -> None:
         """Store the parts of ranges and the independent units, which readers need."""
         edges = {
-            number.name: number.edges
+            number.name: number.part_bounds
             for number in self._sampled_numbers
-            if number.edges
+            if number.part_bounds
         }
         run.store.write_note(EDGES_NOTE, json.dumps(edges))
-        run.store.write_note(UNITS_NOTE, json.dumps(asdict(self.units)))
+        run.store.write_note(UNITS_NOTE, json.dumps(asdict(self.independent_units)))
 
     def execute(self) -> SweepResult:
         """Evaluate the rows that are not stored yet, and return the result."""
@@ -178,13 +178,13 @@ class Sweep:
         for warning in self.job.warnings:
             self.stages.progress.message(warning)
         try:
-            with interruptible():
+            with reraise_lost_interrupt():
                 missing = self._find_missing()
                 # If no row is missing, the last scene is loaded: verifying the worst
                 # row and describing the image formation need a scene.
                 first_row = missing[0].start if missing else self.n_rows - 1
                 # loaded here, so that its time counts for the stage "setup"
-                self._scenes.load(self._find_scene(first_row))
+                self._scenes.load_scene(self._find_scene(first_row))
                 self._evaluate_rows(missing, predictions)
                 worst = self._find_worst(predictions, verify=True)
                 self._map_surface()
@@ -248,18 +248,18 @@ class Sweep:
             self._add_costs(stored_rows)
             # Models of one size share an image, which counts for the first of them.
             self._n_rendered += sum(
-                self.job.is_first_of_size[query.index % self.n_models]
+                self.job.is_first_of_size[query.row_index % self.n_models]
                 for query in queries
             )
-            scene = self._find_scene(queries[0].index)
+            scene = self._find_scene(queries[0].row_index)
             # Summaries of predictors are in the last evaluation of a batch. A later
             # batch of the same worker and scene replaces them.
             _, last_evaluation = evaluated[-1]
-            self._transport[batch.worker, scene] = last_evaluation.light or []
-            if any(evaluation.non_finite for _, evaluation in evaluated):
+            self._transport[batch.worker, scene] = last_evaluation.collected_light or []
+            if any(evaluation.n_non_finite for _, evaluation in evaluated):
                 self._note_non_finite()
             for query, evaluation in evaluated:
-                predictions.add(query.index, evaluation.required_judgement)
+                predictions.add(query.row_index, evaluation.required_judgement)
             self._report(len(queries), predictions)
         # Workers may finish batches in any order.
         self.journal.rows.sort(key=lambda row: row.step)
@@ -299,7 +299,7 @@ class Sweep:
         if self.run is None:
             return
         for query, evaluation in evaluated:
-            number = query.index // self.n_models
+            number = query.row_index // self.n_models
             if evaluation.jpeg is not None:
                 thumbnails.write_thumbnail(self.run.path, number, evaluation.jpeg)
             if evaluation.layers is not None:
@@ -330,7 +330,7 @@ class Sweep:
                 yield [
                     (problem_name, u, query)
                     for problem_name, u, query in items
-                    if query.index in rows
+                    if query.row_index in rows
                 ]
 
     def _split_images(self, rows: range) -> Iterator[range]:
@@ -432,7 +432,7 @@ class Sweep:
                 TableAxis(
                     name=number.name,
                     unit=number.unit,
-                    values=number.parts,
+                    values=number.range_parts,
                     value_index=part_of_row,
                     kind="drawn",
                 )
@@ -450,7 +450,7 @@ class Sweep:
         """
         for name in ("object", "environment", "backdrop", "answer"):
             scene_values = [
-                named_scene.names.get(name, "") for named_scene in self.job.scenes
+                named_scene.value_of_scene_axis.get(name, "") for named_scene in self.job.scenes
             ]
             values = list(dict.fromkeys(scene_values))
             index_of_scene = np.array([values.index(value) for value in scene_values])
@@ -465,8 +465,8 @@ class Sweep:
         if not self.job.axes:
             return []
         # The samples of a grid point are consecutive images.
-        grid_point = image // self.job.samples
-        indices = np.unravel_index(grid_point, self.points.grid.sizes)
+        grid_point = image // self.job.samples_per_grid_point
+        indices = np.unravel_index(grid_point, self.first_scene_configurations.grid.sizes)
         return [
             TableAxis(
                 name=axis.name,
@@ -493,7 +493,7 @@ class Sweep:
             scene_end = scene_begin + self.images_per_scene
             for batch in split_into_batches(scene_begin, scene_end, SAMPLING_BATCH):
                 if batch.start <= last_image:
-                    parts.append(self.points.find_parts(batch.start, len(batch)))
+                    parts.append(self.first_scene_configurations.find_parts(batch.start, len(batch)))
         return np.asarray(np.concatenate(parts)[images])
 
     def _find_worst(
@@ -529,7 +529,7 @@ class Sweep:
         )
         if not verify:
             return worst
-        problem = self._scenes.load(scene).problems[model]
+        problem = self._scenes.load_scene(scene).problems[model]
         return self._verify_worst(worst, problem, query.u)
 
     def _read_row(self, number: int) -> Row:
@@ -543,11 +543,11 @@ class Sweep:
         """Return the names that count as right in the image of a query."""
         task = self.job.tasks[model]
         if task.varies:  # the truth depends on the configuration, as a box does
-            problem = self._scenes.load(scene).problems[model]
+            problem = self._scenes.load_scene(scene).problems[model]
             truth = problem.find_truth(query.u, query.values)
         else:
             truth = task.truth(
-                self.job.make_facts(self.job.scenes[scene], query.values)
+                self.job.make_ground_truth_facts(self.job.scenes[scene], query.values)
             )
         return list(task.truth_names(truth))
 
@@ -624,11 +624,11 @@ class Sweep:
             surface=self._surface,
             drives=self._drives,
             changes=changes or None,
-            shared=SharedWork.of_facts(self._executor.stats, self.journal.machines),
+            shared=SharedWork.from_worker_stats(self._executor.stats, self.journal.machines),
             renders_per_second=self._compute_speed(
                 self.stages.seconds.get("sweep", 0.0)
             ),
-            seconds={**self.stages.seconds, "total": self.stages.total},
+            seconds={**self.stages.seconds, "total": self.stages.total_seconds},
             warnings=[
                 *job.warnings,
                 *self._list_remarks(predictions, verified, changes),
@@ -653,8 +653,8 @@ class Sweep:
             },
             "planned": self.n_rows,
             "grid": {axis.name: len(axis.values) for axis in job.axes},
-            "samples": job.samples,
-            "sampler": config.sampler if self.points.is_sampled else None,
+            "samples": job.samples_per_grid_point,
+            "sampler": config.sampler if self.first_scene_configurations.is_sampled else None,
             "spp": job.spp,
             "seed": config.seed,
         }
@@ -665,14 +665,14 @@ class Sweep:
         # a drive, for example, are not independent, and are one unit.
         rows = np.flatnonzero(predictions.is_counted)
         right = predictions.is_right[rows]
-        units = self.units.find_unit(rows)
+        units = self.independent_units.find_unit(rows)
         outcome = predictions.outcome[rows]
         axes = self._make_axes(rows)
         # If every row is a unit, the summary states no number of units.
-        has_shared_units = self.units.size > 1 and len(units) > 0
+        has_shared_units = self.independent_units.size > 1 and len(units) > 0
         return {
-            **vars(count_by_unit(right, units, outcome)),
-            "out_of_view": int(predictions.is_hidden.sum()),
+            **vars(count_predictions(right, units, outcome)),
+            "out_of_view": int(predictions.is_out_of_view.sum()),
             "phantoms_out_of_view": predictions.n_phantoms_out_of_view,
             "units": len(np.unique(units)) if has_shared_units else None,
             "not_finite": predictions.n_non_finite,
@@ -685,7 +685,7 @@ class Sweep:
     @property
     def _environment(self) -> str:
         """Names of the environments: those a control chooses, or those of settings."""
-        return self.points.environment or self.job.config.environment_name
+        return self.first_scene_configurations.environment or self.job.config.environment_name
 
     def _find_twins(self) -> TwinEvidence | None:
         """Return how far results on renders hold for photographs.
@@ -712,17 +712,17 @@ class Sweep:
         was loaded, the formation is None.
         """
         gains: dict[str, float] = {}
-        if self._scenes.scene is None:
+        if self._scenes.loaded_scene is None:
             return None, gains
         # Formations of other sizes differ only in the resolution.
-        renderer = next(iter(self._scenes.scene.renderer_of_size.values()))
+        renderer = next(iter(self._scenes.loaded_scene.renderer_of_size.values()))
         formation = Formation.from_values(renderer.formation)
         if len(self.job.scenes) <= MAX_LISTED_GAINS:
             for named_scene in self.job.scenes:
                 description = fit_camera(
                     named_scene.scene.description, self.job.image_sizes[0]
                 )
-                names = dict(named_scene.names)
+                names = dict(named_scene.value_of_scene_axis)
                 # The adversarial scene has the gain of its clean scene.
                 names.pop("answer", None)  # the name of the arm
                 gains[", ".join(names.values())] = description.gain
@@ -737,7 +737,7 @@ class Sweep:
         if not adversarial:
             return None
         models = [model.name for model in self.job.models]
-        pairs = predictions.compare_arms(models, self.units)
+        pairs = predictions.compare_arms(models, self.independent_units)
         return ArmComparison(adversarial_run=adversarial, pairs=pairs)
 
     def _count_renders(self, verified: WorstVerified | None) -> dict[str, int]:
@@ -755,8 +755,8 @@ class Sweep:
         ]
         # A continued sweep may have had no batch left to evaluate. Then the predictors
         # of the loaded scene state what they would do.
-        if not self._transport and self._scenes.scene is not None:
-            predictors = self._scenes.scene.predictor_of_size.values()
+        if not self._transport and self._scenes.loaded_scene is not None:
+            predictors = self._scenes.loaded_scene.predictor_of_size.values()
             transport = [predictor.summarize() for predictor in predictors]
         return combine_transport(transport)
 
@@ -814,7 +814,7 @@ class Sweep:
         )
         violations = rows[~is_met]
         return ChangeRates(
-            **vars(count_by_unit(is_met, self.units.find_unit(rows))),
+            **vars(count_predictions(is_met, self.independent_units.find_unit(rows))),
             model=self.job.models[model].name,
             claim=claim,
             when=change,
@@ -837,9 +837,9 @@ class Sweep:
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
         # `noise` is the number of images of a draw, which differ only in noise.
-        if self.units.noise > 1 and self.units.photographs == 1:
-            n_units = self.n_rows // self.units.size
-            yield explain_repeats(self.units.name, self.units.noise, n_units)
+        if self.independent_units.noise > 1 and self.independent_units.photographs == 1:
+            n_units = self.n_rows // self.independent_units.size
+            yield explain_repeats(self.independent_units.name, self.independent_units.noise, n_units)
         yield from self._list_drive_remarks()
         yield from self._list_prediction_remarks(predictions)
         if self._has_non_finite:
@@ -875,7 +875,7 @@ class Sweep:
             (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
         )
         # `explain_repeats` has a remark on repeats of one drive.
-        is_repeated = self.units.noise > 1
+        is_repeated = self.independent_units.noise > 1
         if n_drives == 1 and not is_repeated:
             yield "One drive says nothing of others: there is no interval over drives."
         elif 1 < n_drives < ENOUGH_DRIVES:
@@ -888,10 +888,10 @@ class Sweep:
 
     def _list_prediction_remarks(self, predictions: Predictions) -> Iterator[str]:
         """Yield remarks on predictions that do not count, or do not count as right."""
-        n_hidden = int(predictions.is_hidden.sum())
+        n_hidden = int(predictions.is_out_of_view.sum())
         if n_hidden:
             # Each model's prediction counts as a picture here.
-            images = format_count(int(predictions.is_known.sum()), "picture")
+            images = format_count(int(predictions.has_prediction.sum()), "picture")
             # predictions that find an object of which nothing is in the image
             n_phantoms = predictions.n_phantoms_out_of_view
             phantoms = ""
@@ -924,8 +924,8 @@ def _pair_evaluations(batch: BatchResult) -> list[tuple[Query, Evaluation]]:
     """
     queries = [query for _, _, query in batch.items]
     evaluations = batch.value
-    if batch.lost:  # the reason, as a text
-        evaluations = [make_lost_evaluation(query, batch.lost) for query in queries]
+    if batch.failure_reason:  # the reason, as a text
+        evaluations = [make_lost_evaluation(query, batch.failure_reason) for query in queries]
     return [
         (query, replace(evaluation, machine=batch.machine))
         for query, evaluation in zip(queries, evaluations, strict=True)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.questions.sweep.display import grid_clause, outcomes_clause, rate_text
+from advsearch.questions.sweep.display import format_grid_caution, describe_wrong_outcomes, format_accuracy
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.views import Html, join_html, make_element
@@ -39,9 +39,9 @@ from advsearch.viewer.document import (
     make_data_url,
     make_document,
     remarks_html,
-    subject_html,
+    make_subject_html,
 )
-from advsearch.viewer.pages import make_end, make_part, make_run_page
+from advsearch.viewer.pages import make_page_end, make_part, make_run_page
 from advsearch.viewer.thumbnails import (
     Thumbnails,
     find_thumbnails,
@@ -246,11 +246,11 @@ def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
     """Return the parts that only a page shows, and its end: how to repeat the run."""
     view = make_view(summary)
     page_parts = [
-        part for part in view.sections if part.only == "page" and not part.is_empty
+        part for part in view.sections if part.only_medium == "page" and not part.is_empty
     ]
     return [
         *(make_part(path, part, view.statement) for part in page_parts),
-        make_end(path, summary, view),
+        make_page_end(path, summary, view),
     ]
 
 
@@ -295,7 +295,7 @@ def _header_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
                 make_element(heading, f"{path.name}: this sweep has not ended yet")
             ]
             continue
-        subject = subject_html(
+        subject = make_subject_html(
             ("object", summary.object),
             ("environment", summary.environment),
             ("model", summary.model),
@@ -344,10 +344,10 @@ def verdict_text(summary: SweepSummary) -> str:
     so_far = ""
     if summary.looked_at != summary.planned:
         so_far = f" so far, of {summary.planned} planned"
-    accuracy = f"({rate_text(summary)}){grid_clause(summary)}"
+    accuracy = f"({format_accuracy(summary)}){format_grid_caution(summary)}"
     return (
         f"Right in {summary.correct} of {summary.configurations} "
-        f"configurations{so_far} {accuracy}{outcomes_clause(summary)}."
+        f"configurations{so_far} {accuracy}{describe_wrong_outcomes(summary)}."
     )
 
 

@@ -32,7 +32,7 @@ from advsearch.engine.acceptance import (
 from advsearch.engine.problem import Problem
 from advsearch.engine.surface_light import N_LIGHTS, SurfaceLight
 from advsearch.engine.verifier import Verifier
-from advsearch.questions.sweep.axes import Axis, Points
+from advsearch.questions.sweep.axes import Axis, SceneConfigurations
 from advsearch.runs.results import LinearTransport, PredictionError
 from advsearch.scene.assembly import IMAGE_INPUTS
 from advsearch.scene.color import round_to_8_bit
@@ -57,7 +57,7 @@ from advsearch.scene.surface.renderer import (
     find_changed_inputs,
     find_scene_refusal,
 )
-from advsearch.scene.transport.lights import BasisRenderer, LightBasis, find_lighting
+from advsearch.scene.transport.lights import BasisRenderer, LightBasis, find_light_groups
 from advsearch.scene.transport.matrix import COLLECTED_SPP
 from advsearch.trust.stored_files import scale_limit
 
@@ -86,7 +86,7 @@ class Groups:
     Attributes:
         group_size: number of images of a group.
         n_groups: number of groups.
-        n_alternating_groups: number of groups to cache so that no predictor is made
+        n_groups_to_cache: number of groups to cache so that no predictor is made
             twice if images come in order: 1 if the images of a group follow each other.
     """
 
@@ -117,7 +117,7 @@ class Groups:
         self._between = ProductIndex(tuple(between_sizes))
         self.group_size = self._within.count
         self.n_groups = self._between.count
-        self.n_alternating_groups = self._count_alternating_groups()
+        self.n_groups_to_cache = self._count_alternating_groups()
 
     def _count_alternating_groups(self) -> int:
         """Return how many groups alternate when images come in order.
@@ -147,12 +147,12 @@ class Groups:
             if within == is_within
         ]
 
-    def find_group(self, number: int) -> int:
+    def find_group_of_image(self, number: int) -> int:
         """Return the index of the group of an image of the scene."""
         digits = self._all_axes.digits(number)
         return self._between.index(self._select(digits, is_within=False))
 
-    def find_member(self, number: int, index: int) -> int:
+    def find_image_of_group(self, number: int, index: int) -> int:
         """Return the number of an image of the same group, by its index in the group.
 
         Both images have the same index along every axis between groups. The index in
@@ -199,9 +199,9 @@ class BasisPictures:
 
     def __init__(self, renderer: Renderer, seed: int) -> None:
         self._renderer = renderer
-        self._lighting = find_lighting(renderer)
-        self.parameters = frozenset(self._lighting.groups)
-        self.changes_scene = any(self._lighting.groups.values())
+        self._lighting = find_light_groups(renderer)
+        self.parameters = frozenset(self._lighting.inputs_by_group)
+        self.changes_scene = any(self._lighting.inputs_by_group.values())
 
     def find_refusal(self, make_groups: MakeGroups, spp: int) -> Refusal | None:
         """Return why images are rendered; None if they are predicted.
@@ -218,7 +218,7 @@ class BasisPictures:
         if renderer.formation.denoiser != "oidn":
             return NOISE  # an image that is not denoised has noise to be reproduced
         # The number of lights is the same in all configurations: take the first one.
-        inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+        inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
         n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
         # All numbers of samples are per pixel. There is a basis image for each light,
         # and `N_VIEWS` images are compared with traced ones. For each of these, two
@@ -234,7 +234,7 @@ class BasisPictures:
             )
         height, width = renderer.formation.resolution
         # about 8 bytes for each pixel of a basis image
-        n_bytes = groups.n_alternating_groups * n_lights * 8 * height * width
+        n_bytes = groups.n_groups_to_cache * n_lights * 8 * height * width
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
                 f"basis pictures of {groups.n_groups} groups take too much memory; "
@@ -312,7 +312,7 @@ class LightOnSurfaces:
             seed: seed from which the rays of all arrangements follow.
         """
         self._renderer = renderer
-        self._seed = seeds.stream(seed, "surface light")
+        self._seed = seeds.derive_seed(seed, "surface light")
         self._arrangements: list[SurfaceRenderer] = []
         self._max_arrangements = 0
         # which inputs of the scene change with each parameter
@@ -355,7 +355,7 @@ class LightOnSurfaces:
         arrangement_groups = make_groups(
             self._find_parameters_changing_only(FREE_INPUTS - {COLOR_INPUT})
         )
-        self._max_arrangements = arrangement_groups.n_alternating_groups
+        self._max_arrangements = arrangement_groups.n_groups_to_cache
         # Each group has a light. This is below 1 if groups share arrangements.
         arrangements_per_light = arrangement_groups.n_groups / groups.n_groups
         min_images = find_break_even(self._renderer, spp, arrangements_per_light)
@@ -370,8 +370,8 @@ class LightOnSurfaces:
         environment = self._renderer.scene.get_base_value(ENVIRONMENT_INPUT)
         light_bytes = LIGHT_BYTES + 4 * environment.numel()  # 4 bytes for a float32
         n_bytes = (
-            arrangement_groups.n_alternating_groups * ARRANGEMENT_BYTES
-            + groups.n_alternating_groups * light_bytes
+            arrangement_groups.n_groups_to_cache * ARRANGEMENT_BYTES
+            + groups.n_groups_to_cache * light_bytes
         )
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
@@ -393,7 +393,7 @@ class LightOnSurfaces:
             seed: not used; all arrangements have the same rays.
         """
         with torch.no_grad():
-            inputs = self._renderer.scene.assembly(self._renderer.space.inputs(u))
+            inputs = self._renderer.scene.input_assembler(self._renderer.space.inputs(u))
             for arrangement in self._arrangements:
                 if arrangement.is_applicable(inputs):
                     return arrangement.with_fixed_light(inputs)
@@ -431,7 +431,7 @@ class SweepPredictor:
 
     Attributes:
         problem: problem of a model that gets these images.
-        points: the configurations of the scene.
+        configurations: the configurations of the scene.
         axes: axes of the grid.
         seed: seed of the predictors.
         specialise: whether images may be predicted.
@@ -446,7 +446,7 @@ class SweepPredictor:
     """
 
     problem: Problem
-    points: Points
+    configurations: SceneConfigurations
     axes: tuple[Axis, ...]
     seed: int
     specialise: bool
@@ -493,7 +493,7 @@ class SweepPredictor:
             return NOTHING_MOVES
         if self.renderer.composition_reason or not self.specialise:
             return Refusal(self.renderer.composition_reason or "nothing is left out")
-        return method.find_refusal(self._make_groups, self.problem.spp)
+        return method.find_refusal(self._make_groups, self.problem.search_spp)
 
     def _make_groups(self, parameters: frozenset[str]) -> Groups:
         """Divide the images into groups whose images may differ in some parameters.
@@ -510,11 +510,11 @@ class SweepPredictor:
             if group.name not in axis_names
         )
         return Groups(
-            self.points.grid,
-            samples=self.points.samples,
+            self.configurations.grid,
+            samples=self.configurations.samples_per_grid_point,
             within=tuple(name in parameters for name in axis_names),
             is_sampled=may_draws_differ,
-            frames=self.points.units.frames,
+            frames=self.configurations.independent_units.frames,
         )
 
     def make_images(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptImage]:
@@ -534,10 +534,10 @@ class SweepPredictor:
         for number, query in query_of_image.items():
             predictor = None  # the image is rendered
             if self.refusal is None:
-                group = self._groups.find_group(number)
+                group = self._groups.find_group_of_image(number)
                 predictor = self._load_predictor(group, number)
             if predictor is None:
-                image = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
+                image = self.renderer(query.u, seed=query.seed, spp=self.problem.search_spp)
                 # A predictor of its group may have been traced, and then rejected.
                 n_traced = self._count_traced(number) + 1
                 images[number] = SweptImage(image, prediction_spp=0, n_traced=n_traced)
@@ -560,10 +560,10 @@ class SweepPredictor:
         The predictor serves a group of images. What was traced for it counts for the
         first of them; for the others this is 0.
         """
-        first_of_group = self._groups.find_member(number, 0)
+        first_of_group = self._groups.find_image_of_group(number, 0)
         if number != first_of_group:
             return 0
-        return self._n_traced_of_group.get(self._groups.find_group(number), 0)
+        return self._n_traced_of_group.get(self._groups.find_group_of_image(number), 0)
 
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
@@ -580,13 +580,13 @@ class SweepPredictor:
         """
         if group in self._predictors:
             return self._predictors[group]
-        if len(self._predictors) >= self._groups.n_alternating_groups:
+        if len(self._predictors) >= self._groups.n_groups_to_cache:
             oldest = next(iter(self._predictors))
             self._predictors.pop(oldest)
         begin = time.perf_counter()
         # A scene has fewer groups than images, so that these indices differ between
         # all groups of all scenes.
-        seed = seeds.stream(self.seed, "light", self.images_before + group)
+        seed = seeds.derive_seed(self.seed, "light", self.images_before + group)
         # The configuration is that of the first image of the group, whichever image
         # comes first.
         predictor = self.method.make_predictor(
@@ -623,16 +623,16 @@ class SweepPredictor:
 
         def compare_view(check: int) -> ComparedView:
             """Compare a random image of the group with a traced one."""
-            index = seeds.stream(seed, "check", check) % self._groups.group_size
+            index = seeds.derive_seed(seed, "check", check) % self._groups.group_size
             u = self._make_configuration(number, index)
             (predicted,) = predictor.predict_images([u])
-            noise_seed = seeds.stream(seed, "traced", check)
+            noise_seed = seeds.derive_seed(seed, "traced", check)
             return compare_with_traced(
                 self.renderer,
                 predicted,
                 u,
                 noise_seed,
-                self.problem.spp,
+                self.problem.search_spp,
                 compute_margin,
             )
 
@@ -646,14 +646,14 @@ class SweepPredictor:
             number: number of any image of the group, in the scene.
             index: index of the image in the group.
         """
-        member = self._groups.find_member(number, index)
-        return self.points.make_configurations(member, 1, self.images_before)[0]
+        member = self._groups.find_image_of_group(number, index)
+        return self.configurations.make_configurations(member, 1, self.images_before)[0]
 
     @property
     def n_non_finite(self) -> int:
         """Number of values of predicted images that were not finite and set to 0."""
         return sum(
-            predictor.non_finite
+            predictor.n_non_finite
             for predictor in self._predictors.values()
             if predictor is not None
         )
@@ -755,7 +755,7 @@ def prepare_surface_light(
     can_follow = changed_inputs <= FREE_INPUTS
     if not moves_camera or not can_follow:
         return
-    state = verifier.state
+    state = verifier.run_state
     refusal = find_scene_refusal(problem.renderer)
     min_images = find_break_even(problem.renderer, state.spp)
     if refusal is None and n_images < min_images:
@@ -766,12 +766,12 @@ def prepare_surface_light(
     if refusal is not None:
         return
     title = "finding the light on surfaces"
-    verifier.stages.begin(
+    verifier.progress_stages.begin(
         "transport", title, N_LIGHTS, hint="`specialise=false` leaves it out"
     )
     light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
     # `prepare` compares predicted images with traced ones, and may refuse.
-    light.prepare(verifier.stages.progress.advance)
+    light.prepare(verifier.progress_stages.progress.advance)
     state.predictor_refusal = light.accuracy_refusal
     is_accurate = light.accuracy_refusal is None
     state.predictor = light if is_accurate else None

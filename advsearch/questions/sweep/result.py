@@ -58,7 +58,7 @@ OUTCOMES = tuple(Outcome)
 UNKNOWN_OUTCOME = 255  # in arrays of indices in `OUTCOMES`
 
 
-def count_by_unit(
+def count_predictions(
     right: npt.ArrayLike,
     units: npt.NDArray[np.int64],
     outcome: npt.NDArray[np.uint8] | None = None,
@@ -77,7 +77,7 @@ def count_by_unit(
     """
     right = np.asarray(right)
     if not len(right):
-        return count_independent(0, 0)
+        return count_independent_predictions(0, 0)
     right_in_unit = sum_per_unit(right, units)
     unit_size = sum_per_unit(np.ones(len(right)), units)
     interval = None
@@ -112,7 +112,7 @@ def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
     return count_by_name or None
 
 
-def count_independent(
+def count_independent_predictions(
     correct: int, n_predictions: int, interval: tuple[float, float] | None = None
 ) -> CountedPredictions:
     """Return counts and accuracy of independent predictions, with a 95 % interval.
@@ -140,9 +140,9 @@ class Predictions:
     """The predictions so far, by the number of the row.
 
     Attributes:
-        is_known: (n,) whether there is a prediction.
+        has_prediction: (n,) whether there is a prediction.
         is_right: (n,) whether it is right.
-        is_hidden: (n,) whether nothing of the object is in the image.
+        is_out_of_view: (n,) whether nothing of the object is in the image.
         margin: (n,) margin of the prediction; NaN if it is not a number. Then the
             prediction counts neither as right nor as a wrong label.
         outcome: (n,) outcome of a detection, as an index in `OUTCOMES`.
@@ -150,9 +150,9 @@ class Predictions:
 
     def __init__(self, n_rows: int) -> None:
         """Make empty arrays for `n_rows` rows."""
-        self.is_known: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.has_prediction: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.is_right: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
-        self.is_hidden: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
+        self.is_out_of_view: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         # Not the inverse of `is_right`: a prediction whose margin is NaN is neither.
         self._wrong: npt.NDArray[np.bool_] = np.zeros(n_rows, dtype=bool)
         self.margin = np.full(n_rows, np.nan)
@@ -170,12 +170,12 @@ class Predictions:
             judgement: what the task states about the prediction.
         """
         label = judgement.prediction.label
-        self.is_known[row] = True
+        self.has_prediction[row] = True
         self.is_right[row] = judgement.right
         # A judgement's `success` is that of an attack: the prediction is wrong.
         self._wrong[row] = judgement.success
         self.margin[row] = judgement.margin
-        self.is_hidden[row] = label == OUT_OF_VIEW
+        self.is_out_of_view[row] = label == OUT_OF_VIEW
         outcome = get_outcome(judgement.payload)
         if outcome is not None:  # only a detection has an outcome
             self.outcome[row] = OUTCOMES.index(outcome)
@@ -185,13 +185,13 @@ class Predictions:
     @property
     def is_counted(self) -> npt.NDArray[np.bool_]:
         """(n,) whether there is a prediction, and the object is in the image."""
-        return np.asarray(self.is_known & ~self.is_hidden)
+        return np.asarray(self.has_prediction & ~self.is_out_of_view)
 
     @property
     def n_phantoms_out_of_view(self) -> int:
         """Number of images without the object in which a detector still finds it."""
         is_phantom = self.outcome == OUTCOMES.index(Outcome.PHANTOM)
-        return int((self.is_hidden & is_phantom).sum())
+        return int((self.is_out_of_view & is_phantom).sum())
 
     @property
     def worst_row(self) -> int | None:
@@ -200,14 +200,14 @@ class Predictions:
         Rows without the object count only if there are no others.
         """
         margin = self.margin
-        if not self.is_hidden[self.is_known].all():
-            margin = np.where(self.is_hidden, np.nan, margin)
+        if not self.is_out_of_view[self.has_prediction].all():
+            margin = np.where(self.is_out_of_view, np.nan, margin)
         return None if np.isnan(margin).all() else int(np.nanargmin(margin))
 
     @property
     def n_non_finite(self) -> int:
         """Number of margins that are not numbers; these predictions are not right."""
-        return int((self.is_known & np.isnan(self.margin)).sum())
+        return int((self.has_prediction & np.isnan(self.margin)).sum())
 
     @property
     def frequent_wrong_labels(self) -> dict[str, int]:
@@ -277,8 +277,8 @@ def _compare_pairs(
     difference, interval, _ = compare_paired(clean, adversarial, draws)
     return PairedRates(
         model=model,
-        clean=count_by_unit(clean, draws, clean_outcome),
-        adversarial=count_by_unit(adversarial, draws, adversarial_outcome),
+        clean=count_predictions(clean, draws, clean_outcome),
+        adversarial=count_predictions(adversarial, draws, adversarial_outcome),
         both=int((clean & adversarial).sum()),
         clean_only=int((clean & ~adversarial).sum()),
         adversarial_only=int((~clean & adversarial).sum()),
@@ -325,7 +325,7 @@ class TableAxis:
         predictions = pd.DataFrame({"right": right, "unit": units, "outcome": outcome})
         axis_rows = list[AxisRow]()
         for index, group in predictions.groupby(self.value_index):
-            counts = count_by_unit(group.right, group.unit, group.outcome.to_numpy())
+            counts = count_predictions(group.right, group.unit, group.outcome.to_numpy())
             axis_rows.append(
                 AxisRow(
                     axis=self.name,
@@ -542,7 +542,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     return SweepSummary(
         run=str(run),
         **names,
-        **vars(count_independent(int(right.sum()), len(rows))),
+        **vars(count_independent_predictions(int(right.sum()), len(rows))),
         **unknown,
         **unknown_numbers,
         task="classification",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
-from advsearch.files import MESHES, either
+from advsearch.files import MESHES, join_alternatives
 from advsearch.options import MITSUBA_CONTROL
 from advsearch.questions.attack.settings import MIN_TRIALS, AttackConfig
 from advsearch.settings import (
@@ -82,7 +82,7 @@ class SweepConfig(SceneConfig):
         "object",
         description="the object that the model should "
         "recognise; several, separated by commas",
-        expects=f"names of objects or {either(MESHES)} files",
+        expects=f"names of objects or {join_alternatives(MESHES)} files",
     )
     environment: str | None = setting_as_in(
         SceneConfig,
@@ -265,7 +265,7 @@ class SweepConfig(SceneConfig):
         return value
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return "-".join(Path(name).stem for name in self.objects), self.command
 
     @property

@@ -16,7 +16,7 @@ from advsearch.runs.results import (
     Payload,
     RunResult,
     VerifiedRate,
-    as_fact,
+    make_fact_schema,
     key_validator,
     optional_field,
 )
@@ -383,7 +383,7 @@ class SweepSummary(CountedPredictions, RunResult):
     renders_per_second: float | None = Field(
         description="rendered pictures of the sweep per second; null if nothing was "
         "rendered now",
-        json_schema_extra=as_fact("{:.3g}"),
+        json_schema_extra=make_fact_schema("{:.3g}"),
     )
     warnings: list[str] = Field(description="remarks that limit what the result shows")
 
@@ -393,7 +393,7 @@ class SweepSummary(CountedPredictions, RunResult):
         return self.configurations + self.out_of_view
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """The result in a few words."""
         if self.arms and self.arms.pairs:
             rates = self.arms.pairs[0]

@@ -29,7 +29,7 @@ from advsearch.engine.record import read_judgement
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
 from advsearch.questions.sweep.job import Job, SceneLoader
-from advsearch.questions.sweep.result import count_independent
+from advsearch.questions.sweep.result import count_independent_predictions
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.report.figures import render_figure
 from advsearch.report.wording import shorten_name
@@ -96,7 +96,7 @@ class PartCounts:
         self._failures_left = np.full(N_PERMUTATIONS, n_failures)
         self._random = np.random.default_rng(seed)
 
-    def add(self, parts: Int64Array, failed: bool) -> None:
+    def add_image(self, parts: Int64Array, failed: bool) -> None:
         """Count an image, and decide in which permutations it is a failure.
 
         A permutation assigns the failures to the images anew, at random. Its counts
@@ -319,14 +319,14 @@ class SurfaceCounts:
 
     Attributes:
         parts: the parts of the surface.
-        part_counts: counts of the parts for each model.
+        part_counts_of_model: counts of the parts for each model.
     """
 
     def __init__(self, parts: SurfaceParts, part_counts: Sequence[PartCounts]) -> None:
         self.parts = parts
-        self.part_counts = tuple(part_counts)
+        self.part_counts_of_model = tuple(part_counts)
 
-    def add(self, surfaces: Surfaces, wrong_by_model: Mapping[int, bool]) -> None:
+    def add_image(self, surfaces: Surfaces, wrong_by_model: Mapping[int, bool]) -> None:
         """Count an image for each model.
 
         Parts are the cells of the map. On a mesh of few faces, the faces are parts,
@@ -337,14 +337,14 @@ class SurfaceCounts:
             wrong_by_model: whether the prediction is wrong, by the index of the model.
         """
         is_object = surfaces.visible_mask(OBJECT)
-        face = surfaces.face[is_object].numpy()
+        face = surfaces.face_index[is_object].numpy()
         uv = surfaces.uv[is_object].numpy().astype(np.float64)
         visible_parts = np.unique(self.parts.find_cells(face, uv))
         if self.parts.counts_faces:
             visible_faces = np.unique(face) + MAP_SIZE * MAP_SIZE
             visible_parts = np.concatenate([visible_parts, visible_faces])
         for model, failed in wrong_by_model.items():
-            self.part_counts[model].add(visible_parts, failed)
+            self.part_counts_of_model[model].add_image(visible_parts, failed)
 
     def summarize_kind(
         self,
@@ -424,12 +424,12 @@ class SurfaceCounts:
         n_hidden_right = n_hidden - n_hidden_wrong
         u, v = self.parts.center_uvs[part].tolist()
         return SurfacePart(
-            face=int(self.parts.face[part]),
+            face=int(self.parts.face_of_part[part]),
             u=u,
             v=v,
             center=self.parts.centers[part].tolist(),
-            visible=count_independent(n_visible_right, n_visible),
-            hidden=count_independent(n_hidden_right, n_hidden),
+            visible=count_independent_predictions(n_visible_right, n_visible),
+            hidden=count_independent_predictions(n_hidden_right, n_hidden),
             difference=float(compared.loc[part, "difference"]),
             interval=(
                 float(compared.loc[part, "low"]),
@@ -458,12 +458,12 @@ def map_surface(
     job = scenes.job
     wrong = _read_wrong(scenes, rows)  # (scenes, images, models)
     assets = {
-        named_scene.object: named_scene.scene.description.object
+        named_scene.object_name: named_scene.scene.description.object
         for named_scene in job.scenes
     }
     counts = _make_counts(scenes, assets, wrong)
     for scene, wrong_in_scene in enumerate(wrong):
-        scene_counts = counts[job.scenes[scene].object]
+        scene_counts = counts[job.scenes[scene].object_name]
         _count_scene(scenes, scene, wrong_in_scene, scene_counts, progress)
     return _write_map(counts, assets, [model.name for model in job.models], run)
 
@@ -501,12 +501,12 @@ def _make_counts(
     for object_index, (name, asset) in enumerate(assets.items()):
         parts = SurfaceParts(asset.mesh)
         has_object = np.array(
-            [named_scene.object == name for named_scene in job.scenes]
+            [named_scene.object_name == name for named_scene in job.scenes]
         )
         # Each pair of an object and a model has a seed of its own, and so permutations
         # of its own.
         model_seeds = [
-            seeds.stream(job.config.seed, "surface", object_index * n_models + model)
+            seeds.derive_seed(job.config.seed, "surface", object_index * n_models + model)
             for model in range(n_models)
         ]
         part_counts = [
@@ -523,7 +523,7 @@ def _find_draws(
     scenes: SceneLoader, wrong: npt.NDArray[np.int8], job: Job
 ) -> npt.NDArray[Any]:
     """Return the draw of each image, (scenes, images of a scene)."""
-    units = scenes.load(0).points_of_size[job.image_sizes[0]].units
+    units = scenes.load_scene(0).configurations_by_size[job.image_sizes[0]].independent_units
     image_numbers = np.arange(wrong[..., 0].size)
     return np.asarray(units.find_cluster(image_numbers)).reshape(wrong.shape[:2])
 
@@ -542,7 +542,7 @@ def _make_part_counts(
     permuted = permute_draws(wrong.ravel(), draws.ravel(), seed)
     n_known = int((wrong != UNKNOWN).sum())
     n_failures = int((wrong == 1).sum())
-    return PartCounts(parts.count, n_known, n_failures, seed, permuted)
+    return PartCounts(parts.n_parts, n_known, n_failures, seed, permuted)
 
 
 def _count_scene(
@@ -565,7 +565,7 @@ def _count_scene(
         progress: advances by the number of predictions.
     """
     job = scenes.job
-    swept_scene = scenes.load(scene)
+    swept_scene = scenes.load_scene(scene)
     n_images, n_models = wrong.shape
     for batch in split_into_batches(0, n_images, BATCH_SIZE):
         for size in dict.fromkeys(job.image_sizes):
@@ -573,15 +573,15 @@ def _count_scene(
                 model for model in range(n_models) if job.image_sizes[model] == size
             ]
             # The scenes before this one have the same number of images each.
-            configurations = swept_scene.points_of_size[size].make_configurations(
+            configurations = swept_scene.configurations_by_size[size].make_configurations(
                 batch.start, len(batch), before=scene * n_images
             )
             # at least `MIN_RAYS` rays along the shorter side of the image
             rays_per_pixel = ceil(MIN_RAYS / min(size))
             renderer = swept_scene.renderer_of_size[size]
             for number_in_scene, u in zip(batch, configurations, strict=True):
-                surfaces = renderer.surfaces(u, rays_per_pixel)
-                counts.add(surfaces, _select_known(wrong[number_in_scene], models))
+                surfaces = renderer.find_surfaces(u, rays_per_pixel)
+                counts.add_image(surfaces, _select_known(wrong[number_in_scene], models))
         progress.advance(len(batch) * n_models)
 
 
@@ -656,7 +656,7 @@ def _write_map(
     for number, (name, object_counts) in enumerate(counts.items()):
         comparisons = [
             _compare_kinds(model_counts, object_counts.parts)
-            for model_counts in object_counts.part_counts
+            for model_counts in object_counts.part_counts_of_model
         ]
         for array_name, array in _list_arrays(object_counts, comparisons).items():
             arrays[f"{array_name}_{number}"] = array
@@ -685,7 +685,7 @@ def _make_tables(
     """
     tables = list[SurfaceTable]()
     for model, model_counts, compared_by_kind in zip(
-        models, object_counts.part_counts, comparisons, strict=True
+        models, object_counts.part_counts_of_model, comparisons, strict=True
     ):
         tables += [
             object_counts.summarize_kind(
@@ -729,7 +729,7 @@ def _make_panels(
     """
     views = tuple(_render_views(asset, counts.parts))
     for model, model_counts, compared_by_kind in zip(
-        models, counts.part_counts, comparisons, strict=True
+        models, counts.part_counts_of_model, comparisons, strict=True
     ):
         cells = compared_by_kind["cell"]  # the figure shows no faces
         significant_difference = cells.difference.where(cells.significant)  # else NaN
@@ -762,7 +762,7 @@ def _list_arrays(
         Arrays (models,) or (models, parts), and "map", which has the corners of the
         parts.
     """
-    model_counts = counts.part_counts
+    model_counts = counts.part_counts_of_model
     arrays: dict[str, npt.NDArray[Any]] = {
         "pictures": np.stack([part_counts.n_images for part_counts in model_counts]),
         "failures": np.stack([part_counts.n_failures for part_counts in model_counts]),
@@ -776,7 +776,7 @@ def _list_arrays(
             for compared_by_kind in comparisons
         ]
         arrays[column] = np.stack(column_of_model).astype(np.float32)
-    arrays["map"] = counts.parts.corners.astype(np.float32)
+    arrays["map"] = counts.parts.face_uvs.astype(np.float32)
     return arrays
 
 
@@ -875,7 +875,7 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         to_world = camera_to_world(viewed, aspect=1.0).astype(np.float32)
         surfaces = scene.find_surfaces({"camera.to_world": torch.from_numpy(to_world)})
         is_object = surfaces.visible_mask(OBJECT).numpy()
-        face = surfaces.face.numpy()[is_object]
+        face = surfaces.face_index.numpy()[is_object]
         uv = surfaces.uv.numpy()[is_object].astype(np.float64)
         cells = np.full(is_object.shape, -1, np.int64)
         cells[is_object] = parts.find_cells(face, uv)

@@ -32,12 +32,12 @@ class DetectedFrame(NamedTuple):
     """The boxes in an image of a drive, x0, y0, x1, y1 in pixels.
 
     Attributes:
-        true: (4,) box of the object; None if it is not visible.
+        true_box: (4,) box of the object; None if it is not visible.
         boxes: (n, 4) boxes that a detector predicts.
         scores: (n,) scores of these boxes.
     """
 
-    true: Float64Array | None
+    true_box: Float64Array | None
     boxes: Float64Array
     scores: Float64Array
 
@@ -226,8 +226,8 @@ def track_drive(
     n_switches = 0
     for frame in frames:
         tracks = track_frame(frame.boxes, frame.scores)
-        is_visible = frame.true is not None
-        on_object = _find_tracks_on(tracks, frame.true, iou)
+        is_visible = frame.true_box is not None
+        on_object = _find_tracks_on(tracks, frame.true_box, iou)
         is_lost.append(is_visible and not on_object)
         if not on_object:
             continue
@@ -239,7 +239,7 @@ def track_drive(
         last_number = number
     # Lengths of the runs of lost frames. A frame without the object ends a run.
     gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
-    n_visible = sum(frame.true is not None for frame in frames)
+    n_visible = sum(frame.true_box is not None for frame in frames)
     return DriveTracking(
         lost=sum(is_lost) / max(1, n_visible),  # no division by 0
         switches=n_switches,

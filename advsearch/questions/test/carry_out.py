@@ -57,16 +57,16 @@ class PlannedClaim:
         name: name of the claim, or of the counterexample.
         kind: kind of the claim, or "counterexample".
         config: settings with which it is tested.
-        example: the counterexample; None for a claim of the suite.
-        refusal: why a counterexample cannot be tested on the model; empty if it can. If
+        counterexample: the counterexample; None for a claim of the suite.
+        unsuitable_reason: why a counterexample cannot be tested on the model; empty if it can. If
             it cannot, `config` has the settings with which it was found.
     """
 
     name: str
     kind: str
     config: SceneConfig
-    example: Counterexample | None = None
-    refusal: str = ""
+    counterexample: Counterexample | None = None
+    unsuitable_reason: str = ""
 
 
 def try_suite(
@@ -94,7 +94,7 @@ def try_suite(
         workbench.read_twins(config.twins)
     # A resumed run tests the suite with which it has started, even if the file has
     # changed since.
-    loaded_suite = _read_noted_suite(context.resumed) or suite or _read_suite(config)
+    loaded_suite = _read_noted_suite(context.resumed_directory) or suite or _read_suite(config)
     added = None
     if config.add is not None:
         added = counterexamples.add_counterexample(config.suite, config.add)
@@ -106,7 +106,7 @@ def try_suite(
             # user, its settings must not run code or have other effects outside of the
             # run.
             for claim in planned:
-                claim.config.check_powers(f"claims.{claim.name}.settings")
+                claim.config.check_no_effects(f"claims.{claim.name}.settings")
         remarks = _check_claims(planned, loaded_suite)
     except InputError as error:
         if added is not None:
@@ -169,7 +169,7 @@ def _note_settings(
     settings_of_examples = {
         claim.name: claim.config.get_deciding_settings()
         for claim in planned
-        if claim.example is not None
+        if claim.counterexample is not None
     }
     run.store.write_note(SETTINGS_NOTE, json.dumps(settings_of_examples))
     # Stores the digests of the files in these settings, or compares them with stored
@@ -177,7 +177,7 @@ def _note_settings(
     used_settings = list[dict[str, Any]]()
     for planned_claim in planned:
         used_settings.append(planned_claim.config.to_json())
-        if planned_claim.example is not None:
+        if planned_claim.counterexample is not None:
             continue
         claim = suite.claims[planned_claim.name]
         if isinstance(claim, NoWorseClaim):
@@ -250,13 +250,13 @@ class _SuiteRun:
             return untested
         pending = self._make_untested(claim, "")
         start = time.perf_counter()
-        if claim.example is None:
+        if claim.counterexample is None:
             tested = tester.test_claim(
                 pending, tester.suite.claims[claim.name], claim.config
             )
         else:
             assert isinstance(claim.config, AttackConfig)
-            tested = tester.test_counterexample(pending, claim.example, claim.config)
+            tested = tester.test_counterexample(pending, claim.counterexample, claim.config)
         if tested.cause is Cause.INTERRUPTED:
             raise KeyboardInterrupt  # Ctrl-C in a part of the run ends all of it
         tested = tested.model_copy(update={"seconds": time.perf_counter() - start})
@@ -275,7 +275,7 @@ class _SuiteRun:
             result.kind == "counterexample" and not result.accepted
             for result in self.results
         )
-        is_counterexample = claim.example is not None
+        is_counterexample = claim.counterexample is not None
         tests_all = self.tester.config.all
         if counterexample_failed and not is_counterexample and not tests_all:
             return self._make_untested(claim, NOT_TESTED, Cause.COUNTEREXAMPLE_FAILED)
@@ -283,8 +283,8 @@ class _SuiteRun:
             return self._make_untested(
                 claim, f"{OUT_OF_TIME_REASON} before it began", Cause.OUT_OF_TIME
             )
-        if claim.refusal:
-            return self._make_untested(claim, claim.refusal)
+        if claim.unsuitable_reason:
+            return self._make_untested(claim, claim.unsuitable_reason)
         return None
 
     def _make_untested(
@@ -299,7 +299,7 @@ class _SuiteRun:
         """
         # The statement of a counterexample is added when it is tested.
         text = ""
-        if claim.example is None:
+        if claim.counterexample is None:
             text = describe_claim(self.tester.suite.claims[claim.name], claim.config)
         return ClaimResult(
             name=claim.name,
@@ -337,7 +337,7 @@ class _SuiteRun:
         if config.fresh:
             arguments += ["fresh=false", f"seed={self.tester.suite.seed}"]
         # Settings that affect more than the run, except for those of the run itself.
-        for power in config.powers:
+        for power in config.settings_with_effects:
             if power.name not in ("run", "overwrite"):
                 arguments.append(f"{power.name}={json.dumps(power.default)}")
         return f"{command} {shlex.join(arguments)}".rstrip()
@@ -502,7 +502,7 @@ def _select_claims(
             claim
             for claim in planned
             if claim.name in config.selected_claims
-            or (all_examples and claim.example is not None)
+            or (all_examples and claim.counterexample is not None)
         ]
     # Every other name selects something, and a suite has at least one claim.
     if not selected:
@@ -538,8 +538,8 @@ def _plan_example(
         name=example.name,
         kind="counterexample",
         config=config,
-        example=example,
-        refusal=refusal,
+        counterexample=example,
+        unsuitable_reason=refusal,
     )
 
 
@@ -555,7 +555,7 @@ def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     claims = [
         (planned_claim, suite.claims[planned_claim.name])
         for planned_claim in planned
-        if planned_claim.example is None
+        if planned_claim.counterexample is None
     ]
     remarks = [
         check_pictures(planned_claim.name, claim, suite.confidence)

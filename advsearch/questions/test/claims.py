@@ -37,7 +37,7 @@ from advsearch.questions.test.counterexamples import (
     compute_scene_digest,
     count_trials,
     decide_trials,
-    evaluate_trial,
+    is_right_in_trial,
     varies_conditions,
 )
 from advsearch.questions.test.result import (
@@ -81,12 +81,12 @@ class _OtherSide(NamedTuple):
 
     Attributes:
         journal: evaluates the other side, and stores its evaluations.
-        change: changes the image of the model under test to that of the other side;
+        change_image: changes the image of the model under test to that of the other side;
             None if the other side renders its own image.
     """
 
     journal: workbench.Journal
-    change: ChangePicture | None
+    change_image: ChangePicture | None
 
 
 class _PictureScore(NamedTuple):
@@ -95,13 +95,13 @@ class _PictureScore(NamedTuple):
     Attributes:
         score: from 0 (against the claim) to 1 (for it); None if the image does not
             count, because the object is out of view.
-        badness: rank as an example against the claim: the image with the largest value
+        violation_score: rank as an example against the claim: the image with the largest value
             is reported.
         text: description of the predictions.
     """
 
     score: float | None
-    badness: float = 0.0
+    violation_score: float = 0.0
     text: str = ""
 
 
@@ -109,12 +109,12 @@ class _Example(NamedTuple):
     """The image that is reported as an example against a claim.
 
     Attributes:
-        badness: its rank, see `_PictureScore`.
+        violation_score: its rank, see `_PictureScore`.
         query: its query.
         text: description of the predictions.
     """
 
-    badness: float
+    violation_score: float
     query: workbench.Query
     text: str
 
@@ -231,22 +231,22 @@ class ClaimTester:
         return self.elapsed_seconds >= self.time_limit
 
     def test_claim(
-        self, pending: ClaimResult, claim: AnyClaim, config: SceneConfig
+        self, untested_result: ClaimResult, claim: AnyClaim, config: SceneConfig
     ) -> ClaimResult:
         """Test a claim, and return its result.
 
         Args:
-            pending: the result without a verdict.
+            untested_result: the result without a verdict.
             claim: what is claimed.
             config: settings of its pictures, or of its search.
         """
         if isinstance(claim, ShareClaim | NoWorseClaim):
-            return self._test_by_pictures(pending, claim, config)
+            return self._test_by_pictures(untested_result, claim, config)
         assert isinstance(config, AttackConfig)
-        return self._test_by_search(pending, config)
+        return self._test_by_search(untested_result, config)
 
     def _test_by_search(
-        self, pending: ClaimResult, config: AttackConfig
+        self, untested_result: ClaimResult, config: AttackConfig
     ) -> ClaimResult:
         """Test the claim that no search breaks a model, by an attack.
 
@@ -254,11 +254,11 @@ class ClaimTester:
         adversarial scene.
 
         Args:
-            pending: the result without a verdict, which is filled in.
+            untested_result: the result without a verdict, which is filled in.
             config: settings of the attack.
         """
         search = self._make_search(config)
-        summary = self.context.run_part(pending.name, search)
+        summary = self.context.run_part(untested_result.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
         # with the number of steps that the search chose, if none was set
@@ -266,18 +266,18 @@ class ClaimTester:
         evaluated = words.evaluate_search(summary, planned)
         picture = None
         if evaluated.verdict == FAILED:
-            picture = self._find_search_picture(pending.name, summary)
+            picture = self._find_search_picture(untested_result.name, summary)
         # "products" counts images computed by matrices of light transport, without a
         # render.
         n_pictures = sum(
             count for name, count in summary.renders.items() if name != "products"
         )
-        return pending.model_copy(
+        return untested_result.model_copy(
             update={
                 "verdict": evaluated.verdict,
                 "reason": evaluated.reason,
                 "cause": evaluated.cause,
-                "part": pending.name,
+                "part": untested_result.name,
                 "pictures": n_pictures,
                 "picture": picture,
             }
@@ -317,7 +317,7 @@ class ClaimTester:
 
     def _test_by_pictures(
         self,
-        pending: ClaimResult,
+        untested_result: ClaimResult,
         claim: ShareClaim | NoWorseClaim,
         config: SceneConfig,
     ) -> ClaimResult:
@@ -329,7 +329,7 @@ class ClaimTester:
         decided.
 
         Args:
-            pending: the result without a verdict, which is filled in.
+            untested_result: the result without a verdict, which is filled in.
             claim: the claim.
             config: settings of the pictures.
         """
@@ -339,7 +339,7 @@ class ClaimTester:
         sequence = statistics.sequential.ConfidenceSequence(
             self.suite.confidence, sides=1
         )
-        with self._open_evaluations(pending.name, claim, config, problem) as evaluated:
+        with self._open_evaluations(untested_result.name, claim, config, problem) as evaluated:
             sample = self._sample_pictures(evaluated, claim, sequence)
 
         example = ""
@@ -347,7 +347,7 @@ class ClaimTester:
         if sample.worst is not None:
             query = sample.worst.query
             example = f"{sample.worst.text}: {self._describe(problem, query)}"
-            picture = self._save_picture(pending.name, problem, query)
+            picture = self._save_picture(untested_result.name, problem, query)
         is_late = sample.verdict == UNDECIDED and self.out_of_time
         reason = _describe_sample(
             claim, sample, sequence.interval, example, problem.task.name
@@ -357,7 +357,7 @@ class ClaimTester:
         rate = None
         if sample.scores:
             (rate,) = _to_claim_scale(claim, sequence.mean)
-        return pending.model_copy(
+        return untested_result.model_copy(
             update={
                 "verdict": sample.verdict,
                 "reason": reason,
@@ -400,11 +400,11 @@ class ClaimTester:
                 sample.wrong_payloads.append(judgement.payload)
             sequence.add(score)
             sample.scores.append(score)
-            is_worst = sample.worst is None or badness > sample.worst.badness
+            is_worst = sample.worst is None or badness > sample.worst.violation_score
             is_against_claim = score == 0.0
             if is_against_claim and is_worst:
                 sample.worst = _Example(badness, query, text)
-            sample.verdict = _decide(sequence, threshold_mean(claim))
+            sample.verdict = _decide(sequence, compute_score_threshold(claim))
             if sample.verdict != UNDECIDED:
                 break
         return sample
@@ -517,7 +517,7 @@ class ClaimTester:
             )
         # another scene, in which the object is always hidden
         without_object = self._load_problem(config)
-        without_object.renderer.scene.assembly.is_object_hidden = True
+        without_object.renderer.scene.input_assembler.is_object_hidden = True
         return lambda query, picture: without_object.picture(
             query.u, query.seed, query.spp
         )
@@ -541,7 +541,7 @@ class ClaimTester:
         # Without workers a batch has one query, so that nothing more is rendered once
         # the claim is decided.
         batch_size = 1
-        if journal.evaluator.executor is not None:
+        if journal.evaluator.workers is not None:
             batch_size = BATCHES_AHEAD * (self.config.workers or CLUSTER_WORKERS)
         while batch := list(islice(queries, batch_size)):
             evaluations: Iterable[policies.Evaluation]
@@ -561,7 +561,7 @@ class ClaimTester:
                 return
 
     def test_counterexample(
-        self, pending: ClaimResult, example: Counterexample, config: AttackConfig
+        self, untested_result: ClaimResult, example: Counterexample, config: AttackConfig
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
 
@@ -569,7 +569,7 @@ class ClaimTester:
         undecided, with the reason.
 
         Args:
-            pending: the result without a verdict, which is filled in.
+            untested_result: the result without a verdict, which is filled in.
             example: the counterexample.
             config: settings with which it is tested.
         """
@@ -577,33 +577,33 @@ class ClaimTester:
             f"{config.model} is right on a scene that was predicted as "
             f"{example.wrong_label}"
         )
-        pending = pending.model_copy(update={"statement": statement})
+        untested_result = untested_result.model_copy(update={"statement": statement})
         try:
             parts = workbench.load_parts(config)
             # Trials need no derivatives.
             problem = workbench.make_problem(parts, differentiated=False)
         except InputError as error:
             reason = words.describe_unsuitable(str(error))
-            return pending.model_copy(update={"reason": reason})
+            return untested_result.model_copy(update={"reason": reason})
         file = example.find_changed_file(config)
         if file:
             reason = (
                 f"the file {file} has changed; restore it, or remove the counterexample"
             )
-            return pending.model_copy(update={"reason": reason})
+            return untested_result.model_copy(update={"reason": reason})
         if compute_scene_digest(parts.scene.description) != example.scene_digest:
             reason = (
                 "its scene has changed; remove it, or add the adversarial scene of a "
                 "new run"
             )
-            return pending.model_copy(update={"reason": reason})
+            return untested_result.model_copy(update={"reason": reason})
         return self._test_by_trials(
-            pending, example, problem, has_conditions=varies_conditions(config)
+            untested_result, example, problem, has_conditions=varies_conditions(config)
         )
 
     def _test_by_trials(
         self,
-        pending: ClaimResult,
+        untested_result: ClaimResult,
         example: Counterexample,
         problem: Problem,
         *,
@@ -612,7 +612,7 @@ class ClaimTester:
         """Test a counterexample by trials with fresh seeds.
 
         Args:
-            pending: the result without a verdict.
+            untested_result: the result without a verdict.
             example: the counterexample.
             problem: problem of the model under test.
             has_conditions: whether conditions vary. Then the clean scene is rendered
@@ -636,7 +636,7 @@ class ClaimTester:
                 "cause": Cause.OUT_OF_TIME,
             }
         update |= {"picture": sample.picture, "spp": example.spp}
-        return pending.model_copy(update=update)
+        return untested_result.model_copy(update=update)
 
     def _sample_trials(
         self, example: Counterexample, problem: Problem, *, has_conditions: bool
@@ -667,7 +667,7 @@ class ClaimTester:
         for query, trial, clean in self._run_trials(
             journal, kind, u, example.spp, has_conditions=has_conditions
         ):
-            outcome = evaluate_trial(trial, clean)
+            outcome = is_right_in_trial(trial, clean)
             sample.outcomes.append(outcome)
             # `outcome` is None for a trial that does not count.
             if outcome is False:
@@ -708,7 +708,7 @@ class ClaimTester:
         clean_u = journal.problem.domain.start
         queries = list[workbench.Query]()
         for index in range(2 * count_trials(has_conditions=has_conditions)):
-            seed = seeds.stream(self.suite.seed, kind, index)
+            seed = seeds.derive_seed(self.suite.seed, kind, index)
             query = workbench.Query(u, seed, kind, index, spp=spp)
             queries.append(query)
             if has_conditions:
@@ -771,11 +771,11 @@ def _evaluate_with_pictures(
     """
     with_image = pictures is not None
     evaluations = journal.evaluator(
-        [replace(query, with_image=with_image) for query in queries]
+        [replace(query, includes_image=with_image) for query in queries]
     )
     for query, evaluation in zip(queries, evaluations, strict=True):
         if pictures is not None:
-            pictures[query.index] = evaluation.picture
+            pictures[query.row_index] = evaluation.picture
         yield evaluation
 
 
@@ -793,7 +793,7 @@ def _evaluate_batch(
     """
     # Images are stored only if the other side changes them.
     pictures: dict[int, Tensor | None] | None = {}
-    if other_side.change is None:
+    if other_side.change_image is None:
         pictures = None
     # A list, so that all images are stored before they are changed.
     evaluations = list(
@@ -826,20 +826,20 @@ def _evaluate_other_side(
             no change.
         queries: the queries.
     """
-    if other_side.change is None or pictures is None:
+    if other_side.change_image is None or pictures is None:
         # The other side renders its own images.
         yield from other_side.journal.evaluator(queries)
         return
     other_problem = other_side.journal.evaluator.problem
     for query in queries:
         # There is no image if the evaluation was read from the store of a resumed run.
-        picture = pictures.get(query.index)
+        picture = pictures.get(query.row_index)
         if picture is None:
             picture = problem.picture(query.u, query.seed, query.spp)
-        changed_picture = other_side.change(query, picture)
+        changed_picture = other_side.change_image(query, picture)
         # Claims that are tested by images have no varying conditions, so that no seed
         # is needed.
-        full_configuration = other_problem.add_conditions(query.u)
+        full_configuration = other_problem.make_full_configuration(query.u)
         judgement = other_problem.judge(changed_picture, full_configuration)
         yield policies.Evaluation.from_judgement(judgement)
 
@@ -880,10 +880,10 @@ def sample_queries(
     """
     for index in range(count):
         generator = torch.Generator().manual_seed(
-            seeds.stream(problem.seed, f"{kind} draw", index)
+            seeds.derive_seed(problem.seed, f"{kind} draw", index)
         )
         (u,) = problem.domain.sample(generator)
-        seed = seeds.stream(problem.seed, kind, index)
+        seed = seeds.derive_seed(problem.seed, kind, index)
         # Values of parameters are stored with the row, except for large textures.
         values = {}
         if problem.domain.dim <= MAX_STORED_VALUES:
@@ -894,7 +894,7 @@ def sample_queries(
         )
 
 
-def threshold_mean(claim: ShareClaim | NoWorseClaim) -> float:
+def compute_score_threshold(claim: ShareClaim | NoWorseClaim) -> float:
     """Return the threshold that the mean of the scores has to exceed, from 0 to 1.
 
     For a claim about two models, a mean of 1/2 means that both are equally good. It is
@@ -921,7 +921,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     count_needed = partial(
         statistics.sequential.count_needed_samples, confidence=confidence
     )
-    threshold = threshold_mean(claim)
+    threshold = compute_score_threshold(claim)
     # number of images to exceed the threshold, and number to fall below it
     needed = max(count_needed(threshold), count_needed(1.0 - threshold))
     if claim.pictures < needed:

@@ -296,7 +296,7 @@ class Counterexample:
         path: path of the file.
         config: settings of the run that found it.
         wrong_label: the wrong prediction.
-        files: SHA-256 of the files in its settings, by name.
+        digest_by_file: SHA-256 of the files in its settings, by name.
         scene_digest: digest of the scene.
         spp: samples per pixel of its verification.
         clean_offsets: (d,) float32 offset of each value from that of the clean scene.
@@ -306,7 +306,7 @@ class Counterexample:
     path: Path
     config: AttackConfig
     wrong_label: str
-    files: Mapping[str, str]
+    digest_by_file: Mapping[str, str]
     scene_digest: str
     spp: int
     clean_offsets: Floats
@@ -355,7 +355,7 @@ class Counterexample:
     def find_changed_file(self, config: AttackConfig) -> str | None:
         """Return the name of a file in its settings that has changed, or None."""
         return directory.summary.find_changed_file(
-            self.files, select_deciding_settings(config)
+            self.digest_by_file, select_deciding_settings(config)
         )
 
     def make_configuration(self, start: Tensor) -> Tensor:
@@ -421,7 +421,7 @@ def make_paths_relative(values: Mapping[str, Any]) -> dict[str, Any]:
     return relative
 
 
-def evaluate_trial(
+def is_right_in_trial(
     trial: tasks.Judgement, clean: tasks.Judgement | None = None
 ) -> bool | None:
     """Return whether the model is right in a trial, None if the trial does not count.
@@ -489,13 +489,13 @@ def _is_wrong_on(
     configurations = [u, start] if has_conditions else [u]
     outcomes = list[bool | None]()
     for index in range(trials):
-        seed = seeds.stream(problem.seed, "kept", index)
+        seed = seeds.derive_seed(problem.seed, "kept", index)
         judgements = []
         for configuration in configurations:
             picture = problem.picture(configuration, seed, example.spp)
-            full_configuration = problem.add_conditions(configuration, seed)
+            full_configuration = problem.make_full_configuration(configuration, seed)
             judgements.append(problem.judge(picture, full_configuration))
-        is_right = evaluate_trial(*judgements)
+        is_right = is_right_in_trial(*judgements)
         outcomes.append(is_right)
         # After one right trial, the verdict of a single scene cannot be FAILED.
         if is_right and not has_conditions:
@@ -716,7 +716,7 @@ def _read(path: Path) -> Counterexample:
         path=path,
         config=config,
         wrong_label=content.said,
-        files=content.files,
+        digest_by_file=content.files,
         scene_digest=content.scene,
         spp=content.spp,
         clean_offsets=offsets,

@@ -131,7 +131,7 @@ class SuiteResult(views.InNotebook, RunResult):
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         """The number of claims by verdict: ``3 held, 1 failed``."""
         answers = [claim.verdict for claim in self.claims]
         texts = []
@@ -178,7 +178,7 @@ def make_view(result: SuiteResult) -> ShownResult:
     sections = [
         ResultPart(
             "The claims",
-            heads=TABLE_HEADS,
+            column_heads=TABLE_HEADS,
             rows=make_table_rows(result),
             note=READING_NOTE,
             parts=[claim.part for claim in result.claims],
@@ -498,7 +498,7 @@ def describe_suite(result: SuiteResult) -> str:
         results.INTERRUPTED: "Stopped, so far",
     }
     beginning = beginnings.get(result.ending, result.verdict.capitalize())
-    return f"{beginning}: {result.brief or 'no claims'}{expected}."
+    return f"{beginning}: {result.outcome_summary or 'no claims'}{expected}."
 
 
 def list_facts(result: SuiteResult) -> dict[str, str]:

@@ -113,7 +113,7 @@ class SuiteConfig(Config):
         return () if self.only is None else settings.split_names(self.only)
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         """The names that a run's directory is named after."""
         return Path(self.suite).stem, self.command
 

@@ -56,12 +56,12 @@ class Selection:
 
     Attributes:
         objects: objects of all rows; the index of an object is the number of its row.
-        windows: windows of the selected rows, by their numbers.
+        window_by_row_number: windows of the selected rows, by their numbers.
         warnings: warnings about what was left out.
     """
 
     objects: Sequence[PhotographedObject]
-    windows: Mapping[int, rendering.PhotoWindow]
+    window_by_row_number: Mapping[int, rendering.PhotoWindow]
     warnings: list[str]
 
 
@@ -93,12 +93,12 @@ def run_twins(context: RunContext[TwinsConfig], *, network: Any = None) -> Twins
 
     def make_result(rows: list[TwinRow]) -> TwinsResult:
         # Tasks may have new remarks after they were calibrated in the comparison.
-        remarks = [remark for judge in judges for remark in judge.task.remarks]
+        remarks = [remark for judge in judges for remark in judge.task.output_remarks]
         return comparison.make_result(rows, [*warnings, *remarks])
 
     # `compare` looks up stored rows, and `collect` gathers stored and new ones.
     rows = comparison.compare(selection, measurements)
-    return measurements.collect(rows, make_result)
+    return measurements.make_result_of_rows(rows, make_result)
 
 
 class ModelJudge:
@@ -168,8 +168,8 @@ class ModelJudge:
             output = self.model(color.round_to_8_bit(photograph))
             self.task = self.task.after_calibration(output, truth)
         # A task without calibration may be ambiguous, too.
-        if self.task.ambiguities:
-            raise InputError(f"task {self.task.name}: {self.task.ambiguities}")
+        if self.task.ambiguity_message:
+            raise InputError(f"task {self.task.name}: {self.task.ambiguity_message}")
 
 
 def load_judges(
@@ -364,10 +364,10 @@ class Comparison:
             selection: objects that are compared, and their windows.
             measurements: stored rows of the run, by name; finished rows are added.
         """
-        self._context.progress.stage("twins", len(selection.windows))
+        self._context.progress.stage("twins", len(selection.window_by_row_number))
         # Objects with the same mesh and the same shape of pixels share a renderer.
         groups: dict[tuple[Path, float], list[int]] = {}
-        for number in selection.windows:
+        for number in selection.window_by_row_number:
             item = selection.objects[number]
             key = (item.mesh, round(item.camera.pixel_aspect, 3))
             groups.setdefault(key, []).append(number)
@@ -445,7 +445,7 @@ class Comparison:
         layers = {}
         for number in numbers:
             item = selection.objects[number]
-            window = selection.windows[number]
+            window = selection.window_by_row_number[number]
             photograph = self._load_photograph(item.photograph)
             layers[number] = renderer.render(
                 item, photograph, window, self._size, number
@@ -471,7 +471,7 @@ class Comparison:
         """
         item = selection.objects[numbers[0]]
         film = rendering.choose_film(
-            [selection.windows[number] for number in numbers], item.camera.pixel_aspect
+            [selection.window_by_row_number[number] for number in numbers], item.camera.pixel_aspect
         )
         return renderer_type(
             self._load_asset(item),
@@ -498,7 +498,7 @@ class Comparison:
             renderer: renderer of the object in the environment.
         """
         item = selection.objects[number]
-        window = selection.windows[number]
+        window = selection.window_by_row_number[number]
         environment = self._config.environment_name
         render = renderer.render(item, window, number)
         render_of_environment = {environment: render}
@@ -531,7 +531,7 @@ class Comparison:
             judge: judge of the model.
         """
         item = selection.objects[number]
-        window = selection.windows[number]
+        window = selection.window_by_row_number[number]
         twin = make_twin()
         facts = self._make_facts(item, twin)
         return TwinRow(
@@ -543,10 +543,10 @@ class Comparison:
             label=self._find_label(item),
             condition=item.condition,
             window=window,
-            size=twin.size,
+            size=twin.silhouette_size_pixels,
             brightness=twin.brightness,
             contrast=twin.contrast,
-            texture=twin.texture,
+            texture=twin.texture_correlation,
             visible=item.visible,
             overlap=rendering.measure_pose(item, twin, window),
             predictions=list(judge.predict(item.frame, twin, facts)),
@@ -563,7 +563,7 @@ class Comparison:
         return tasks.Facts(
             item.object,
             self._find_label(item),
-            compute_sight=None if twin is None else lambda: twin.sight,
+            compute_sight=None if twin is None else lambda: twin.visible_surface,
         )
 
     def _find_label(self, item: PhotographedObject) -> str:

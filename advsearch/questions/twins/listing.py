@@ -485,8 +485,8 @@ def _read_row_camera(
     file = _get_file(row, "camera", path, where)
     model = workbench.read_camera(str(file))
     # These are fractions of the width and the height.
-    lens = {key: model.values[key] for key in ("fx", "fy", "cx", "cy")}
-    distortion = [value for key, value in model.values.items() if key not in lens]
+    lens = {key: model.intrinsic_by_name[key] for key in ("fx", "fy", "cx", "cy")}
+    distortion = [value for key, value in model.intrinsic_by_name.items() if key not in lens]
     if any(distortion) or model.kind != PINHOLE_KIND:
         raise InputError(
             f"{where}: camera: expected a pinhole, got a lens with distortion; "

@@ -55,24 +55,24 @@ class Twin:
 
     Attributes:
         images: (H, W, 3) sRGB images in [0, 1], by the name of the surroundings.
-        sight: what is visible of the object, for tasks.
+        visible_surface: what is visible of the object, for tasks.
         coverage: (h, w) how much of each pixel of the window the twin covers, hidden
             parts included.
-        size: square root of the silhouette's area, in pixels of the photograph.
+        silhouette_size_pixels: square root of the silhouette's area, in pixels of the photograph.
         brightness: mean of the twin minus that of the photograph where the twin covers
             it, in sRGB.
         contrast: standard deviation of the photograph around the object, in sRGB.
-        texture: correlation of the luminance of twin and photograph where the twin
+        texture_correlation: correlation of the luminance of twin and photograph where the twin
             covers it, in sRGB; None if one of them is uniform.
     """
 
     images: Mapping[str, Tensor]
-    sight: Any
+    visible_surface: Any
     coverage: Tensor
-    size: float
+    silhouette_size_pixels: float
     brightness: float
     contrast: float
-    texture: float | None
+    texture_correlation: float | None
 
 
 def project_object(item: PhotographedObject, asset: assets.ObjectAsset) -> Float64Array:
@@ -163,12 +163,12 @@ class Layer:
         composed: (h, w, 3) sRGB in [0, 1], in the photograph's pixels.
         alpha: (h, w) in [0, 1], how much of each pixel the object covers, hidden parts
             included.
-        sight: what is visible of the object, for tasks, at the model's size.
+        visible_surface: what is visible of the object, for tasks, at the model's size.
     """
 
     composed: Tensor
     alpha: Tensor
-    sight: Any
+    visible_surface: Any
 
 
 class LayerRenderer:
@@ -241,10 +241,10 @@ class LayerRenderer:
             number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
-        scene_inputs = renderer.scene.assembly(
+        scene_inputs = renderer.scene.input_assembler(
             make_camera_inputs(item, self._asset, window)
         )
-        seed = seeds.stream(self._seed, "layer", number)
+        seed = seeds.derive_seed(self._seed, "layer", number)
         with torch.no_grad():
             # with an alpha channel, since the environment is hidden
             rendered = renderer.render_radiance(
@@ -258,7 +258,7 @@ class LayerRenderer:
         return Layer(
             composed=composed,
             alpha=rendered[..., 3].clamp(0.0, 1.0),
-            sight=_make_sight(surfaces, self._asset.size_in_metres, model_size),
+            visible_surface=_make_sight(surfaces, self._asset.size_in_metres, model_size),
         )
 
     def _make_image_inputs(
@@ -325,15 +325,15 @@ class SurroundedRenderer:
             number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
-        scene_inputs = renderer.scene.assembly(
+        scene_inputs = renderer.scene.input_assembler(
             make_camera_inputs(item, self._asset, window)
         )
-        seed = seeds.stream(self._seed, "surrounded", number)
+        seed = seeds.derive_seed(self._seed, "surrounded", number)
         with torch.no_grad():
             radiance = renderer.render_radiance(
                 scene_inputs, seed, self._spp, hide_environment=False
             )
-            image: Tensor = renderer.formation.display(radiance)
+            image: Tensor = renderer.formation.map_to_display(radiance)
         return image
 
 
@@ -380,14 +380,14 @@ def make_twin(
     difference = (layer.composed - crop)[is_covered]
     return Twin(
         images={name: resize(image, model_size) for name, image in images.items()},
-        sight=layer.sight,
+        visible_surface=layer.visible_surface,
         # The full silhouette, with hidden parts, is compared with the data's mask.
         coverage=layer.alpha,
         # the side in pixels of a square with the object's area
-        size=math.sqrt(float(layer.alpha.sum())),
+        silhouette_size_pixels=math.sqrt(float(layer.alpha.sum())),
         brightness=float(difference.mean()) if len(difference) else 0.0,
         contrast=float(around.std()) if len(around) > 1 else 0.0,
-        texture=correlate_luminance(layer.composed[is_covered], crop[is_covered]),
+        texture_correlation=correlate_luminance(layer.composed[is_covered], crop[is_covered]),
     )
 
 

@@ -165,7 +165,7 @@ class TwinsConfig(Config):
         return self.threads
 
     @property
-    def title_words(self) -> tuple[str, ...]:
+    def run_name_words(self) -> tuple[str, ...]:
         return Path(self.photographs).stem, self.command
 
 
@@ -273,7 +273,7 @@ class TwinsResult(views.InNotebook, results.RunResult):
     warnings: list[str] = Field(description="remarks that limit what the result shows")
 
     @property
-    def brief(self) -> str:
+    def outcome_summary(self) -> str:
         row = find_row(self.table, COMPOSED)
         return "" if row is None else f"agree {wording.percent(row.agreement.value)}"
 
@@ -366,7 +366,7 @@ def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
         rows.append(
             _make_agreement_cells(total, f"{prefix}{_name_surroundings(total)}")
         )
-    return ResultPart("How far twins hold", heads=HEADS, rows=rows, note=TABLE_NOTE)
+    return ResultPart("How far twins hold", column_heads=HEADS, rows=rows, note=TABLE_NOTE)
 
 
 def _list_totals(
@@ -397,7 +397,7 @@ def _make_group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[Result
                     rows.append(_make_agreement_cells(row, group))
             title = f"By {kind}: {name}"
             heads = (kind, *HEADS[1:])
-            yield ResultPart(title, heads=heads, rows=rows, folded=True, only="page")
+            yield ResultPart(title, column_heads=heads, rows=rows, folded=True, only_medium="page")
 
 
 def _make_factor_part(result: TwinsResult) -> ResultPart:
@@ -415,7 +415,7 @@ def _make_factor_part(result: TwinsResult) -> ResultPart:
         )
     return ResultPart(
         "What goes with disagreement",
-        heads=("", "from", "disagree", "rate"),
+        column_heads=("", "from", "disagree", "rate"),
         rows=rows,
         note="Of twins in the photograph. Each factor is cut into parts with as many "
         "pairs; a part that stands out is a hint, and no cause.",
@@ -508,8 +508,8 @@ def _make_pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
         if captions:
             captions[0] = f"{name}, {row.size:.0f} pixels. {captions[0]}"
         groups.append(list(map(views.Picture, pair.pictures, captions)))
-    yield ResultPart(title, lines[:MAX_TEXT_PAIRS], only="text")
-    yield ResultPart(title, pictures=groups, only="page")
+    yield ResultPart(title, lines[:MAX_TEXT_PAIRS], only_medium="text")
+    yield ResultPart(title, pictures=groups, only_medium="page")
 
 
 def _describe_prediction(image: TwinPrediction) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.files import either
+from advsearch.files import join_alternatives
 from advsearch.trust import stored_files
 from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
@@ -239,10 +239,10 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     # The advice is about programs that export meshes.
     advice = None if what == "environment" else find_advice(Path(file))
     if advice is not None:
-        raise FileFormatError(f"{path}: {advice} (supported are {either(suffixes)})")
+        raise FileFormatError(f"{path}: {advice} (supported are {join_alternatives(suffixes)})")
     got = f"got {path.suffix!r}" if path.suffix else "got a name without a suffix"
     raise FileFormatError(
-        f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; "
+        f"{path}: expected an {what} file ending in {join_alternatives(suffixes)}, {got}; "
         "convert it to one of these"
     )
 
@@ -277,7 +277,7 @@ def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:
     )
 
 
-def find_kind(data: bytes) -> str | None:
+def detect_file_kind(data: bytes) -> str | None:
     """Return the kind of file that begins with these bytes, None if it is unknown.
 
     It follows "got" in a message: "a PNG picture".
@@ -290,7 +290,7 @@ def find_kind(data: bytes) -> str | None:
 
 def describe_content(data: bytes) -> str:
     """Describe the content of a file, to follow "got" in a message."""
-    kind = find_kind(data)
+    kind = detect_file_kind(data)
     if kind is not None:
         return kind
     return "binary data of another kind" if b"\x00" in data else "text of another kind"

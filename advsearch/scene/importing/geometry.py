@@ -50,7 +50,7 @@ class TriangleSoup:
 
     points: Float64Array  # (P, 3), the largest extent 1
     faces: IntArray  # (F, 3) points
-    part_ids: IntArray  # (F,) the part of the file that the face belongs to
+    part_of_face: IntArray  # (F,) the part of the file that the face belongs to
     normals: Float64Array  # (F, 3, 3) unit normals of the corners; NaN if unknown
     uvs: Float64Array  # (F, 3, 2); NaN if unknown
     # (F, 3, 3) linear factors of the base color; 1 if the file has none.
@@ -84,7 +84,7 @@ class TriangleSoup:
             self, **{name: getattr(self, name)[rows, order] for name in names}
         )
 
-    def compute_face_vectors(self) -> Float64Array:
+    def compute_area_vectors(self) -> Float64Array:
         """Return face normals (F, 3), as long as twice the faces' areas."""
         return compute_area_vectors(self.points[self.faces])
 
@@ -159,7 +159,7 @@ def join_parts(
     return TriangleSoup(
         points=points,
         faces=point_of_vertex[faces],
-        part_ids=np.arange(len(parts)).repeat(n_faces),
+        part_of_face=np.arange(len(parts)).repeat(n_faces),
         normals=normalize_vectors(normals) @ turn.T,
         uvs=np.concatenate(
             [_gather_at_corners(part.uvs, part.faces, 2) for part in parts]
@@ -262,7 +262,7 @@ def compute_extent(parts: Sequence[ImportedPart]) -> float:
     return float((upper / 2 - lower / 2).max()) * 2
 
 
-def repair(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
+def repair_soup(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
     """Repair a soup that `join_parts` returned.
 
     Faces without area are removed, the winding becomes consistent and outward, and
@@ -277,7 +277,7 @@ def repair(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
         InputError: no face has an area; the message names the file, `source`.
     """
     has_no_area = (
-        np.linalg.norm(soup.compute_face_vectors(), axis=1) <= MIN_DOUBLED_AREA
+        np.linalg.norm(soup.compute_area_vectors(), axis=1) <= MIN_DOUBLED_AREA
     )
     if has_no_area.all():
         raise InputError(
@@ -290,7 +290,7 @@ def repair(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
     return _fix_normals(_fix_winding(soup, notes), notes)
 
 
-def assemble(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
+def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     """Return the soup as a mesh, and the stored vertex of each of its vertices.
 
     Corners become one vertex if they have the same point, normal and UV, and also the
@@ -440,7 +440,7 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
         shell is one-sided.
     """
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
-    area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
+    area = np.linalg.norm(soup.compute_area_vectors(), axis=1)
     # Corner c is a corner of face c // 3.
     starts, ends = _link_windings(left_corner // 3, right_corner // 3, same_direction)
     component = find_components(2 * len(area), starts, ends)
@@ -502,7 +502,7 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
         shell: the shell of each face, (F,).
     """
     face_counts = np.bincount(shell)
-    vectors = soup.compute_face_vectors()
+    vectors = soup.compute_area_vectors()
     n_shells = len(face_counts)
     is_closed = _find_closed_shells(soup, shell, face_counts)
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
@@ -600,7 +600,7 @@ def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     A single normal that is missing, or on the back of its face, is computed too. A
     computed normal is smooth, or in a part with flat shading that of the face.
     """
-    vectors = soup.compute_face_vectors()
+    vectors = soup.compute_area_vectors()
     area = np.linalg.norm(vectors, axis=1)
     is_known = np.isfinite(soup.normals).all(axis=2)
     is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
@@ -641,7 +641,7 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     below the crease angle. It is the mean of their normals, weighted by their angles at
     that point (Thuermer and Wuethrich 1998).
     """
-    face_normals = normalize_vectors(soup.compute_face_vectors())
+    face_normals = normalize_vectors(soup.compute_area_vectors())
     smoothing_group = _find_smoothing_groups(soup, face_normals)
     weighted = face_normals[:, None] * _compute_corner_angles(soup)[:, :, None]
     normal_sums: Float64Array = np.stack(

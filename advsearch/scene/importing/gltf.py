@@ -23,7 +23,7 @@ from advsearch.scene.importing.files import (
     damaged,
     decode_text,
     describe_content,
-    find_kind,
+    detect_file_kind,
     format_name,
 )
 from advsearch.scene.importing.gltf_entries import (
@@ -34,7 +34,7 @@ from advsearch.scene.importing.gltf_entries import (
     Primitive,
     Sparse,
 )
-from advsearch.trust.named_files import References, normalize_name
+from advsearch.trust.named_files import ReferencedFiles, normalize_name
 from advsearch.trust.stored_files import JsonBoundsError, check_most, parse_json
 
 MOST_VALUES = 1_000_000
@@ -118,7 +118,7 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     try:
         content = parse_json(text)
     except ValueError as error:
-        got = find_kind(chunk)  # such as a web page; None if unknown
+        got = detect_file_kind(chunk)  # such as a web page; None if unknown
         if not got:
             is_over_limit = isinstance(error, JsonBoundsError)
             got = str(error) if is_over_limit else "something else"
@@ -523,7 +523,7 @@ class GltfFile:
         """
         self.path = path
         self.header = read_header(path, data)
-        self.references = References(path)
+        self.references = ReferencedFiles(path)
         _, self._chunk = _split_chunks(path, data)
         self._buffers: dict[int, bytes] = {}
         self._sparse_filled: dict[int, npt.NDArray[Any]] = {}
@@ -537,12 +537,12 @@ class GltfFile:
             ValueError: the data is not valid base64.
         """
         if not uri.startswith("data:"):
-            return self.references.get(uri)
+            return self.references.read_file(uri)
         kind, _, content = uri.partition(",")
         data = unquote_to_bytes(content)
         return base64.b64decode(data) if kind.endswith(";base64") else data
 
-    def get_view(self, index: int) -> memoryview:
+    def get_view_bytes(self, index: int) -> memoryview:
         """Return the bytes of a buffer view.
 
         Raises:
@@ -580,7 +580,7 @@ class GltfFile:
                 raise self._make_empty_buffer_error(index)
         except FileNotFoundError:
             name = normalize_name(uri or "")
-            reason = self.references.refused.get(name, "is missing")
+            reason = self.references.refusal_by_name.get(name, "is missing")
             message = (
                 f"{self.path}: needs {format_name(name)}, which {reason}; put that "
                 "file beside it"
@@ -606,7 +606,7 @@ class GltfFile:
             return _make_unsupported_error(self.path, sorted(unread))
         return damaged(self.path, f"a buffer {index} with content", "none")
 
-    def read_values(self, index: int) -> npt.NDArray[Any]:
+    def read_stored_values(self, index: int) -> npt.NDArray[Any]:
         """Return the values (count, width) of an accessor as they are stored.
 
         They are those of the buffer view, or zeros if the accessor has none. Sparse
@@ -700,7 +700,7 @@ class GltfFile:
         Raises:
             FileFormatError: the view is too short.
         """
-        data = self.get_view(view)
+        data = self.get_view_bytes(view)
         row_size = shape[1] * kind.itemsize
         row_stride = stride or row_size
         end = offset + (shape[0] - 1) * row_stride + row_size
@@ -713,13 +713,13 @@ class GltfFile:
         )
         return values
 
-    def read_numbers(self, index: int, rows: IntArray) -> Float64Array:
+    def read_float_rows(self, index: int, rows: IntArray) -> Float64Array:
         """Return rows (N,) of an accessor as float64 (N, width).
 
         Normalized integers are divided by the largest value of their type. The results
         are in [-1, 1]: the smallest signed integer would be below -1, and is clipped.
         """
-        values = self.read_values(index)[rows]
+        values = self.read_stored_values(index)[rows]
         numbers: Float64Array = values.astype(np.float64)
         if not self.header.accessors[index].normalized or values.dtype.kind == "f":
             return numbers

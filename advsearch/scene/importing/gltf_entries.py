@@ -297,7 +297,7 @@ class TextureTransform(Entry):
     texCoord: UvSetIndex | None = None
 
 
-class TextureUse(Entry):
+class TextureInfo(Entry):
     index: Index
     texCoord: UvSetIndex = 0
     transform: Annotated[
@@ -311,7 +311,7 @@ class TextureUse(Entry):
         other = self.transform.texCoord
         return f"TEXCOORD_{self.texCoord if other is None else other}"
 
-    def has_same_coordinates(self, other: TextureUse) -> bool:
+    def has_same_coordinates(self, other: TextureInfo) -> bool:
         """Return whether another texture has the same coordinates and transform."""
         transform = self.transform
         other_transform = other.transform
@@ -323,7 +323,7 @@ class TextureUse(Entry):
         )
 
 
-class NormalUse(TextureUse):
+class NormalUse(TextureInfo):
     scale: float = 1.0
 
 
@@ -332,15 +332,15 @@ Factor = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 class MetallicRoughness(Entry):
     baseColorFactor: Factor | None = None
-    baseColorTexture: TextureUse | None = None
+    baseColorTexture: TextureInfo | None = None
     metallicFactor: float = 1.0
     roughnessFactor: float = 1.0
-    metallicRoughnessTexture: TextureUse | None = None
+    metallicRoughnessTexture: TextureInfo | None = None
 
 
 class SpecularGlossiness(Entry):
     diffuseFactor: Factor | None = None
-    diffuseTexture: TextureUse | None = None
+    diffuseTexture: TextureInfo | None = None
     glossinessFactor: float = 1.0
 
 
@@ -354,7 +354,7 @@ class MaterialEntry(Entry):
     pbrMetallicRoughness: MetallicRoughness | None = None
     name: str | None = None
     normalTexture: NormalUse | None = None
-    emissiveTexture: TextureUse | None = None
+    emissiveTexture: TextureInfo | None = None
     emissiveFactor: Annotated[
         list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)
     ] = [0.0] * 3
@@ -370,7 +370,7 @@ class MaterialEntry(Entry):
     )
 
     @property
-    def surface(self) -> MetallicRoughness:
+    def metallic_roughness(self) -> MetallicRoughness:
         """Base color, roughness and metallic.
 
         A material of KHR_materials_pbrSpecularGlossiness is read as not metallic. Its
@@ -387,14 +387,14 @@ class MaterialEntry(Entry):
         )
 
     @property
-    def layout_texture(self) -> TextureUse | None:
+    def layout_texture(self) -> TextureInfo | None:
         """The texture whose coordinates become those of the mesh.
 
         It is the texture of the base color, or else the normal map, or else the texture
         of the emission.
         """
         return (
-            self.surface.baseColorTexture or self.normalTexture or self.emissiveTexture
+            self.metallic_roughness.baseColorTexture or self.normalTexture or self.emissiveTexture
         )
 
     @property
@@ -404,7 +404,7 @@ class MaterialEntry(Entry):
             return "TEXCOORD_0"
         return self.layout_texture.uv_attribute
 
-    def can_read(self, use: TextureUse | None) -> bool:
+    def shares_layout(self, use: TextureInfo | None) -> bool:
         """Return whether a texture has the coordinates of `layout_texture`, or is None.
 
         Textures with other coordinates are left out.
@@ -443,7 +443,7 @@ class Texture(Entry):
     webp: Index | None = _make_extension_field("EXT_texture_webp", "source")
 
     @property
-    def image(self) -> int | None:
+    def image_index(self) -> int | None:
         """Index of its image; None if only an unsupported extension has one."""
         return self.source if self.webp is None else self.webp
 
@@ -497,7 +497,7 @@ class Header(Entry):
         return reached
 
     @property
-    def parents(self) -> list[int]:
+    def parent_of_node(self) -> list[int]:
         """The parent of each node, -1 for a root."""
         parents = [-1] * len(self.nodes)
         for index, node in enumerate(self.nodes):
@@ -505,7 +505,7 @@ class Header(Entry):
                 parents[child] = index
         return parents
 
-    def get_label(self, index: int) -> str:
+    def get_node_label(self, index: int) -> str:
         """Return the name of a node, or of its mesh, or its index in words."""
         node = self.nodes[index]
         mesh_name = None if node.mesh is None else self.meshes[node.mesh].name

@@ -43,7 +43,7 @@ from advsearch.scene.importing.gltf_entries import (
     MaterialEntry,
     Primitive,
     Sampler,
-    TextureUse,
+    TextureInfo,
 )
 from advsearch.scene.importing.parts import (
     FLAT_TEXEL,
@@ -84,7 +84,7 @@ MAX_SENTENCE_LENGTH = 500  # limit of the characters of a note of the USD conver
 DIRECTIONAL_LIGHT_DISTANCE = 1000.0  # distance of a directional light, in object sizes
 
 
-def note_left_out(header: Header, notes: Notes) -> None:
+def note_skipped_contents(header: Header, notes: Notes) -> None:
     """Note the contents of a file that are not imported.
 
     First come notes of the converter from OpenUSD, then extensions, and then maps,
@@ -152,11 +152,11 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
             material.occlusionTexture is not None for material in materials
         ),
         "normal map{s} with other texture coordinates than the base colour: left out": (
-            not material.can_read(material.normalTexture) for material in materials
+            not material.shares_layout(material.normalTexture) for material in materials
         ),
         "emission texture{s} with other coordinates than the base colour: left out, "
         "with the emission": (
-            any(material.emission) and not material.can_read(material.emissiveTexture)
+            any(material.emission) and not material.shares_layout(material.emissiveTexture)
             for material in materials
         ),
         "material{s} with an alphaMode that glTF does not have: opaque": (
@@ -249,7 +249,7 @@ def _note_unread_attributes(header: Header, primitive: Primitive, notes: Notes) 
         material = header.materials[primitive.material]
         # Normal maps and emission are read only with the coordinates of the base color.
         read_names.add(material.uv_attribute)
-        roughness_texture = material.surface.metallicRoughnessTexture
+        roughness_texture = material.metallic_roughness.metallicRoughnessTexture
         if roughness_texture is not None:
             read_names.add(roughness_texture.uv_attribute)
     for name in primitive.attributes:
@@ -386,7 +386,7 @@ class GltfSurfaces:
         opacity, only for the alpha modes "MASK" and "BLEND". The color is None if it is
         plain white and the material names a texture, even if its file is missing.
         """
-        entry = material.surface
+        entry = material.metallic_roughness
         stated_factor = entry.baseColorFactor
         if stated_factor is None:
             stated_factor = [1.0] * 4
@@ -420,7 +420,7 @@ class GltfSurfaces:
     def _make_normal_map(self, material: MaterialEntry) -> Float32Array | None:
         """Return the normal map (H, W, 3) of a material, or None."""
         use = material.normalTexture
-        if use is None or not material.can_read(use):
+        if use is None or not material.shares_layout(use):
             return None
         image = self._load_image(
             use, "numbers", "the normal map {name} {why}; it is left out"
@@ -437,7 +437,7 @@ class GltfSurfaces:
         """
         factor = np.array(material.emission)
         use = material.emissiveTexture
-        if not factor.any() or not material.can_read(use):
+        if not factor.any() or not material.shares_layout(use):
             return None
         image = self._load_image(
             use, "colours", "the texture {name} of the emission {why}; it is left out"
@@ -460,7 +460,7 @@ class GltfSurfaces:
             material: the material.
             pieces: all primitives with the material.
         """
-        entry = material.surface
+        entry = material.metallic_roughness
         use = entry.metallicRoughnessTexture
         image = self._load_image(
             use,
@@ -477,7 +477,7 @@ class GltfSurfaces:
         return entry.roughnessFactor * green, entry.metallicFactor * blue
 
     def _load_image(
-        self, use: TextureUse | None, kind: ImageKind, note_template: str
+        self, use: TextureInfo | None, kind: ImageKind, note_template: str
     ) -> Float32Array | None:
         """Return the texels (H, W, C) of a texture for a renderer that filters.
 
@@ -510,7 +510,7 @@ class GltfSurfaces:
         return texels.repeat(repeats, axis=0).repeat(repeats, axis=1)
 
     def _load_texels(
-        self, use: TextureUse, kind: ImageKind, note_template: str
+        self, use: TextureInfo, kind: ImageKind, note_template: str
     ) -> Float32Array | None:
         """Return the texels (H, W, C) of a texture as the file has them.
 
@@ -520,7 +520,7 @@ class GltfSurfaces:
             note_template: the note if it has no texels, with `{name}` for the image and
                 `{why}` for the reason; then None is returned.
         """
-        image_index = self.file.header.textures[use.index].image
+        image_index = self.file.header.textures[use.index].image_index
         if image_index is None:
             self._images.note_missing(
                 "(embedded)",
@@ -538,13 +538,13 @@ class GltfSurfaces:
                 return self.file.load_uri(entry.uri)
             if entry.bufferView is None:
                 return b""
-            return bytes(self.file.get_view(entry.bufferView))
+            return bytes(self.file.get_view_bytes(entry.bufferView))
 
         # Several textures may show the same file, which is decoded once.
         key = (entry.uri, entry.bufferView)
-        return self._images.load(key, load_content, kind, name, note_template)
+        return self._images.load_image(key, load_content, kind, name, note_template)
 
-    def _get_sampler(self, use: TextureUse) -> Sampler:
+    def _get_sampler(self, use: TextureInfo) -> Sampler:
         """Return the sampler of a texture, which has defaults if the file states none."""
         sampler_index = self.file.header.textures[use.index].sampler
         if sampler_index is None:
@@ -606,14 +606,14 @@ class GltfSurfaces:
         images are missing have a sampler, too.
         """
         uses = (
-            material.surface.baseColorTexture,
+            material.metallic_roughness.baseColorTexture,
             material.normalTexture,
             material.emissiveTexture,
         )
         return [
             self._get_sampler(use)
             for use in uses
-            if use is not None and material.can_read(use)
+            if use is not None and material.shares_layout(use)
         ]
 
     def _fit_axis(
@@ -863,7 +863,7 @@ class _Instance(NamedTuple):
 
 def _list_instances(header: Header) -> list[_Instance]:
     """Return every mesh that a node of the scene draws, in order of the nodes."""
-    poses = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
+    poses = sorted(gltf_skeleton.iterate_node_poses(header), key=lambda item: item[0])
     instances = []
     for node, pose in poses:
         mesh = header.nodes[node].mesh
@@ -905,7 +905,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     with_faces = _select_with_faces(pieces)
     if not with_faces:
         raise _make_no_faces_error(path, header, has_primitives=bool(pieces))
-    note_left_out(header, notes)
+    note_skipped_contents(header, notes)
     _note_pieces(header, keys=list(pieces), with_faces=with_faces, notes=notes)
     parts_by_key = _make_parts(GltfSurfaces(file, notes), with_faces)
     skins = _read_skins(file, mesh_nodes)
@@ -922,7 +922,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
 class SkinPose(NamedTuple):
     """A skin at rest."""
 
-    joints: IntArray  # (J,) its joints, which are nodes
+    joint_nodes: IntArray  # (J,) its joints, which are nodes
     inverse_binds: Float64Array  # (J, 4, 4) from the mesh to each joint
     matrices: Float64Array  # (J, 4, 4) from the mesh to the scene
 
@@ -1004,7 +1004,7 @@ def _note_pieces(
         mesh for (mesh, _), piece in with_faces.items() if piece.has_transparent_colors
     }
     meshes_without_material = {
-        mesh for (mesh, _), piece in with_faces.items() if piece.material is None
+        mesh for (mesh, _), piece in with_faces.items() if piece.material_index is None
     }
     if transparent_meshes:
         notes.warn(_format_count(len(transparent_meshes), TRANSPARENT_COLORS_NOTE))
@@ -1026,7 +1026,7 @@ def _make_parts(
     """
     groups = dict[int | None, dict[PrimitiveKey, PrimitiveData]]()
     for key, piece in with_faces.items():
-        groups.setdefault(piece.material, {})[key] = piece
+        groups.setdefault(piece.material_index, {})[key] = piece
     parts = dict[PrimitiveKey, ImportedPart]()
     for material, group in groups.items():
         surface, scale, shift = surfaces.make_surface(material, list(group.values()))
@@ -1049,7 +1049,7 @@ def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose
     # Joints may be outside of the scene that is imported. Without scenes in the header,
     # all nodes are iterated over.
     all_poses = dict(
-        gltf_skeleton.iterate_poses(header.model_copy(update={"scenes": []}))
+        gltf_skeleton.iterate_node_poses(header.model_copy(update={"scenes": []}))
     )
     skins = dict[int, SkinPose]()
     for index in {header.nodes[node].skin for node in mesh_nodes}:
@@ -1143,22 +1143,22 @@ def _make_movable(
     inverse_binds = np.eye(4)[None]
     if skin is not None and piece.vertex_joints is not None:
         vertex_joints = piece.vertex_joints
-        joint_nodes = skin.joints
+        joint_nodes = skin.joint_nodes
         inverse_binds = skin.inverse_binds
-    rest_weights = gltf_skeleton.read_rest_weights(file, node, len(piece.targets))
+    rest_weights = gltf_skeleton.read_rest_weights(file, node, len(piece.morph_targets))
     movable = Movable(
         skeleton=skeleton,
         node=node,
         vertices=part.vertices,
-        nodes=joint_nodes,
+        joint_nodes=joint_nodes,
         inverse_binds=inverse_binds,
         joints=vertex_joints.joints,
         weights=vertex_joints.weights,
-        targets=piece.targets,
+        targets=piece.morph_targets,
         rest_weights=rest_weights,
     )
-    morphed = gltf_skeleton.apply_targets(
-        part, piece.targets, piece.normal_offsets, rest_weights
+    morphed = gltf_skeleton.apply_morph_targets(
+        part, piece.morph_targets, piece.normal_offsets, rest_weights
     )
     return replace(morphed, movable=movable)
 
@@ -1170,11 +1170,11 @@ class PrimitiveData(NamedTuple):
     """
 
     part: ImportedPart  # its geometry
-    material: int | None  # index of its material
+    material_index: int | None  # index of its material
     # Whether it has vertex colors with an alpha below 1, and a transparent material.
     has_transparent_colors: bool
     vertex_joints: gltf_skeleton.VertexJoints | None  # joints and weights
-    targets: tuple[MorphTarget, ...]  # morph targets
+    morph_targets: tuple[MorphTarget, ...]  # morph targets
     # (V, 3) offsets that each target adds to the normals; None if it changes none.
     normal_offsets: tuple[Float64Array | None, ...]
     # (V, 2) coordinates of its texture of roughness and metallic.
@@ -1196,7 +1196,7 @@ def _read_vertex_colors(
     """
     if "COLOR_0" not in attributes:
         return None, False
-    rgba = file.read_numbers(attributes["COLOR_0"], used)
+    rgba = file.read_float_rows(attributes["COLOR_0"], used)
     rgba = np.clip(np.nan_to_num(rgba), 0.0, 1.0)
     has_alpha = rgba.shape[1] == 4 and bool((rgba[:, 3] < 1.0).any())
     return rgba[:, :3][faces], has_alpha
@@ -1218,7 +1218,7 @@ def _read_roughness_coordinates(
         material: its material.
         used: (V,) the vertices that faces use.
     """
-    texture = material.surface.metallicRoughnessTexture
+    texture = material.metallic_roughness.metallicRoughnessTexture
     if texture is None:
         return None
     return _read_texture_coordinates(file, attributes, texture, used)
@@ -1242,7 +1242,7 @@ def read_primitive(
     if primitive.mode < TRIANGLES or "POSITION" not in attributes:
         return None
     used, faces = _find_used_vertices(file, primitive)
-    positions = file.read_numbers(attributes["POSITION"], used)
+    positions = file.read_float_rows(attributes["POSITION"], used)
     material = MaterialEntry()
     if primitive.material is not None:
         material = file.header.materials[primitive.material]
@@ -1251,11 +1251,11 @@ def read_primitive(
     colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
     normals = None
     if "NORMAL" in attributes:
-        normals = file.read_numbers(attributes["NORMAL"], used)
+        normals = file.read_float_rows(attributes["NORMAL"], used)
     vertex_joints = None
     if is_skinned:
         vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used)
-    targets, normal_offsets = gltf_skeleton.read_targets(
+    targets, normal_offsets = gltf_skeleton.read_morph_targets(
         file, primitive, used, mesh_extras
     )
     # Primitives with the same material share a surface, which `_make_parts` adds.
@@ -1270,10 +1270,10 @@ def read_primitive(
     )
     return PrimitiveData(
         part=part,
-        material=primitive.material,
+        material_index=primitive.material,
         has_transparent_colors=material.alphaMode in TRANSPARENT_MODES and has_alpha,
         vertex_joints=vertex_joints,
-        targets=targets,
+        morph_targets=targets,
         normal_offsets=normal_offsets,
         roughness_uvs=roughness_uvs,
     )
@@ -1297,7 +1297,7 @@ def _find_used_vertices(
     count = file.header.accessors[primitive.attributes["POSITION"]].count
     order = np.arange(count)
     if primitive.indices is not None:
-        order = file.read_values(primitive.indices)[:, 0].astype(np.int64)
+        order = file.read_stored_values(primitive.indices)[:, 0].astype(np.int64)
     if len(order) and order.max() >= count:
         raise damaged(
             file.path,
@@ -1313,7 +1313,7 @@ def _find_used_vertices(
 def _read_texture_coordinates(
     file: GltfFile,
     attributes: Mapping[str, int],
-    use: TextureUse | None,
+    use: TextureInfo | None,
     used: IntArray,
 ) -> Float64Array | None:
     """Return the texture coordinates of used vertices, or None if there are none.
@@ -1336,7 +1336,7 @@ def _read_texture_coordinates(
         # This is no error: the coordinates of the base color were checked with the
         # header, and other textures can be left out.
         return None
-    uvs = file.read_numbers(attributes[name], used)
+    uvs = file.read_float_rows(attributes[name], used)
     if use is None:
         return uvs
     transform = use.transform

@@ -51,7 +51,7 @@ for each morph target.
 MIN_QUATERNION_LENGTH = 1e-6  # minimum length of a quaternion; the format requires 1
 
 
-def iterate_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
+def iterate_node_poses(header: Header) -> Iterator[tuple[int, Float64Array]]:
     """Yield the index and the pose (4, 4) of each node of the file's scene.
 
     The pose maps the node's coordinates to the scene's. In a file without scenes, all
@@ -165,9 +165,9 @@ def _read_joint_set(
         raise damaged(
             file.path, "four joints and four weights of each vertex", "others"
         )
-    joints = file.read_values(joints_index)[used].astype(np.int64)
+    joints = file.read_stored_values(joints_index)[used].astype(np.int64)
     # Weights may be stored as integers, which `read_numbers` converts to fractions.
-    weights = file.read_numbers(weights_index, used)
+    weights = file.read_float_rows(weights_index, used)
     return VertexJoints(joints, weights)
 
 
@@ -185,7 +185,7 @@ def read_inverse_binds(file: GltfFile, skin: Skin) -> Float64Array:
     count = len(skin.joints)
     if skin.inverseBindMatrices is None:
         return np.tile(np.eye(4), (count, 1, 1))
-    values = file.read_values(skin.inverseBindMatrices)
+    values = file.read_stored_values(skin.inverseBindMatrices)
     if values.shape[1:] != (16,) or len(values) < count:
         got = f"{len(values)} of {values.shape[1]} numbers"
         raise damaged(file.path, f"{count} inverse bind matrices of 4 x 4", got)
@@ -239,7 +239,7 @@ def pose_part(
     return replace_geometry(part, vertices, normals, is_mirrored=are_all_mirrored)
 
 
-def read_targets(
+def read_morph_targets(
     file: GltfFile, primitive: Primitive, used: IntArray, extras: object
 ) -> tuple[tuple[MorphTarget, ...], tuple[Float64Array | None, ...]]:
     """Read the morph targets of a primitive.
@@ -312,11 +312,11 @@ def _read_offsets(
             f"a {name} of type VEC3 for each vertex in a morph target",
             "others",
         )
-    offsets = file.read_numbers(attributes[name], used)
+    offsets = file.read_float_rows(attributes[name], used)
     return _require_finite(file.path, "morph targets", offsets)
 
 
-def apply_targets(
+def apply_morph_targets(
     part: ImportedPart,
     targets: Sequence[MorphTarget],
     normal_offsets: Sequence[Float64Array | None],
@@ -458,7 +458,7 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
     return Skeleton(
         source=file.path.name,
         names=_name_nodes(header),
-        parents=np.array(header.parents),
+        parents=np.array(header.parent_of_node),
         local_matrices=np.stack([compute_matrix(node) for node in header.nodes]),
         translations=np.array([node.translation or [0.0] * 3 for node in header.nodes]),
         rotations=np.asarray(rotations / np.maximum(lengths, 1e-12)),
@@ -529,7 +529,7 @@ def _find_moving_channels(
         skins: indices of the skins of these nodes.
     """
     joints = (joint for skin in skins for joint in header.skins[skin].joints)
-    moving_nodes = with_ancestors(header.parents, {*target_counts, *joints})
+    moving_nodes = with_ancestors(header.parent_of_node, {*target_counts, *joints})
 
     def moves_geometry(channel: Channel) -> bool:
         """Return whether a channel sets something that moves geometry."""
@@ -622,7 +622,7 @@ def _read_keys(
             f"{n_keys:,} keys of a {property_name}"
         )
         raise damaged(file.path, expected, f"{output.count:,} of {output.width}")
-    values = file.read_numbers(index, np.arange(count))
+    values = file.read_float_rows(index, np.arange(count))
     return _require_finite(file.path, "the keys of a clip", values).reshape(
         n_keys, values_per_key, n_targets * width
     )
@@ -653,7 +653,7 @@ def _read_times(file: GltfFile, index: int) -> Float64Array:
             "keys of a clip at times in seconds, of type SCALAR and 32-bit floats",
             "others",
         )
-    values = file.read_numbers(index, np.arange(accessor.count))
+    values = file.read_float_rows(index, np.arange(accessor.count))
     times = _require_finite(path, "the times of a clip", values)[:, 0]
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
         raise damaged(

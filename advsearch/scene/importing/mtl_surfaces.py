@@ -25,7 +25,7 @@ from advsearch.scene.importing.parts import (
 from advsearch.scene.importing.pictures import FileImages, ImageKind
 from advsearch.scene.importing.texture import average_over_faces
 from advsearch.scene.importing.unread import TrackedKeys
-from advsearch.trust.named_files import References, normalize_name
+from advsearch.trust.named_files import ReferencedFiles, normalize_name
 
 IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
 """Common statements without a counterpart in a physical material: ambient light, Phong's
@@ -71,7 +71,7 @@ class MtlReader:
         n_libraries: number of material files that were read.
     """
 
-    references: References
+    references: ReferencedFiles
     notes: Notes
     find_mapped_faces: Callable[[str, int], tuple[Float64Array, Float64Array]]
     n_libraries: int = 0
@@ -80,7 +80,7 @@ class MtlReader:
     # Surfaces by `id` of their material and the UDIM square.
     _surfaces: dict[tuple[int, int], MtlSurface] = field(default_factory=dict)
     # Maps by `id` of their material and the keyword.
-    _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
+    _uses: dict[tuple[int, str], MapStatement | None] = field(default_factory=dict)
 
     def read_library(self, name: str) -> None:
         """Read a material file, and store its materials by name for `get_surface`.
@@ -94,7 +94,7 @@ class MtlReader:
             name: name of the file, as the mesh file writes it.
         """
         try:
-            text = decode_text(self.references.get(name))
+            text = decode_text(self.references.read_file(name))
         except FileNotFoundError:
             self._note_missing_library(name)
             return
@@ -113,7 +113,7 @@ class MtlReader:
         """Note a material file that is missing, or that must not be read."""
         file_name = normalize_name(name)
         # `references.get` has stored a reason such as "is missing".
-        reason = self.references.refused[file_name]
+        reason = self.references.refusal_by_name[file_name]
         self.notes.warn_that_file(
             f"names the material file {format_name(file_name)}, which {reason}; "
             "neutral grey is used instead"
@@ -128,7 +128,7 @@ class MtlReader:
         for material in materials:
             known_material = self._materials.setdefault(material.name, material)
             if (
-                known_material.statements != material.statements
+                known_material.argument_by_keyword != material.argument_by_keyword
                 and known_material.file == material.file
             ):
                 self.notes.warn(
@@ -181,7 +181,7 @@ class MtlReader:
         if numbered_name is None:
             return []
         squares = [square for square in candidates if square]
-        named_square = find_square(numbered_name)
+        named_square = parse_udim_square(numbered_name)
         other_squares = [square for square in squares if square != named_square]
         if not other_squares:
             return []  # the image that the material names is that of all faces
@@ -204,7 +204,7 @@ class MtlReader:
     def _find_numbered_name(self, material: MtlMaterial) -> str | None:
         """Return the first name of a material's images that has a UDIM square in it."""
         for use in [self._parse_use(material, key) for key in UV_MAPS]:
-            if use is not None and find_square(use.name) is not None:
+            if use is not None and parse_udim_square(use.name) is not None:
                 return use.name
         return None
 
@@ -228,8 +228,8 @@ class MtlReader:
         )
         uses = self._parse_uses(material, square)
         # The mesh has one layout of texture coordinates, which is that of its first
-        # image. Without images it has the defaults of `MapUse`.
-        no_use = MapUse(name="", options={})
+        # image. Without images it has the defaults of `MapStatement`.
+        no_use = MapStatement(name="", options={})
         first_use = next((uses[key] for key in UV_MAPS if key in uses), no_use)
         self._drop_other_layouts(material, uses, first_use)
         color, texture = self._make_base_color(material, uses.get("map_kd"))
@@ -254,20 +254,20 @@ class MtlReader:
         )
         return MtlSurface(surface, first_use.scale, first_use.offset, is_clamped)
 
-    def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapUse]:
+    def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapStatement]:
         """Return the maps of a material by keyword, with the images of a UDIM square.
 
         The maps are marked as read, so that they are not noted. Normal maps are not:
         `_make_normal_map` reads only the first one that it can use.
         """
-        uses = dict[str, MapUse]()
+        uses = dict[str, MapStatement]()
         for key in (*UV_MAPS, "map_pr", "map_pm"):
             use = self._parse_use(material, key)
             if use is not None:
                 uses[key] = use
-        material.keys.mark_read(*(key for key in uses if key not in NORMAL_MAPS))
+        material.tracked_statements.mark_read(*(key for key in uses if key not in NORMAL_MAPS))
         # `_note_unread` notes some values of illum, but not the statement itself.
-        material.keys.mark_read("illum")
+        material.tracked_statements.mark_read("illum")
         if square:
             uses = {
                 key: replace(use, name=replace_square(use.name, square))
@@ -276,7 +276,7 @@ class MtlReader:
         return uses
 
     def _drop_other_layouts(
-        self, material: MtlMaterial, uses: dict[str, MapUse], first_use: MapUse
+        self, material: MtlMaterial, uses: dict[str, MapStatement], first_use: MapStatement
     ) -> None:
         """Remove maps whose texture coordinates differ from those of the first.
 
@@ -301,11 +301,11 @@ class MtlReader:
                     f"{statement} has other texture coordinates (-s, -o) than its first "
                     "map; it is left out"
                 )
-                material.keys.mark_read(key)
+                material.tracked_statements.mark_read(key)
                 del uses[key]
 
     def _make_base_color(
-        self, material: MtlMaterial, use: MapUse | None
+        self, material: MtlMaterial, use: MapStatement | None
     ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the color (3,) of ``Kd`` and the texture (H, W, 3) of ``map_Kd``.
 
@@ -324,7 +324,7 @@ class MtlReader:
         )
         texture = self._load_image(use, "colours and alpha", note_template)
         if use is not None and texture is not None:
-            if texture[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
+            if texture[:, :, 3].min() < 1.0 and "map_d" not in material.argument_by_keyword:
                 self.notes.warn(
                     f"the alpha of {format_name(use.name)} is left out: no map_d "
                     "makes it an opacity"
@@ -344,7 +344,7 @@ class MtlReader:
         if values is not None and len(values) in (1, 3, 4):
             rgb = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0)
             return np.asarray(rgb, np.float32)
-        if "kd" in material.statements:
+        if "kd" in material.argument_by_keyword:
             statement = (
                 f"the Kd {format_name(argument)} of the material "
                 f"{format_name(material.name)}"
@@ -359,9 +359,9 @@ class MtlReader:
         illumination models above 2, such as ray-traced glass.
         """
         zero_keys = {
-            key for key in material.statements if _is_zero(material.peek_argument(key))
+            key for key in material.argument_by_keyword if _is_zero(material.peek_argument(key))
         }
-        base_map = parse_map(without_comment(material.statements.get("map_kd", "")))
+        base_map = parse_map(without_comment(material.argument_by_keyword.get("map_kd", "")))
 
         def is_without_effect(key: str, statement: str) -> bool:
             """Return whether a statement changes nothing."""
@@ -386,12 +386,12 @@ class MtlReader:
             self.notes.record("fourth number of", material.spelling["kd"])
         if material.peek_argument("illum") not in ("", "0", "1", "2"):
             self.notes.record(
-                "illumination model", without_comment(material.statements["illum"])
+                "illumination model", without_comment(material.argument_by_keyword["illum"])
             )
-        for name in material.keys.find_unread(is_without_effect):
+        for name in material.tracked_statements.find_unread(is_without_effect):
             self.notes.record("material statement", name)
 
-    def _parse_use(self, material: MtlMaterial, key: str) -> MapUse | None:
+    def _parse_use(self, material: MtlMaterial, key: str) -> MapStatement | None:
         """Parse a statement that names an image, and note options that are not read.
 
         The result is None if the statement is missing or names no image. Text from a #
@@ -400,11 +400,11 @@ class MtlReader:
         """
         if (id(material), key) in self._uses:
             return self._uses[id(material), key]
-        statement = material.statements.get(key, "")
+        statement = material.argument_by_keyword.get(key, "")
         use = parse_map(without_comment(statement))
         use_with_comment = parse_map(statement)
         if use_with_comment is not None and use_with_comment != use:
-            if isinstance(self.references.find(use_with_comment.name), bytes):
+            if isinstance(self.references.read_or_explain(use_with_comment.name), bytes):
                 use = use_with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
         if use is not None:
@@ -412,7 +412,7 @@ class MtlReader:
         return use
 
     def _note_unread_options(
-        self, material: MtlMaterial, key: str, use: MapUse
+        self, material: MtlMaterial, key: str, use: MapStatement
     ) -> None:
         """Note the options of an image that are not read, unless they change nothing.
 
@@ -442,7 +442,7 @@ class MtlReader:
             )
 
     def _apply_opacity(
-        self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface
+        self, material: MtlMaterial, use: MapStatement | None, surface: ImportedSurface
     ) -> ImportedSurface:
         """Return a surface with its opacity.
 
@@ -521,7 +521,7 @@ class MtlReader:
         self,
         material: MtlMaterial,
         key: str,
-        use: MapUse | None,
+        use: MapStatement | None,
         name: str,
         square: int,
     ) -> float | None:
@@ -554,7 +554,7 @@ class MtlReader:
         return number
 
     def _make_normal_map(
-        self, material: MtlMaterial, uses: dict[str, MapUse]
+        self, material: MtlMaterial, uses: dict[str, MapStatement]
     ) -> Float32Array | None:
         """Return the first usable normal map (H, W, 3) of a material, or None.
 
@@ -571,7 +571,7 @@ class MtlReader:
                 continue
             use = uses[key]
             image = self._load_image(use, "numbers", note_template)
-            material.keys.mark_read(
+            material.tracked_statements.mark_read(
                 *(other for other in uses if uses[other].name == use.name)
             )
             if image is not None:
@@ -584,7 +584,7 @@ class MtlReader:
         return None
 
     def _make_emission(
-        self, material: MtlMaterial, use: MapUse | None
+        self, material: MtlMaterial, use: MapStatement | None
     ) -> Float32Array | None:
         """Return the radiance of ``Ke`` and ``map_Ke``, (H, W, 3), or None.
 
@@ -618,7 +618,7 @@ class MtlReader:
         return FileImages(len(self._materials), self.references, self.notes)
 
     def _load_image(
-        self, use: MapUse | None, kind: ImageKind, note_template: str
+        self, use: MapStatement | None, kind: ImageKind, note_template: str
     ) -> Float32Array | None:
         """Return the values (H, W, C) of an image with its ``-mm`` applied.
 
@@ -659,7 +659,7 @@ def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
     return picture[:, :, channel]
 
 
-def find_libraries(arguments: Sequence[str], references: References) -> list[str]:
+def find_libraries(arguments: Sequence[str], references: ReferencedFiles) -> list[str]:
     """Return the names of the material files that ``mtllib`` lines name.
 
     A line may name several files, and a name may have blanks. If the full line is the
@@ -689,9 +689,9 @@ def find_libraries(arguments: Sequence[str], references: References) -> list[str
     return list(dict.fromkeys(filter(None, names)))
 
 
-def _exists(references: References, name: str) -> bool:
+def _exists(references: ReferencedFiles, name: str) -> bool:
     """Return whether there is a file of a name that may be read."""
-    return isinstance(references.find(name), bytes)
+    return isinstance(references.read_or_explain(name), bytes)
 
 
 def _has_mtl_suffix(name: str) -> bool:
@@ -718,12 +718,12 @@ def _split_libraries(line: str) -> list[str]:
 
 FIRST_SQUARE = 1001
 SQUARES_PER_ROW = 10
-PLACEHOLDER_SQUARE = 0  # result of `find_square` for a name that stands for all squares
+PLACEHOLDER_SQUARE = 0  # result of `parse_udim_square` for a name that stands for all squares
 _SQUARE_NUMBER = re.compile(r"(?<!\d)1\d{3}(?=\.\w+$)")
 _PLACEHOLDER = re.compile(r"<UDIM>", re.IGNORECASE)
 
 
-def find_square(name: str) -> int | None:
+def parse_udim_square(name: str) -> int | None:
     """Return the UDIM square in the name of an image, or None if it has none.
 
     It is `PLACEHOLDER_SQUARE` if the name has the placeholder ``<UDIM>``.
@@ -806,20 +806,20 @@ class MtlMaterial:
 
     name: str  # as it is written after ``newmtl``, perhaps with a comment
     file: str  # name of the material file
-    statements: dict[str, str] = field(default_factory=dict)
+    argument_by_keyword: dict[str, str] = field(default_factory=dict)
     spelling: dict[str, str] = field(default_factory=dict)  # keywords as written
     # Keywords of statements that a later, different one overrides.
     overridden: list[str] = field(default_factory=list)
 
     @cached_property
-    def keys(self) -> TrackedKeys[str]:
+    def tracked_statements(self) -> TrackedKeys[str]:
         """The statements, tracking which of them are read."""
         # `find_unread` returns keywords as the file writes them, so that these are the
         # keys here; they are looked up in lower case.
         return TrackedKeys(
             {
                 self.spelling[key]: statement
-                for key, statement in self.statements.items()
+                for key, statement in self.argument_by_keyword.items()
             },
             fold=str.lower,
         )
@@ -829,16 +829,16 @@ class MtlMaterial:
 
         The statement is marked as read.
         """
-        self.keys.mark_read(key)
+        self.tracked_statements.mark_read(key)
         return self.peek_argument(key)
 
     def peek_argument(self, key: str) -> str:
         """Return what `read_argument` returns, but don't mark the statement as read."""
-        return self.statements.get(key, "").partition("#")[0].strip()
+        return self.argument_by_keyword.get(key, "").partition("#")[0].strip()
 
 
 @dataclass(frozen=True)
-class MapUse:
+class MapStatement:
     """A statement that names a picture."""
 
     name: str  # name of the picture in the file
@@ -873,9 +873,9 @@ def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
         elif materials:
             material = materials[-1]
             value = argument.strip()
-            if material.statements.get(key, value) != value:  # an earlier one differs
+            if material.argument_by_keyword.get(key, value) != value:  # an earlier one differs
                 material.overridden.append(keyword)
-            material.statements[key] = value
+            material.argument_by_keyword[key] = value
             material.spelling[key] = keyword
         else:
             stray_keywords.append(keyword)
@@ -887,7 +887,7 @@ def without_comment(text: str) -> str:
     return _COMMENT.sub("", text).strip()
 
 
-def parse_map(argument: str) -> MapUse | None:
+def parse_map(argument: str) -> MapStatement | None:
     """Parse the arguments of a statement that names an image; None if it names none.
 
     In "-s 2 2 -clamp on old wood.png" the name is "old wood.png". Known options are
@@ -910,7 +910,7 @@ def parse_map(argument: str) -> MapUse | None:
     if not name:
         return None
     bump, _ = _parse_pair(options, "bm", (1.0, 1.0))  # the option has one number
-    return MapUse(
+    return MapStatement(
         name,
         options,
         scale=_parse_pair(options, "s", (1.0, 1.0)),

@@ -39,19 +39,19 @@ from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.files import Notes, format_name, make_safe_name
 from advsearch.scene.importing.geometry import (
     TriangleSoup,
-    assemble,
+    make_mesh_from_soup,
     compute_extent,
     compute_rotation,
     find_used,
     join_parts,
     list_used_vertices,
-    repair,
+    repair_soup,
 )
 from advsearch.scene.importing.gltf_entries import Header
 from advsearch.scene.importing.parts import (
     ImportedPart,
     ImportedSurface,
-    select_visible,
+    select_visible_parts,
 )
 from advsearch.scene.importing.readers import (
     GLTF_SUFFIXES,
@@ -120,7 +120,7 @@ def import_object(
         up: the axis of the file that points up; None for the axis of its format, or
             else the one that its shape suggests.
         facing: the axis of the file, one of `FRONT_AXES`, along which the object's
-            front faces; None for the axis of its format (`find_front`).
+            front faces; None for the axis of its format (`find_front_axis`).
 
     Raises:
         FileFormatError: the file is missing, of another kind, corrupt, or has no faces;
@@ -140,15 +140,15 @@ def import_object(
         notes += gltf_parts.describe_left_out(header, file.name)
         format_up = up or "y"
     if facing is None:
-        front = find_front(file, header, up)
+        front = find_front_axis(file, header, up)
     else:
-        front = FileAxis(check_facing(facing, format_up))
+        front = FileAxis(parse_facing_axis(facing, format_up))
     return make_object(
         parts, notes, file=file, name=make_safe_name(file), up=up, front=front
     )
 
 
-def check_facing(facing: str, up: str | None) -> str:
+def parse_facing_axis(facing: str, up: str | None) -> str:
     """Return an axis of `FRONT_AXES`, completing a plus sign that was left out.
 
     Raises:
@@ -178,7 +178,7 @@ VRM_0 = "VRM"  # extensions of glTF
 VRM_1 = "VRMC_vrm"
 
 
-def find_front(path: Path, header: Header | None, up: str | None = None) -> FileAxis:
+def find_front_axis(path: Path, header: Header | None, up: str | None = None) -> FileAxis:
     """Return the axis along which the front of an object faces, as its format defines.
 
     The front of a glTF asset faces +Z (Khronos, glTF 2.0, section 3.4), which is -Y in
@@ -242,7 +242,7 @@ def make_object(
     up_axis = _find_up(parts, file, up, front)
     rotation = compute_rotation(up_axis.axis, front.axis)
     surfaces = [part.surface for part in parts]
-    soup = repair(join_parts(parts, str(file), rotation), str(file), object_notes)
+    soup = repair_soup(join_parts(parts, str(file), rotation), str(file), object_notes)
     soup, maps = apply_textures(soup, surfaces, object_notes)
     opacity = _find_opacity(maps.color, object_notes)
     material = _compute_mean_material(soup, surfaces, object_notes)
@@ -273,7 +273,7 @@ def _select_visible_parts(
     parts: list[ImportedPart], notes: Notes
 ) -> list[ImportedPart]:
     """Return the parts that are not fully transparent, and note the others."""
-    visible_parts = select_visible(parts)
+    visible_parts = select_visible_parts(parts)
     # Parts are compared by identity.
     transparent = [part for part in parts if part not in visible_parts]
     names = dict.fromkeys(
@@ -344,8 +344,8 @@ def _compute_mean_material(
     """
     # twice the area of each surface, in the order of `surfaces`
     visible_area = np.bincount(
-        soup.part_ids,
-        weights=np.linalg.norm(soup.compute_face_vectors(), axis=1),
+        soup.part_of_face,
+        weights=np.linalg.norm(soup.compute_area_vectors(), axis=1),
         minlength=len(surfaces),
     )
     # What a surface does not state has the value of the default material.
@@ -404,7 +404,7 @@ def _make_mesh(
         name: faces for name, faces in faces_by_material if name and len(faces)
     }
     try:
-        mesh, stored_vertices = assemble(soup)
+        mesh, stored_vertices = make_mesh_from_soup(soup)
         normalised_mesh = replace(normalise_mesh(mesh), materials=materials)
     except InputError as error:  # it does not name the file
         raise InputError(f"{file}: {error}") from None

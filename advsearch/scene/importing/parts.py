@@ -264,7 +264,7 @@ def group_faces(*keys: IntArray | BoolArray) -> list[IntArray]:
     return group_indices(group.reshape(-1))
 
 
-def select_visible(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
+def select_visible_parts(parts: Sequence[ImportedPart]) -> list[ImportedPart]:
     """Return the parts that are not fully transparent, or all if that leaves none."""
     return [part for part in parts if not part.surface.is_transparent] or list(parts)
 
@@ -326,10 +326,10 @@ class IndexedValues(NamedTuple):
     """Values, and the indices by which the corners of triangles refer to them."""
 
     values: Float64Array  # (N, C) float64
-    rows: IntArray  # (F, 3) int64 rows of `values`; -1 if a corner has none
+    row_of_corner: IntArray  # (F, 3) int64 rows of `values`; -1 if a corner has none
 
 
-def split_at_corners(
+def make_part_from_corners(
     triangles: IntArray,
     points: IndexedValues,
     normals: IndexedValues | None,
@@ -362,12 +362,12 @@ def split_at_corners(
         """Return values (V, C), NaN for vertices without one; None if all are without."""
         if indexed is None:
             return None
-        rows = indexed.rows[triangles].reshape(-1)[first_corner]
+        rows = indexed.row_of_corner[triangles].reshape(-1)[first_corner]
         if (rows < 0).all():
             return None
         return np.where(rows[:, None] >= 0, indexed.values[rows], np.nan)
 
-    vertices = points.values[points.rows[triangles].reshape(-1)[first_corner]]
+    vertices = points.values[points.row_of_corner[triangles].reshape(-1)[first_corner]]
     return ImportedPart(
         vertices=vertices,
         faces=faces.reshape(-1, 3),
@@ -403,6 +403,6 @@ def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntA
             _, corner_number = np.unique(corner_number, return_inverse=True)
             corner_number = corner_number.reshape(-1)
             bound = len(corner_number)
-        corner_number = corner_number * base + indexed.rows[triangles].reshape(-1) + 1
+        corner_number = corner_number * base + indexed.row_of_corner[triangles].reshape(-1) + 1
         bound *= base
     return corner_number

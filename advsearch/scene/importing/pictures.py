@@ -26,7 +26,7 @@ from advsearch.pictures import (
 from advsearch.scene.assets import Float32Array
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes, format_name
-from advsearch.trust.named_files import References, normalize_name
+from advsearch.trust.named_files import ReferencedFiles, normalize_name
 from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 # Limit of the sides of an imported texture, in texels; larger ones are averaged down.
@@ -281,7 +281,7 @@ class FileImages:
     """Decodes the images of one file, each once, within limits in total."""
 
     materials: int  # number of materials of the file
-    references: References  # finds the files that it names
+    references: ReferencedFiles  # finds the files that it names
     notes: Notes  # notes about the file: images made smaller, or missing
     # Longest side of a texture; None for a limit by the number of materials.
     limit: int | None = None
@@ -311,9 +311,9 @@ class FileImages:
         self, name: str, kind: ImageKind, message: str
     ) -> Float32Array | None:
         """Return the values of an image that the file names; see `load`."""
-        return self.load(name, lambda: self.references.get(name), kind, name, message)
+        return self.load_image(name, lambda: self.references.read_file(name), kind, name, message)
 
-    def load(
+    def load_image(
         self,
         key: Hashable,
         read_bytes: Callable[[], bytes],
@@ -371,7 +371,7 @@ class FileImages:
             image = Image.open(io.BytesIO(read_bytes()), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             # A file that must not be read has a reason here.
-            return self.references.refused.get(normalize_name(name), UNREADABLE)
+            return self.references.refusal_by_name.get(normalize_name(name), UNREADABLE)
         try:
             texture = self._load_within_limits(image, kind)
         except FileFormatError as error:

@@ -33,10 +33,10 @@ from advsearch.scene.importing.parts import (
     ImportedSurface,
     IndexedValues,
     group_faces,
-    split_at_corners,
+    make_part_from_corners,
 )
 from advsearch.scene.importing.pictures import FileImages
-from advsearch.trust.named_files import References
+from advsearch.trust.named_files import ReferencedFiles
 
 Numbers = npt.NDArray[np.generic]
 _TYPES = {
@@ -79,7 +79,7 @@ class Element:
     name: str
     count: int  # number of its rows
     # Types of properties; for a list, the type of its values.
-    types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
+    type_by_property: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
     # Types of the counts of lists.
     count_types: dict[str, np.dtype[np.generic]] = field(default_factory=dict)
     # Values (N,) of properties with one in each row.
@@ -164,14 +164,14 @@ def _parse_header(
                 element
                 and count_kind in _TYPES
                 and kind in _TYPES
-                and name not in element.types
+                and name not in element.type_by_property
             ):
-                element.types[name] = _make_dtype(kind, byte_order)
+                element.type_by_property[name] = _make_dtype(kind, byte_order)
                 element.count_types[name] = _make_dtype(count_kind, byte_order)
             case ["property", kind, name] if (
-                element and kind in _TYPES and name not in element.types
+                element and kind in _TYPES and name not in element.type_by_property
             ):
-                element.types[name] = _make_dtype(kind, byte_order)
+                element.type_by_property[name] = _make_dtype(kind, byte_order)
             case []:
                 pass
             case _:
@@ -221,7 +221,7 @@ class _RowReader:
         """Make the views of the bytes, and find the sizes of scalars and counts."""
         element = self.element
         self.values = {
-            name: self._view_from_any_byte(kind) for name, kind in element.types.items()
+            name: self._view_from_any_byte(kind) for name, kind in element.type_by_property.items()
         }
         self.counts = {
             name: self._view_from_any_byte(kind)
@@ -470,24 +470,24 @@ def _make_parts(
     triangles, polygon = triangulate_and_note(points[corners], corner_counts, notes)
     position = IndexedValues(points, corners[triangles])
     normals = reader.read_columns("vertex", (("nx", "ny", "nz"),))
-    normal = None if normals is None else IndexedValues(normals, position.rows)
+    normal = None if normals is None else IndexedValues(normals, position.row_of_corner)
     uvs = reader.read_uvs(corners, corner_counts, triangles)
     polygon_textures = reader.read_texture_indices(
         texture_names, corners, corner_counts
     )
     texture = polygon_textures[polygon]
-    colors = reader.read_colors(position.rows, polygon)
+    colors = reader.read_colors(position.row_of_corner, polygon)
     surfaces = reader.make_surfaces(texture_names, has_no_colors=colors is None)
     # The last one is for faces without texture, whose index is -1.
     surfaces.append(ImportedSurface())
     parts = list[ImportedPart]()
     has_uvs = np.zeros(len(triangles), np.bool_)
     if uvs is not None:
-        has_uvs = np.asarray((uvs.rows >= 0).all(axis=1))
+        has_uvs = np.asarray((uvs.row_of_corner >= 0).all(axis=1))
     for group in group_faces(texture, has_uvs):
         surface = surfaces[texture[group[0]]]
         surface, tint = _combine_colors(surface, colors, group, notes)
-        parts.append(split_at_corners(group, position, normal, uvs, tint, surface))
+        parts.append(make_part_from_corners(group, position, normal, uvs, tint, surface))
     return parts
 
 
@@ -512,7 +512,7 @@ class _Properties:
         """Record all properties, so that those that are never read are noted."""
         for element in self.elements.values():
             if element.name in ("vertex", "face", "tristrips"):
-                for name in element.types:
+                for name in element.type_by_property:
                     self.notes.record(f"{element.name} property", name)
             elif element.count:
                 self.notes.record("element", element.name)
@@ -751,7 +751,7 @@ class _Properties:
         # The three channels are assumed to have the same type.
         scalars = self.elements[element].scalars
         red_name, _, _ = self._find_group(element, scalars, COLOR_NAMES)
-        color_type = self.elements[element].types[red_name]
+        color_type = self.elements[element].type_by_property[red_name]
         # Alphas have the scale of the colors, which is known here.
         self._mark_opaque_alphas(element, color_type)
         full_brightness = _find_scale(values, color_type)
@@ -838,7 +838,7 @@ class _Properties:
             names: names of the texture files.
             has_no_colors: whether the file has no colors that could replace a texture.
         """
-        references = References(Path(self.notes.path))
+        references = ReferencedFiles(Path(self.notes.path))
         # Each texture is the surface of one material.
         pictures = FileImages(
             materials=len(names), references=references, notes=self.notes

@@ -65,5 +65,5 @@ def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
     converter = _CONVERTERS.get(path.suffix.lower().removeprefix("."))
     if converter is None:
         return data
-    convert: Callable[[Path, bytes], bytes] = load_attribute(converter.target)
+    convert: Callable[[Path, bytes], bytes] = load_attribute(converter.import_path)
     return convert(path, data)

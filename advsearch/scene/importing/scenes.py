@@ -39,9 +39,9 @@ from advsearch.scene.importing.gltf_entries import (
     Header,
     LightEntry,
 )
-from advsearch.scene.importing.gltf_skeleton import iterate_poses
-from advsearch.scene.importing.objects import find_front, make_object, read_parts
-from advsearch.scene.importing.parts import ImportedPart, select_visible
+from advsearch.scene.importing.gltf_skeleton import iterate_node_poses
+from advsearch.scene.importing.objects import find_front_axis, make_object, read_parts
+from advsearch.scene.importing.parts import ImportedPart, select_visible_parts
 from advsearch.scene.importing.readers import (
     GLTF_SUFFIXES,
     list_suffixes,
@@ -84,7 +84,7 @@ class ImportedScene:
     cameras: Mapping[str, PosedCamera] = field(default_factory=dict)  # cameras by name
 
 
-def split_node(spec: str) -> tuple[str, str | None]:
+def split_node_argument(spec: str) -> tuple[str, str | None]:
     """Split ``scene.glb#chair`` into the file and the node, None if none is named."""
     suffixes = "|".join(map(re.escape, (*GLTF_SUFFIXES, MITSUBA_SUFFIX)))
     match = re.fullmatch(rf"(.+({suffixes}))#(.*)", spec, re.IGNORECASE | re.DOTALL)
@@ -118,14 +118,14 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     data = read_mesh_bytes(path, "scene", GLTF_SUFFIXES)
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
-    node_poses = dict(iterate_poses(header))
+    node_poses = dict(iterate_node_poses(header))
     # The named node with its descendants is the object; the rest surrounds it.
     object_nodes = header.find_descendants([_find_node(path, header, parts, node)])
     object_parts = [part for part in parts if part.node in object_nodes]
     lights = _find_node_lights(header, node_poses)
     n_other_meshes = len({part.node for part in parts} - object_nodes)
     _check_surroundings(path, n_other_meshes + len(lights))
-    front = find_front(path, header)
+    front = find_front_axis(path, header)
     # y is up in glTF. Surroundings are converted to the object's frame.
     frame = _compute_frame(object_parts, compute_rotation("y", front.axis))
     names = UniqueNames(RESERVED_NAMES)
@@ -220,7 +220,7 @@ def _make_lamps(
     """
     lamps: list[ScenePart] = []
     for index, light in lights.items():
-        name = names.make_unique(light.name or header.get_label(index))
+        name = names.make_unique(light.name or header.get_node_label(index))
         pose = node_poses[index]
         lamps.append(_make_lamp(path, name, light, candela_per_unit, pose, frame))
     return lamps
@@ -243,8 +243,8 @@ def _find_node(
         UnknownNameError: no candidate has the name.
         InputError: several candidates have the name.
     """
-    candidates = sorted(with_ancestors(header.parents, {part.node for part in parts}))
-    labels = {index: header.get_label(index) for index in candidates}
+    candidates = sorted(with_ancestors(header.parent_of_node, {part.node for part in parts}))
+    labels = {index: header.get_node_label(index) for index in candidates}
     matches = [
         index for index, label in labels.items() if name in (label, f"node {index}")
     ]
@@ -313,8 +313,8 @@ def list_node_names(path: Path) -> list[str]:
     with_mesh = {
         index for index, node in enumerate(header.nodes) if node.mesh is not None
     }
-    candidates = sorted(with_ancestors(header.parents, with_mesh))
-    return list(dict.fromkeys(map(header.get_label, candidates)))
+    candidates = sorted(with_ancestors(header.parent_of_node, with_mesh))
+    return list(dict.fromkeys(map(header.get_node_label, candidates)))
 
 
 def _make_mesh_names(
@@ -322,7 +322,7 @@ def _make_mesh_names(
 ) -> dict[int, str]:
     """Return a unique name for each node with parts, by the node's index."""
     nodes = sorted({part.node for part in parts})
-    return {node: names.make_unique(header.get_label(node)) for node in nodes}
+    return {node: names.make_unique(header.get_node_label(node)) for node in nodes}
 
 
 def _make_camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
@@ -332,7 +332,7 @@ def _make_camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
     for index in sorted(nodes):
         camera = header.nodes[index].camera
         if camera is not None and header.cameras[camera].perspective is not None:
-            label = header.cameras[camera].name or header.get_label(index)
+            label = header.cameras[camera].name or header.get_node_label(index)
             name_of_node[index] = names.make_unique(label)
     return name_of_node
 
@@ -349,7 +349,7 @@ class NodeContents:
 
 
 @dataclass(frozen=True, eq=False)
-class Contents:
+class FileContents:
     """The contents of a file that can be imported."""
 
     object: ObjectAsset  # all geometry of the file, as one object
@@ -368,7 +368,7 @@ def _group_by_node(parts: Iterable[ImportedPart]) -> dict[int, list[ImportedPart
 
 # Values out of range are rejected later, not reported by NumPy's warnings.
 @np.errstate(all="ignore")
-def list_contents(path: Path) -> Contents:
+def read_file_contents(path: Path) -> FileContents:
     """Return the contents of a mesh or glTF file that can be imported.
 
     The contents of Mitsuba's files are read by `scene_files.read_contents`.
@@ -382,26 +382,26 @@ def list_contents(path: Path) -> Contents:
     parts, notes = read_parts(path, data)
     name = make_safe_name(path)
     if path.suffix.lower() not in GLTF_SUFFIXES:
-        front = find_front(path, header=None)
+        front = find_front_axis(path, header=None)
         # The axis that points up is guessed from the shape.
         asset = make_object(parts, notes, file=path, name=name, up=None, front=front)
-        return Contents(asset)
+        return FileContents(asset)
     header = gltf.read_header(path, data)
     notes += gltf_parts.describe_changed_lights(header, path.name)
     asset = make_object(
-        parts, notes, file=path, name=name, up="y", front=find_front(path, header)
+        parts, notes, file=path, name=name, up="y", front=find_front_axis(path, header)
     )
     parts_of_node = _group_by_node(parts)
     mesh_names = _make_mesh_names(header, parts, UniqueNames(RESERVED_NAMES))
     nodes = [
-        _measure_node(header.get_label(index), mesh_names[index], parts_of_node[index])
+        _measure_node(header.get_node_label(index), mesh_names[index], parts_of_node[index])
         for index in sorted(parts_of_node)
     ]
     lights = tuple(
         light.name or f"light {index}" for index, light in enumerate(header.lights)
     )
-    cameras = tuple(_make_camera_names(header, dict(iterate_poses(header))).values())
-    return Contents(asset, tuple(nodes), lights, cameras)
+    cameras = tuple(_make_camera_names(header, dict(iterate_node_poses(header))).values())
+    return FileContents(asset, tuple(nodes), lights, cameras)
 
 
 def _measure_node(
@@ -444,7 +444,7 @@ def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFra
         turn: rotation (3, 3) from the file's axes to ours.
     """
     face_corners = []
-    for part in select_visible(parts):
+    for part in select_visible_parts(parts):
         triangles = part.vertices[part.faces]
         doubled_area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Float32Array, Float64Array
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import Notes, decode_text, find_kind
+from advsearch.scene.importing.files import Notes, decode_text, detect_file_kind
 from advsearch.scene.importing.parts import NEUTRAL_GREY, ImportedPart, ImportedSurface
 
 Attributes = npt.NDArray[np.uint16]
@@ -57,7 +57,7 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _parse_text(data, notes)
     else:
-        got = find_kind(data)
+        got = detect_file_kind(data)
         if got is None:
             got = f"{len(data)} bytes, which is neither ASCII nor that long"
         raise notes.damaged(

@@ -81,7 +81,7 @@ def _list_used_surfaces(
 ) -> list[ImportedSurface]:
     """Return the distinct surfaces of parts that have faces."""
     used_by_id = {
-        id(surfaces[part]): surfaces[part] for part in np.unique(soup.part_ids)
+        id(surfaces[part]): surfaces[part] for part in np.unique(soup.part_of_face)
     }
     return list(used_by_id.values())
 
@@ -185,7 +185,7 @@ def index_materials(
     names = list(dict.fromkeys(surface.name for surface in surfaces))
     index_of_name = {name: index for index, name in enumerate(names)}
     index_of_part = np.array([index_of_name[surface.name] for surface in surfaces])
-    return names, index_of_part[soup.part_ids]
+    return names, index_of_part[soup.part_of_face]
 
 
 def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
@@ -336,7 +336,7 @@ def _is_usable(soup: TriangleSoup, uvs: Float64Array) -> bool:
     ):
         return False
     uv_area = np.abs(compute_doubled_areas(uvs)) / 2.0
-    surface_area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
+    surface_area = np.linalg.norm(soup.compute_area_vectors(), axis=1)
     squashed_area = surface_area[uv_area < _MIN_FACE_UV_AREA].sum()
     return bool(
         squashed_area <= _MAX_SQUASHED * surface_area.sum()
@@ -513,7 +513,7 @@ def bake(
     # (T, 3) factor of the base color at each texel
     factor = np.einsum("tk,tkc->tc", texels.weights, soup.colors[texels.face])
     # the texels of each part, up to the last one that has any
-    texels_of_part = group_indices(soup.part_ids[texels.face])
+    texels_of_part = group_indices(soup.part_of_face[texels.face])
     for surface, index in zip(surfaces, texels_of_part, strict=False):
         if not len(index):
             continue
@@ -649,8 +649,8 @@ def _sample_base_color(
     color = _get_plain_color(surface)
     if surface.texture is not None:
         shows_texture = [other.texture is surface.texture for other in surfaces]
-        is_selected = np.array(shows_texture)[soup.part_ids]
-        areas = np.linalg.norm(soup.compute_face_vectors(), axis=1)[is_selected]
+        is_selected = np.array(shows_texture)[soup.part_of_face]
+        areas = np.linalg.norm(soup.compute_area_vectors(), axis=1)[is_selected]
         mean = average_over_faces(
             _to_linear(surface.texture), soup.uvs[is_selected], areas
         )
@@ -666,7 +666,7 @@ def _count_texels(soup: TriangleSoup, surfaces: Sequence[ImportedSurface]) -> fl
     """
     n_texels = 0.0
     uv_areas = np.nan_to_num(np.abs(compute_doubled_areas(soup.uvs)) / 2.0)
-    for part, area in enumerate(np.bincount(soup.part_ids, uv_areas)):
+    for part, area in enumerate(np.bincount(soup.part_of_face, uv_areas)):
         sizes = (image.shape[0] * image.shape[1] for image in surfaces[part].images)
         n_texels += float(area) * max(sizes, default=0)
     return n_texels
@@ -824,7 +824,7 @@ def _unmirror(
     soup = replace(soup, uvs=uvs)
     normals = maps.normals
     is_mirrored = compute_doubled_areas(uvs) < 0.0
-    area = np.linalg.norm(soup.compute_face_vectors(), axis=1)
+    area = np.linalg.norm(soup.compute_area_vectors(), axis=1)
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
     if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps

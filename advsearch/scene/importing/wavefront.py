@@ -45,9 +45,9 @@ from advsearch.scene.importing.parts import (
     ImportedSurface,
     IndexedValues,
     group_faces,
-    split_at_corners,
+    make_part_from_corners,
 )
-from advsearch.trust.named_files import References
+from advsearch.trust.named_files import ReferencedFiles
 
 # Statements that only name groups of faces; all groups are joined.
 GROUPING = frozenset(("g", "o"))
@@ -108,7 +108,7 @@ def _transform_uvs(
     """
     corner = mtl_surfaces.get_square_corner(square)
     uvs = (uv.values - corner) * mtl_surface.scale + mtl_surface.offset
-    return IndexedValues(uvs, uv.rows)
+    return IndexedValues(uvs, uv.row_of_corner)
 
 
 def _note_repetition(uvs: Float64Array, notes: Notes) -> None:
@@ -130,8 +130,8 @@ class _Triangles:
         normal: normals of their corners.
         colors: (T, 3, 3) linear colors of their corners, None if the file has none.
         material_names: names of the materials.
-        material: (T,) index of the material; -1 before the first ``usemtl``.
-        square: (T,) UDIM square; 0 if the material has one image for all squares.
+        material_index: (T,) index of the material; -1 before the first ``usemtl``.
+        udim_square: (T,) UDIM square; 0 if the material has one image for all squares.
         is_flat: (T,) whether smoothing is off.
         has_uvs: (T,) whether all corners have texture coordinates.
     """
@@ -141,8 +141,8 @@ class _Triangles:
     normal: IndexedValues
     colors: Float64Array | None
     material_names: Sequence[str]
-    material: IntArray
-    square: IntArray
+    material_index: IntArray
+    udim_square: IntArray
     is_flat: BoolArray
     has_uvs: BoolArray
 
@@ -154,10 +154,10 @@ class _Triangles:
         Triangles of another UDIM square, and those without UVs, are left out.
         """
         material = self.material_names.index(material_name)
-        is_selected = (self.material == material) & (self.square == square)
-        is_selected = is_selected & (self.uv.rows >= 0).all(axis=1)
-        uvs = self.uv.values[self.uv.rows[is_selected]]
-        points = self.position.values[self.position.rows[is_selected]]
+        is_selected = (self.material_index == material) & (self.udim_square == square)
+        is_selected = is_selected & (self.uv.row_of_corner >= 0).all(axis=1)
+        uvs = self.uv.values[self.uv.row_of_corner[is_selected]]
+        points = self.position.values[self.position.row_of_corner[is_selected]]
         return uvs, np.linalg.norm(compute_area_vectors(points), axis=1)
 
 
@@ -197,14 +197,14 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         """
         return triangles.measure_mapped_faces(name, square)
 
-    reader = MtlReader(References(path), notes, find_mapped_faces)
+    reader = MtlReader(ReferencedFiles(path), notes, find_mapped_faces)
     _read_libraries(reader, statements.library_lines, notes)
     triangles = _make_triangles(lines, tables, faces, statements, reader)
     names_libraries = bool(statements.library_lines)
     return [
         _make_part(triangles, group, reader, names_libraries)
         for group in group_faces(
-            triangles.material, triangles.has_uvs, triangles.is_flat, triangles.square
+            triangles.material_index, triangles.has_uvs, triangles.is_flat, triangles.udim_square
         )
     ]
 
@@ -239,12 +239,12 @@ def _make_triangles(
         position=position,
         uv=uv,
         normal=normal,
-        colors=None if vertex_colors is None else vertex_colors[position.rows],
+        colors=None if vertex_colors is None else vertex_colors[position.row_of_corner],
         material_names=names,
-        material=material,
-        square=_find_squares(reader, names, material, uv),
+        material_index=material,
+        udim_square=_find_squares(reader, names, material, uv),
         is_flat=is_flat,
-        has_uvs=np.asarray((uv.rows >= 0).all(axis=1)),
+        has_uvs=np.asarray((uv.row_of_corner >= 0).all(axis=1)),
     )
 
 
@@ -262,9 +262,9 @@ def _make_part(
     """
     first = group[0]  # all triangles of the group have the same properties
     name = ""
-    if triangles.material[first] >= 0:
-        name = triangles.material_names[triangles.material[first]]
-    square = int(triangles.square[first])
+    if triangles.material_index[first] >= 0:
+        name = triangles.material_names[triangles.material_index[first]]
+    square = int(triangles.udim_square[first])
     has_colors = triangles.colors is not None
     mtl_surface = _find_material(reader, name, square, has_colors, names_libraries)
     surface, corner_colors = _combine_colors(
@@ -272,8 +272,8 @@ def _make_part(
     )
     uv = _transform_uvs(triangles.uv, square, mtl_surface)
     if mtl_surface.is_clamped and triangles.has_uvs[first]:
-        _note_repetition(uv.values[uv.rows[group]], reader.notes)
-    return split_at_corners(
+        _note_repetition(uv.values[uv.row_of_corner[group]], reader.notes)
+    return make_part_from_corners(
         group,
         points=triangles.position,
         normals=triangles.normal,
@@ -321,7 +321,7 @@ def _find_flat_faces(
     is_off_by_group = [value in NOT_SMOOTH for value in values]
     # Triangles before the first statement have the group -1, which is the last entry.
     is_off = np.array([*is_off_by_group, False])[group]
-    lacks_normals = (normal.rows < 0).any(axis=1)
+    lacks_normals = (normal.row_of_corner < 0).any(axis=1)
     if ((group >= 0) & ~is_off & lacks_normals).any():
         notes.warn(
             "smoothing groups are left out: its normals are computed, with creases at "
@@ -345,10 +345,10 @@ def _find_squares(
         uv: the texture coordinates of the triangles.
     """
     square = np.zeros(len(material), np.int64)
-    has_uvs = (uv.rows >= 0).all(axis=1)
+    has_uvs = (uv.row_of_corner >= 0).all(axis=1)
     for material_index in np.unique(material[has_uvs & (material >= 0)]):
         faces = np.flatnonzero(has_uvs & (material == material_index))
-        face_squares = mtl_surfaces.compute_squares(uv.values[uv.rows[faces]])
+        face_squares = mtl_surfaces.compute_squares(uv.values[uv.row_of_corner[faces]])
         candidates = np.unique(face_squares).tolist()
         squares_with_image = reader.find_squares(names[material_index], candidates)
         square[faces] = np.where(
@@ -563,10 +563,10 @@ class ObjLines:
 
     Attributes:
         text: the file, as `_normalize_lines` returns it.
-        bytes: the same as an array.
-        starts: (L,) index of the first byte of each line.
-        ends: (L,) index of the line break of each line.
-        kind: (L,) index into `KINDS` of each line, or `OTHER_KIND`.
+        text_bytes: the same as an array.
+        line_starts: (L,) index of the first byte of each line.
+        line_ends: (L,) index of the line break of each line.
+        kind_of_line: (L,) index into `KINDS` of each line, or `OTHER_KIND`.
         is_unended: whether the last line of the file has no line break.
     """
 
@@ -590,17 +590,17 @@ class ObjLines:
         self.text = text
         # A file without a last line break may be cut short; `_check_sizes` uses this.
         self.is_unended = not data.endswith((b"\n", b"\r"))
-        self.bytes = np.frombuffer(text, dtype=np.uint8)
+        self.text_bytes = np.frombuffer(text, dtype=np.uint8)
         # The normalized text ends in a line break, so that every line has an end.
-        self.ends = np.flatnonzero(self.bytes == _NEWLINE)
-        self.starts = np.concatenate([[0], self.ends[:-1] + 1])
+        self.line_ends = np.flatnonzero(self.text_bytes == _NEWLINE)
+        self.line_starts = np.concatenate([[0], self.line_ends[:-1] + 1])
         # a last line may be shorter than three bytes
-        padded = np.concatenate([self.bytes, np.full(3, _NEWLINE, np.uint8)])
+        padded = np.concatenate([self.text_bytes, np.full(3, _NEWLINE, np.uint8)])
         first_byte, second_byte, third_byte = (
-            padded[self.starts + offset] for offset in range(3)
+            padded[self.line_starts + offset] for offset in range(3)
         )
         # A keyword has one or two letters, and a blank after it.
-        self.kind = np.full(len(self.starts), OTHER_KIND, dtype=np.int8)
+        self.kind_of_line = np.full(len(self.line_starts), OTHER_KIND, dtype=np.int8)
         for index, kind in enumerate(KINDS):
             if len(kind) == 2:
                 matches = (first_byte == ord(kind[0])) & (second_byte == ord(kind[1]))
@@ -608,19 +608,19 @@ class ObjLines:
             else:
                 matches = first_byte == ord(kind[0])
                 after_keyword = second_byte
-            self.kind[matches & _IS_BLANK[after_keyword]] = index
+            self.kind_of_line[matches & _IS_BLANK[after_keyword]] = index
 
     def iterate_others(self) -> Iterator[tuple[int, str, str]]:
         """Yield the row, keyword and argument of each line that is not in `KINDS`.
 
         Empty lines and comments are left out.
         """
-        first_byte = self.bytes[self.starts]
+        first_byte = self.text_bytes[self.line_starts]
         is_empty = first_byte == _NEWLINE
         is_comment = first_byte == _HASH
-        is_other = (self.kind == OTHER_KIND) & ~is_empty & ~is_comment
+        is_other = (self.kind_of_line == OTHER_KIND) & ~is_empty & ~is_comment
         for row in np.flatnonzero(is_other):
-            line = decode_text(self.text[self.starts[row] : self.ends[row]])
+            line = decode_text(self.text[self.line_starts[row] : self.line_ends[row]])
             keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
             yield int(row), keyword, rest.strip()
 
@@ -724,7 +724,7 @@ class ObjLines:
             rows: (P,) row of each face's line.
             sizes: (P,) number of corners of each face.
         """
-        is_last_line = rows[-1] == len(self.starts) - 1
+        is_last_line = rows[-1] == len(self.line_starts) - 1
         if sizes[-1] < 3 and self.is_unended and is_last_line:
             ((line_number, words),) = self._iterate_words(rows[-1:])
             got = f"{format_name(' '.join(['f', *words]))} (is the file cut short?)"
@@ -755,7 +755,7 @@ class ObjLines:
             return
         # For each corner, the number of rows of the table above its line. (The sum has
         # the line itself, which is a face and no row of a table.)
-        count_before_line = np.cumsum(self.kind == KINDS.index(kind))
+        count_before_line = np.cumsum(self.kind_of_line == KINDS.index(kind))
         count_before = np.repeat(count_before_line[rows], sizes)
         if (index < -count_before).any():
             self._raise_for_faces(rows)
@@ -788,12 +788,12 @@ class ObjLines:
         Args:
             kind: keyword, one of `KINDS`.
         """
-        is_selected = self.kind == KINDS.index(kind)
+        is_selected = self.kind_of_line == KINDS.index(kind)
         # Lengths include line breaks, so that they add up to the length of the text.
-        lengths = self.ends - self.starts + 1
+        lengths = self.line_ends - self.line_starts + 1
         rows = np.flatnonzero(is_selected)
         is_selected_byte = np.repeat(is_selected, lengths)
-        line_bytes = self.bytes[is_selected_byte]
+        line_bytes = self.text_bytes[is_selected_byte]
         # index of the first byte of each selected line in `line_bytes`
         selected_lengths = lengths[rows]
         starts = np.cumsum(selected_lengths) - selected_lengths
@@ -808,7 +808,7 @@ class ObjLines:
     def _iterate_words(self, rows: IntArray) -> Iterator[tuple[int, list[str]]]:
         """Yield the number (from 1) and the arguments of the lines in these rows."""
         for row in rows:
-            line = decode_text(self.text[self.starts[row] : self.ends[row]])
+            line = decode_text(self.text[self.line_starts[row] : self.line_ends[row]])
             yield int(row) + 1, line.partition("#")[0].split()[1:]
 
     def _raise_for_faces(self, rows: IntArray) -> NoReturn:
@@ -819,7 +819,7 @@ class ObjLines:
         `read_faces`.
         """
         counts_before_line = np.stack(
-            [np.cumsum(self.kind == KINDS.index(kind)) for kind in TABLES], axis=1
+            [np.cumsum(self.kind_of_line == KINDS.index(kind)) for kind in TABLES], axis=1
         )
         for line_number, words in self._iterate_words(rows):
             row = line_number - 1

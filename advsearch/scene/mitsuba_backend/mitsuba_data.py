@@ -91,7 +91,7 @@ def _find_numbers(
     input_of_key = {
         key: name
         for name, (key, scene_input) in scene.declared_inputs.items()
-        if scene_input.write in (to_flat_array, to_color)
+        if scene_input.convert_to_mitsuba in (to_flat_array, to_color)
     }
     numbers: dict[str, PluginNumber] = {}
     other_types: dict[str, str] = {}

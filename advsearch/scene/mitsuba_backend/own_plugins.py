@@ -1053,7 +1053,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
         # "reach" is the largest angle to the axis at which the lens has rays
         self._model = CameraModel(
-            str(props["kind"]), values, max_angle=float(props["reach"])
+            str(props["kind"]), values, max_angle_degrees=float(props["reach"])
         )
         self._near = float(props["near_clip"])
         self._far = float(props["far_clip"])
@@ -1228,7 +1228,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         y = torch.linspace(0.0, 1.0, n_rows + 1, dtype=torch.float64)
         positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         with torch.no_grad():
-            model = self._model.with_numbers(self.lens.torch().cpu())
+            model = self._model.with_intrinsics(self.lens.torch().cpu())
             table = model.make_ray_table(positions.reshape(-1, 2))
         self.rays = mi.Float(table.reshape(-1).contiguous())
         dr.eval(self.rays)

@@ -27,7 +27,7 @@ from advsearch.scene.mitsuba_backend.variant import (
     Plugin,
     dr,
     mi,
-    population,
+    scene_registry,
     suppress_warnings,
 )
 
@@ -100,13 +100,13 @@ class SceneInput:
     key: str
     # function that converts the tensor to Mitsuba's type; None if Mitsuba takes a
     # tensor, as for textures and grids
-    write: Write | None = None
+    convert_to_mitsuba: Write | None = None
     # whether the interior adjoint (`prb`) differentiates it correctly
-    is_interior: bool = False
+    has_interior_adjoint: bool = False
     # shape of the tensor; None takes it from Mitsuba's own value
     shape: tuple[int, ...] | None = None
     # Mitsuba's object that has the parameter, if several may match `key`
-    owner: Any = None
+    parameter_owner: Any = None
     # range of values that are rendered; a value outside is clamped to it, and keeps its
     # derivative
     rendered_range: tuple[float, float] | None = None
@@ -139,7 +139,7 @@ def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
             for key in parameters.keys()
             if key.startswith(prefix) and key.endswith(suffix)
         ]
-    owner = scene_input.owner
+    owner = scene_input.parameter_owner
     if owner is not None:
         # Mitsuba's properties of a parameter: the third is the object that has it.
         keys = [key for key in keys if parameters.properties[key][2] is owner]
@@ -161,7 +161,7 @@ IDLE_LOBES: Plugin = {
 
 
 @dataclass(frozen=True)
-class Translation:
+class TranslatedPart:
     """A part of a scene inside Mitsuba."""
 
     # entries of the scene's dictionary by name; one that the scene has already
@@ -171,11 +171,11 @@ class Translation:
     inputs: tuple[SceneInput, ...] = ()
     # entries that replace those of the path integrator's dictionary; a medium needs
     # another type
-    integrator: Plugin = field(default_factory=dict)
+    integrator_entries: Plugin = field(default_factory=dict)
 
 
 @singledispatch
-def translate_part(part: parts.ScenePart) -> Translation:
+def translate_part(part: parts.ScenePart) -> TranslatedPart:
     """Return the plugins and inputs of a part in Mitsuba.
 
     Each kind of part registers a function of its own, by `@translate_part.register`,
@@ -188,7 +188,7 @@ def translate_part(part: parts.ScenePart) -> Translation:
 
 
 @translate_part.register
-def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
+def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> TranslatedPart:
     """Return the shape of a mesh in Mitsuba, and its inputs.
 
     Args:
@@ -213,7 +213,7 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
     if meshes.has_textured_emission(part):
         inputs.append(
             SceneInput(
-                f"{name}.radiance", f"{name}.emitter.radiance.data", is_interior=True
+                f"{name}.radiance", f"{name}.emitter.radiance.data", has_interior_adjoint=True
             )
         )
     elif part.emission is not None:
@@ -221,7 +221,7 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
     mesh = meshes.make_mitsuba_mesh(
         name, part.mesh, part.to_world, surface, meshes.make_emitter(part)
     )
-    return Translation({name: mesh}, tuple(inputs))
+    return TranslatedPart({name: mesh}, tuple(inputs))
 
 
 def _load_user_surface(
@@ -248,8 +248,8 @@ def _load_user_surface(
             SceneInput(
                 f"{part.name}.base_color",
                 f"{part.name}.*.data",
-                is_interior=True,
-                owner=texture,
+                has_interior_adjoint=True,
+                parameter_owner=texture,
             )
         )
         return texture
@@ -269,14 +269,14 @@ def _make_principled_inputs(name: str) -> list[SceneInput]:
     base_color = SceneInput(
         name=f"{name}.base_color",
         key=f"{name}.*.base_color.data",
-        is_interior=True,
+        has_interior_adjoint=True,
     )
     numbers = [
         SceneInput(
             f"{name}.{parameter}",
             f"{name}.*.{key}",
-            write=to_flat_array,
-            is_interior=True,
+            convert_to_mitsuba=to_flat_array,
+            has_interior_adjoint=True,
             shape=(1,),
             rendered_range=meshes.RENDERED_RANGES.get(parameter),
         )
@@ -297,8 +297,8 @@ def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:
     return SceneInput(
         f"{name}.{parameter}",
         f"{name}.{key}.value",
-        write=to_color,
-        is_interior=True,
+        convert_to_mitsuba=to_color,
+        has_interior_adjoint=True,
         shape=(3,),
     )
 
@@ -314,21 +314,21 @@ def _make_pose_input(name: str, parameter: str) -> SceneInput:
     return SceneInput(
         name=f"{name}.{parameter}",
         key=f"{name}.to_world",
-        write=to_transform,
+        convert_to_mitsuba=to_transform,
         shape=(4, 4),
     )
 
 
 @translate_part.register
-def _translate_plugin(part: parts.PluginPart) -> Translation:
+def _translate_plugin(part: parts.PluginPart) -> TranslatedPart:
     """Return one of Mitsuba's plugins as it is, which has no inputs."""
     integrator = {"type": "prbvolpath"} if part.volumetric else {}
     plugins = {part.name: meshes.to_loadable(part.plugin)}
-    return Translation(plugins, integrator=integrator)
+    return TranslatedPart(plugins, integrator_entries=integrator)
 
 
 @translate_part.register
-def _translate_numbers(part: parts.PluginNumbers) -> Translation:
+def _translate_numbers(part: parts.PluginNumbers) -> TranslatedPart:
     """Return the inputs of numbers of Mitsuba's plugins, and no plugin.
 
     Some numbers belong to another part, such as "object.roughness", which has that
@@ -339,7 +339,7 @@ def _translate_numbers(part: parts.PluginNumbers) -> Translation:
         for plugin_number in part.numbers
         if plugin_number.input.startswith(f"{part.name}.")
     ]
-    return Translation(plugins={}, inputs=tuple(inputs))
+    return TranslatedPart(plugins={}, inputs=tuple(inputs))
 
 
 def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
@@ -370,14 +370,14 @@ def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
         plugin_number.key,
         write,
         # `valid` are the estimators that are valid for it.
-        is_interior="adjoint" in plugin_number.valid,
+        has_interior_adjoint="adjoint" in plugin_number.valid,
         shape=(len(plugin_number.values),),
         rendered_range=rendered_range,
     )
 
 
 @translate_part.register
-def _translate_point_lamp(part: parts.PointLamp) -> Translation:
+def _translate_point_lamp(part: parts.PointLamp) -> TranslatedPart:
     """Return a lamp that is a point."""
     name = part.name
     lamp = {
@@ -388,15 +388,15 @@ def _translate_point_lamp(part: parts.PointLamp) -> Translation:
     position = SceneInput(
         name=f"{name}.position",
         key=f"{name}.position",
-        write=to_point,
+        convert_to_mitsuba=to_point,
         shape=(3,),
     )
     intensity = _make_light_input(name, parameter="intensity", key="intensity")
-    return Translation({name: lamp}, (position, intensity))
+    return TranslatedPart({name: lamp}, (position, intensity))
 
 
 @translate_part.register
-def _translate_spot_lamp(part: parts.SpotLamp) -> Translation:
+def _translate_spot_lamp(part: parts.SpotLamp) -> TranslatedPart:
     """Return a lamp with a cone."""
     cutoff, beam = part.cone
     lamp = {
@@ -407,11 +407,11 @@ def _translate_spot_lamp(part: parts.SpotLamp) -> Translation:
         "beam_width": beam,
     }
     intensity = _make_light_input(part.name, parameter="intensity", key="intensity")
-    return Translation({part.name: lamp}, (intensity,))
+    return TranslatedPart({part.name: lamp}, (intensity,))
 
 
 @translate_part.register
-def _translate_ball_lamp(part: parts.BallLamp) -> Translation:
+def _translate_ball_lamp(part: parts.BallLamp) -> TranslatedPart:
     """Return a lamp that is a shining ball.
 
     It is a unit sphere under a pose that scales and moves it. It has no surface of its
@@ -429,11 +429,11 @@ def _translate_ball_lamp(part: parts.BallLamp) -> Translation:
         _make_pose_input(part.name, "ball"),
         _make_light_input(part.name, parameter="radiance", key="emitter.radiance"),
     )
-    return Translation({part.name: ball}, inputs)
+    return TranslatedPart({part.name: ball}, inputs)
 
 
 @translate_part.register
-def _translate_projector(part: parts.ProjectorPart) -> Translation:
+def _translate_projector(part: parts.ProjectorPart) -> TranslatedPart:
     """Return a projector.
 
     The irradiance that Mitsuba's projector gives at distance 1 is pi times its texture.
@@ -456,13 +456,13 @@ def _translate_projector(part: parts.ProjectorPart) -> Translation:
     pattern = SceneInput(
         name=f"{name}.pattern",
         key=f"{name}.irradiance.data",
-        is_interior=True,
+        has_interior_adjoint=True,
     )
-    return Translation({name: projector}, (_make_pose_input(name, "pose"), pattern))
+    return TranslatedPart({name: projector}, (_make_pose_input(name, "pose"), pattern))
 
 
 @translate_part.register
-def _translate_beam(part: parts.BeamLamp) -> Translation:
+def _translate_beam(part: parts.BeamLamp) -> TranslatedPart:
     """Return a headlamp's beam as a projector.
 
     The table has the intensity I of each direction. On a plane at distance 1, at an
@@ -487,11 +487,11 @@ def _translate_beam(part: parts.BeamLamp) -> Translation:
         "irradiance": {**meshes.make_texture(image), "wrap_mode": "clamp"},
         "sampling_weight": part.weight,
     }
-    return Translation({part.name: lamp}, (_make_pose_input(part.name, "to_world"),))
+    return TranslatedPart({part.name: lamp}, (_make_pose_input(part.name, "to_world"),))
 
 
 @translate_part.register
-def _translate_haze(part: parts.HazePart) -> Translation:
+def _translate_haze(part: parts.HazePart) -> TranslatedPart:
     """Return a haze.
 
     No shape refers to Mitsuba's medium. It only holds density and albedo, as parameters
@@ -505,27 +505,27 @@ def _translate_haze(part: parts.HazePart) -> Translation:
     )
     # Mitsuba does not release media. So the medium is held as long as its owner lives,
     # here the population itself: forever.
-    population.add(population, media=(medium,))
+    scene_registry.hold_objects(scene_registry, media=(medium,))
     inputs = (
         SceneInput(
             f"{name}.density",
             f"{name}.sigma_t.value.value",
-            write=to_flat_array,
-            is_interior=True,
+            convert_to_mitsuba=to_flat_array,
+            has_interior_adjoint=True,
             shape=(1,),
         ),
         SceneInput(
             f"{name}.albedo",
             f"{name}.albedo.value.value",
-            write=to_color,
-            is_interior=True,
+            convert_to_mitsuba=to_color,
+            has_interior_adjoint=True,
             shape=(3,),
         ),
     )
-    return Translation(
+    return TranslatedPart(
         plugins={name: medium},
         inputs=inputs,
-        integrator={
+        integrator_entries={
             "type": "advsearch_haze",
             "medium": medium,
             "radius": part.radius,
@@ -729,8 +729,8 @@ def _make_lens(description: SceneDescription) -> Plugin:
     camera: Plugin = {
         "type": "advsearch_camera",
         "kind": model.kind,
-        "reach": model.max_angle,  # largest angle to the axis
-        **model.values,
+        "reach": model.max_angle_degrees,  # largest angle to the axis
+        **model.intrinsic_by_name,
     }
     if drops > 0.0:
         camera |= {
@@ -744,7 +744,7 @@ def _make_lens(description: SceneDescription) -> Plugin:
             half_fov = math.radians(description.get_number("camera.fov")) / 2.0
             camera["drop_tangent"] = math.tan(half_fov)
         else:
-            camera["drop_tangent"] = max(model.visible_tangents)
+            camera["drop_tangent"] = max(model.inner_half_tangents)
     return camera
 
 
@@ -776,21 +776,21 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 
     camera_inputs = [
-        SceneInput(f"camera.{name}", f"camera.{key}", write=to_flat_array, shape=(1,))
+        SceneInput(f"camera.{name}", f"camera.{key}", convert_to_mitsuba=to_flat_array, shape=(1,))
         for name, key in CAMERA_KEYS.items()
     ]
     return (
         _make_pose_input("camera", "to_world"),
-        SceneInput("camera.fov", "camera.x_fov", write=to_horizontal_fov, shape=(1,)),
+        SceneInput("camera.fov", "camera.x_fov", convert_to_mitsuba=to_horizontal_fov, shape=(1,)),
         SceneInput("camera.lens", "camera.lens", shape=(len(NUMBER_NAMES),)),
         *camera_inputs,
         # (H, W + 2, 3): a copy of the last column before the first, and of the first
         # after the last
-        SceneInput("environment.padded", "environment.data", is_interior=True),
+        SceneInput("environment.padded", "environment.data", has_interior_adjoint=True),
         # pose of the plane that receives the shadow in a photograph
         _make_pose_input(GROUND_NAME, "to_world"),
         # (h, w, 3): colors of a ground that the map of the environment shows
         SceneInput(
-            "ground.reflectance", f"{GROUND_NAME}.*.reflectance.data", is_interior=True
+            "ground.reflectance", f"{GROUND_NAME}.*.reflectance.data", has_interior_adjoint=True
         ),
     )

@@ -353,7 +353,7 @@ def trace_paths(
     scene: Any,
     ray: Any,
     numbers: PathSamples,
-    changed: Sequence[Any],
+    changed_shapes: Sequence[Any],
     max_depth: int,
     roulette_depth: int,
 ) -> Any:
@@ -363,7 +363,7 @@ def trace_paths(
         scene: scene without media and cut-outs, whose emitters are not hidden.
         ray: camera rays.
         numbers: random numbers of the paths.
-        changed: shapes whose surfaces may have changed.
+        changed_shapes: shapes whose surfaces may have changed.
         max_depth: longest path in segments.
         roulette_depth: bounces from which on Russian roulette may end a path.
 
@@ -378,7 +378,7 @@ def trace_paths(
         si = scene.ray_intersect(path.ray, mi.RayFlags.All, is_coherent)
         bsdf = si.bsdf(path.ray)
         path.add_emission(scene, si)
-        path.meet(si, bsdf, changed)
+        path.meet(si, bsdf, changed_shapes)
         path.reflect(scene, si, bsdf, numbers, max_depth)
         path.survive(numbers, roulette_depth)
     return *path.list_channels(), path.has_met

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
-from advsearch.scene.assembly import Assembly
+from advsearch.scene.assembly import InputAssembler
 from advsearch.scene.backdrop import compute_plane_radiance
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import (
@@ -39,7 +39,7 @@ from advsearch.scene.mitsuba_backend.meshes import (
     to_repeating_uv,
 )
 from advsearch.scene.mitsuba_backend.transport import (
-    Paths,
+    TracedPaths,
     collect_paths,
     find_first_hits,
 )
@@ -49,7 +49,7 @@ from advsearch.scene.mitsuba_backend.variant import (
     dr,
     mi,
     mitsuba_lock,
-    population,
+    scene_registry,
 )
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_TYPE
 from advsearch.scene.parts import PATTERN_SUFFIX, Lamp, LampGlass, iterate_plugins
@@ -82,14 +82,14 @@ class MitsubaScene:
 
     Attributes:
         max_depth: longest light path in segments, as the argument.
-        depth: current longest light path; `limit_depth` makes it smaller for a time.
-        assembly: function that turns the inputs of a space into those of this scene.
-        definition: description of the scene, and name of the filter.
+        current_max_depth: current longest light path; `limit_depth` makes it smaller for a time.
+        input_assembler: function that turns the inputs of a space into those of this scene.
+        description_and_filter: description of the scene, and name of the filter.
         input_names: names of all inputs that can be set.
         parameters: Mitsuba's parameters of the scene, from `mi.traverse`.
         plane_radiance: (3,) radiance, without the object, of the plane that receives
             the shadow in a photograph; None if there is no plane.
-        integrator: Mitsuba's name of the path integrator of primal renders.
+        integrator_name: Mitsuba's name of the path integrator of primal renders.
         roulette_depth: bounces from which on Russian roulette may end a path there.
         declared_inputs: for each input its key in `parameters`, and its definition.
         interior_inputs: inputs that the interior adjoint differentiates correctly.
@@ -102,9 +102,9 @@ class MitsubaScene:
         leave_out: names from `advsearch.scene.formation.OMISSIONS`: work that is not
             needed. The default is all of it; less is only for measuring what it saves.
         max_depth: longest light path in segments.
-        sampler: Mitsuba's name of the sampler; some round sample counts up, see
+        sampler_name: Mitsuba's name of the sampler; some round sample counts up, see
             `round_sample_count`.
-        integrator: Mitsuba's name of the path integrator of primal renders without
+        integrator_name: Mitsuba's name of the path integrator of primal renders without
             media. None chooses `path` in scenes with roulette, and else `prb`.
     """
 
@@ -136,14 +136,14 @@ class MitsubaScene:
 
             # Free unused scenes before the new one is loaded: their objects have ids,
             # for which kernels are compiled, and which are used again then.
-            if population.unused:
-                population.free_unused()
-            self.definition = (description, filter)
+            if scene_registry.unused_keys:
+                scene_registry.free_unused()
+            self.description_and_filter = (description, filter)
             self.resolution = resolution
-            self.sampler = sampler
-            self.assembly = Assembly(description, resolution)
+            self.sampler_name = sampler
+            self.input_assembler = InputAssembler(description, resolution)
             self.max_depth = max_depth
-            self.depth = max_depth
+            self.current_max_depth = max_depth
             self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
             # "tracing" is the work that recordings save. Dr.Jit can record neither a
@@ -170,11 +170,11 @@ class MitsubaScene:
             self._integrators: dict[tuple[str, int], Any] = {}
             self._declare_inputs(inputs)
             # base values of inputs that were changed at least once
-            self._base: dict[str, Any] = {}
+            self._base_values: dict[str, Any] = {}
             # values of inputs that do not have their base value now
-            self._applied: dict[str, Tensor] = {}
+            self._applied_values: dict[str, Tensor] = {}
             self._recorded = Recordings()
-            population.add(
+            scene_registry.hold_objects(
                 self,
                 self._scene,
                 self._integrators,
@@ -191,7 +191,7 @@ class MitsubaScene:
 
     def _set_sampling_weights(self) -> None:
         """Set how often each mesh that emits light is sampled as a light."""
-        meshes = self.definition[0].meshes.values()
+        meshes = self.description_and_filter[0].meshes.values()
         for name, weight in compute_sampling_weights(meshes).items():
             self.parameters[f"{name}.emitter.sampling_weight"] = weight
         self.parameters.update()
@@ -203,11 +203,11 @@ class MitsubaScene:
         time than its noise costs. `integrator` is Mitsuba's type; None takes "path"
         there, and "prb" elsewhere.
         """
-        self.integrator = integrator or "prb"
+        self.integrator_name = integrator or "prb"
         self.roulette_depth = NO_ROULETTE_DEPTH
         self._gradient_roulette_depth = NO_ROULETTE_DEPTH
-        if is_enclosed(self.definition[0]):
-            self.integrator = integrator or "path"
+        if is_enclosed(self.description_and_filter[0]):
+            self.integrator_name = integrator or "path"
             self.roulette_depth = ROULETTE_DEPTH
             self._gradient_roulette_depth = GRADIENT_ROULETTE_DEPTH
 
@@ -217,9 +217,9 @@ class MitsubaScene:
         This also extends `_path_entries`, which every path integrator of the scene
         needs.
         """
-        description, filter_name = self.definition
+        description, filter_name = self.description_and_filter
         plugins = parts.make_scene_dict(
-            description, self.resolution, filter_name, self.sampler
+            description, self.resolution, filter_name, self.sampler_name
         )
         with parts.convert_refusals(description):
             # lobes of the principled plugin that have no effect, but take time
@@ -232,7 +232,7 @@ class MitsubaScene:
             ]
             for translation in translations:
                 plugins |= translation.plugins
-                self._path_entries |= translation.integrator
+                self._path_entries |= translation.integrator_entries
             # Lamps that are dark by default are not sampled as lights. If an input
             # switches one on, paths still find it when they meet it by chance.
             if "emitters" in self._leave_out:
@@ -261,7 +261,7 @@ class MitsubaScene:
         self.interior_inputs = frozenset(
             name
             for name, (_, scene_input) in self.declared_inputs.items()
-            if scene_input.is_interior
+            if scene_input.has_interior_adjoint
         )
         # Vertices and normals, which are written into the memory that they have.
         self._buffers = frozenset(
@@ -273,7 +273,7 @@ class MitsubaScene:
         self._constants = frozenset(
             name
             for name, (_, scene_input) in self.declared_inputs.items()
-            if scene_input.write is parts.to_constant
+            if scene_input.convert_to_mitsuba is parts.to_constant
         )
 
     def _find_media(self) -> tuple[Any, ...]:
@@ -289,11 +289,11 @@ class MitsubaScene:
         `changes` may have `max_depth`, `sampler`, `integrator` and `leave_out`. The
         integrator is chosen again if it is not among them.
         """
-        description, filter_name = self.definition
+        description, filter_name = self.description_and_filter
         arguments = {
             "max_depth": self.max_depth,
             "leave_out": self._leave_out,
-            "sampler": self.sampler,
+            "sampler": self.sampler_name,
             **changes,
         }
         other = MitsubaScene(
@@ -310,13 +310,13 @@ class MitsubaScene:
         """Limit light paths to `depth` segments inside the `with`, if it is not
         None.
         """
-        depth_before = self.depth
+        depth_before = self.current_max_depth
         if depth is not None:
-            self.depth = min(depth, self.max_depth)
+            self.current_max_depth = min(depth, self.max_depth)
         try:
             yield
         finally:
-            self.depth = depth_before
+            self.current_max_depth = depth_before
 
     @contextmanager
     def limit_window(self, window: Window | None) -> Iterator[None]:
@@ -361,7 +361,7 @@ class MitsubaScene:
 
         The scene's sampler is the default.
         """
-        return round_sample_count(sampler or self.sampler, samples)
+        return round_sample_count(sampler or self.sampler_name, samples)
 
     def get_base_value(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh tensor of the input's shape.
@@ -369,7 +369,7 @@ class MitsubaScene:
         All inputs of the scene are reset to their base values.
         """
         key, scene_input = self.declared_inputs[name]
-        self._set({})  # Mitsuba's parameter then has the base value
+        self._set_inputs_exactly({})  # Mitsuba's parameter then has the base value
         value = parts.to_torch(self.parameters[key])
         if scene_input.shape is None:
             return value
@@ -405,7 +405,7 @@ class MitsubaScene:
             - (H, W, 6) for "guides": the first hit's albedo in [0, 1], and its shading
               normal.
         """
-        INTERRUPTS.look()  # stops here if the user has interrupted the run
+        INTERRUPTS.raise_pending()  # stops here if the user has interrupted the run
         with mitsuba_lock, self._crop_film():
 
             def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
@@ -423,21 +423,21 @@ class MitsubaScene:
                 sensor.sampler().seed(0, 1)
                 return image
 
-            self._set(inputs)
-            if population.unused:
-                population.free_unused()
+            self._set_inputs_exactly(inputs)
+            if scene_registry.unused_keys:
+                scene_registry.free_unused()
             spp = self.round_sample_count(spp)
             # All are loaded before the first render: to load one makes the recordings
             # stale.
             integrators = [self._get_integrator(method) for method in seeds]
-            media = population.list_media() if self.is_volumetric else []
+            media = scene_registry.list_media() if self.is_volumetric else []
             images: list[Tensor] = []
             for (method, seed), integrator in zip(
                 seeds.items(), integrators, strict=True
             ):
                 function: Callable[..., Any] = render
                 if self._uses_recordings:
-                    key = (method, spp, self.depth, self.window)
+                    key = (method, spp, self.current_max_depth, self.window)
                     function = self._recorded.get_or_record(key, render, media)
                 # opaque: a literal seed would be a constant of the recorded kernel
                 drjit_image = function(
@@ -462,7 +462,7 @@ class MitsubaScene:
         It is recorded at the first call with a key, and replayed later.
         """
         if self._uses_recordings:
-            media = population.list_media() if self.is_volumetric else []
+            media = scene_registry.list_media() if self.is_volumetric else []
             function = self._recorded.get_or_record(key, function, media)
         return function(self._scene, self._sensor, *args)
 
@@ -497,7 +497,7 @@ class MitsubaScene:
     def set_inputs(self, inputs: Mapping[str, Tensor]) -> Any:
         """Set inputs and return Mitsuba's scene, which has them until the next call."""
         with mitsuba_lock:
-            self._set(inputs)
+            self._set_inputs_exactly(inputs)
             return self._scene
 
     def set_geometry(self, inputs: Mapping[str, Tensor]) -> None:
@@ -509,7 +509,7 @@ class MitsubaScene:
         # In both, buffers without an entry have their base values.
         requested = {name: inputs[name] for name in inputs if name in self._buffers}
         applied = {
-            name: self._applied[name] for name in self._applied if name in self._buffers
+            name: self._applied_values[name] for name in self._applied_values if name in self._buffers
         }
         is_set = requested.keys() == applied.keys() and all(
             torch.equal(requested[name].float(), applied[name]) for name in requested
@@ -530,20 +530,20 @@ class MitsubaScene:
                 are larger by this factor.
         """
         with mitsuba_lock:
-            self._set(inputs)
+            self._set_inputs_exactly(inputs)
             height, width = self.resolution
             hits = find_first_hits(
                 self._scene, self._sensor, (height * subdivision, width * subdivision)
             )
-            for part in self.definition[0].parts:
+            for part in self.description_and_filter[0].parts:
                 if isinstance(part, LampGlass):
                     # The glass of a lamp was cut out of another mesh, its carrier. A
                     # hit on it counts as a hit on that face of the carrier.
                     on_glass = hits.visible_mask(part.name)
                     carrier_face = torch.from_numpy(part.face_of_carrier)
-                    hits.face[on_glass] = carrier_face[hits.face[on_glass]]
+                    hits.face_index[on_glass] = carrier_face[hits.face_index[on_glass]]
                     # ids count from 1, and 0 is no surface
-                    hits.id[on_glass] = hits.names.index(part.carrier) + 1
+                    hits.id[on_glass] = hits.shape_names.index(part.carrier) + 1
             return hits
 
     def render_adjoint(
@@ -590,10 +590,10 @@ class MitsubaScene:
                 method = "boundary"
                 extra = extra | self._buffers
             # The integrator of images may be "path", which has no adjoint; "prb" has.
-            if method == "path" and self.integrator != "prb":
+            if method == "path" and self.integrator_name != "prb":
                 method = "adjoint"
             image_gradient = self._make_image_gradient(cotangent)
-            self._set(inputs)
+            self._set_inputs_exactly(inputs)
             names = (*sorted(extra - set(requested)), *requested)
             with self._tracked(names, inputs) as tracked, self._crop_film():
                 self._get_integrator(method).render_backward(
@@ -665,7 +665,7 @@ class MitsubaScene:
                 tracked[name] = tensor
                 # Mitsuba's parameter may have another type than a tensor.
                 self.parameters[key] = (
-                    scene_input.write(tensor) if scene_input.write else tensor
+                    scene_input.convert_to_mitsuba(tensor) if scene_input.convert_to_mitsuba else tensor
                 )
             self.parameters.update()
             # Mitsuba warns at every call if a film samples beyond its border.
@@ -709,9 +709,9 @@ class MitsubaScene:
                 material_adjoint,
             )
 
-            self._set(inputs)
+            self._set_inputs_exactly(inputs)
             # The first call loads integrators of its own, which makes recordings stale.
-            population.changes += 1
+            scene_registry.n_changes += 1
             buffers = ("vertices", "normals")
             moving = [f"{name}.{buffer}" for name in meshes for buffer in buffers]
             return material_adjoint(
@@ -722,7 +722,7 @@ class MitsubaScene:
                 cotangent=cotangent,
                 seed=seed,
                 spp=spp,
-                max_depth=self.depth,
+                max_depth=self.current_max_depth,
                 shadow_spp=SHADOW_SPP,
             )
 
@@ -736,7 +736,7 @@ class MitsubaScene:
 
     def collect_paths(
         self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int
-    ) -> Paths:
+    ) -> TracedPaths:
         """Trace light paths, and collect where they depend on one texture.
 
         Each vertex of a path has the derivative of its pixel by the texture there. The
@@ -750,10 +750,10 @@ class MitsubaScene:
             spp: samples per pixel.
         """
         with mitsuba_lock, self._crop_film():
-            self._set(inputs)
+            self._set_inputs_exactly(inputs)
             key, _scene_input = self.declared_inputs[name]
             spp = self.round_sample_count(spp)
-            noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
+            noise = mi.load_dict({"type": self.sampler_name, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
             n_samples = math.prod(self.window_size) * spp
             # `opaque`: a literal seed would be compiled into the kernel as a constant.
@@ -771,7 +771,7 @@ class MitsubaScene:
                 key,
                 noise,
                 size=self.window_size,
-                depth=self.depth,
+                depth=self.current_max_depth,
                 spp=spp,
                 projector=projector,
                 unseen=self._find_plane(),
@@ -783,7 +783,7 @@ class MitsubaScene:
             # (no surface): their coordinates are converted.
             surface = None
             if projector is None:
-                surface = self.definition[0].meshes[part].surface
+                surface = self.description_and_filter[0].meshes[part].surface
                 if surface is None:
                     return paths
             texture_size = self.parameters[key].shape[:2]
@@ -802,29 +802,29 @@ class MitsubaScene:
         shapes = {shape.id(): shape for shape in self._scene.shapes()}
         return shapes[parts.GROUND_NAME]
 
-    def _set(self, inputs: Mapping[str, Tensor]) -> None:
+    def _set_inputs_exactly(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, and everything else to its base value.
 
         Inputs that already have the requested value are not written again. Vertices are
         overwritten in the memory that they have, since recordings refer to it. Some
         numbers are compiled into recordings as constants: if one of them changes, all
-        recordings are stale, which `population.changes` counts.
+        recordings are stale, which `scene_registry.changes` counts.
         """
         self._check_known(inputs)
         if self._values_to_upload:
             # Write all inputs: without `_applied`, all of them count as changed.
             inputs = {**self._values_to_upload, **inputs}
-            self._applied.clear()
+            self._applied_values.clear()
         changes = self._find_changes(inputs)
         changes_constants = not self._constants.isdisjoint(changes)
         if changes_constants:
-            population.changes += 1
+            scene_registry.n_changes += 1
         for name, value in changes.items():
             self._write(name, value)
             if value is None:  # back to the base value
-                del self._applied[name]
+                del self._applied_values[name]
             else:
-                self._applied[name] = value.clone()
+                self._applied_values[name] = value.clone()
         if changes:
             self.parameters.update()
 
@@ -849,11 +849,11 @@ class MitsubaScene:
 
         None as a value means that the input goes back to its base value.
         """
-        reset = [name for name in self._applied if name not in inputs]
+        reset = [name for name in self._applied_values if name not in inputs]
         changes: dict[str, Tensor | None] = dict.fromkeys(reset)
         for name, tensor in inputs.items():
             value = self.declared_inputs[name][1].to_rendered(tensor)
-            applied = self._applied.get(name)
+            applied = self._applied_values.get(name)
             is_set = (
                 applied is not None
                 and applied.shape == value.shape
@@ -880,17 +880,17 @@ class MitsubaScene:
                     f"{tuple(tensor.shape)}, from what sets it"
                 )
         is_buffer = name in self._buffers
-        if name not in self._base:
+        if name not in self._base_values:
             # A buffer is copied, since it is overwritten in place below.
             base = current.torch().clone() if is_buffer else current
-            self._base[name] = type(current)(base)
+            self._base_values[name] = type(current)(base)
         if tensor is None:
             # a copy, so that the stored value is not what Mitsuba changes
-            value = type(current)(self._base[name])
+            value = type(current)(self._base_values[name])
         else:
             value = mi.TensorXf(tensor)
-            if scene_input.write:
-                value = scene_input.write(value)
+            if scene_input.convert_to_mitsuba:
+                value = scene_input.convert_to_mitsuba(value)
         if is_buffer:
             self._overwrite_buffer(current, value)
             self.parameters.set_dirty(key)
@@ -907,7 +907,7 @@ class MitsubaScene:
         dr.scatter(buffer, value, dr.arange(mi.UInt32, len(buffer)))
         dr.eval(buffer)
         has_moved = buffer.torch().data_ptr() != address
-        population.changes += has_moved
+        scene_registry.n_changes += has_moved
 
     def _get_integrator(self, method: str) -> Any:
         """Return the integrator of a method at the current depth, loaded on first use.
@@ -917,19 +917,19 @@ class MitsubaScene:
                 both, without the environment that the camera sees; "guides" for the
                 denoiser; "boundary" for derivatives with the terms of moving outlines.
         """
-        key = (method, self.depth)
+        key = (method, self.current_max_depth)
         if key not in self._integrators:
             # `_path_entries` has what a part of the scene needs, such as haze; it may
             # replace the type.
             adjoint = {
                 "type": "prb",
-                "max_depth": self.depth,
+                "max_depth": self.current_max_depth,
                 "rr_depth": self._gradient_roulette_depth,
                 **self._path_entries,
             }
             path = {
-                "type": self.integrator,
-                "max_depth": self.depth,
+                "type": self.integrator_name,
+                "max_depth": self.current_max_depth,
                 "rr_depth": self.roulette_depth,
                 **self._path_entries,
             }
@@ -938,8 +938,8 @@ class MitsubaScene:
             if self.plane_radiance is not None:
                 hidden["type"] = "advsearch_photograph"
                 # `PhotographPath` names them as the properties of the plane's coat.
-                hidden["reflectance"] = self.definition[0].get_number("ground.gloss")
-                hidden["roughness"] = self.definition[0].get_number("ground.roughness")
+                hidden["reflectance"] = self.description_and_filter[0].get_number("ground.gloss")
+                hidden["roughness"] = self.description_and_filter[0].get_number("ground.roughness")
             recipes: dict[str, Plugin] = {
                 "path": path,
                 "adjoint": adjoint,
@@ -947,13 +947,13 @@ class MitsubaScene:
                 "guides": self._guides,
                 "boundary": {
                     "type": "prb_projective",
-                    "max_depth": self.depth,
+                    "max_depth": self.current_max_depth,
                     "rr_depth": NO_ROULETTE_DEPTH,
                     "guiding": "none",
                 },
             }
             self._integrators[key] = mi.load_dict(recipes[method])
-            population.changes += 1
+            scene_registry.n_changes += 1
         return self._integrators[key]
 
 

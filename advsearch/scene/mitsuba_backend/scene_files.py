@@ -30,7 +30,7 @@ from advsearch.scene.importing.files import (
     make_safe_name,
     sanitize_name,
 )
-from advsearch.scene.importing.geometry import assemble, join_parts
+from advsearch.scene.importing.geometry import make_mesh_from_soup, join_parts
 from advsearch.scene.importing.parts import MAX_RADIANCE, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import RESERVED_NAMES, ImportedScene
 from advsearch.scene.importing.texture import apply_textures
@@ -404,7 +404,7 @@ def _paint(
     soup, maps = apply_textures(
         join_parts([part], where, np.eye(3)), [surface_color], Notes(where)
     )
-    textured_mesh = assemble(soup)[0]
+    textured_mesh = make_mesh_from_soup(soup)[0]
     return textured_mesh, maps.color
 
 

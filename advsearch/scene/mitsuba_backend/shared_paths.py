@@ -19,7 +19,7 @@ from torch import Tensor
 from advsearch.interrupts import INTERRUPTS
 from advsearch.scene.assets import Float64Array
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import dr, mi, mitsuba_lock, population
+from advsearch.scene.mitsuba_backend.variant import dr, mi, mitsuba_lock, scene_registry
 
 # samplers whose numbers `paths.PathSamples` can compute for any sample
 SAMPLERS = ("independent", "multijitter")
@@ -33,19 +33,19 @@ class StoredPaths:
     """The light that the images of one seed have in common.
 
     Attributes:
-        sums: (pixels, channels) float64 sums over samples, without the light that
+        channel_sums: (pixels, channels) float64 sums over samples, without the light that
             depends on a changed surface.
-        samples: for each launch the indices, a Dr.Jit array, of the samples whose path
+        changed_sample_indices: for each launch the indices, a Dr.Jit array, of the samples whose path
             has met a changed surface.
     """
 
-    sums: Float64Array
-    samples: list[Any]
+    channel_sums: Float64Array
+    changed_sample_indices: list[Any]
 
     @property
     def n_bytes(self) -> int:
         """Memory, bytes: 4 for the index of each sample."""
-        return int(self.sums.nbytes + 4 * sum(map(dr.width, self.samples)))
+        return int(self.channel_sums.nbytes + 4 * sum(map(dr.width, self.changed_sample_indices)))
 
 
 class SharedPaths:
@@ -93,12 +93,12 @@ class SharedPaths:
         Returns:
             The radiance (H, W, 3), and for "guides" albedo and normal (H, W, 6).
         """
-        INTERRUPTS.look()  # stops here if the user has interrupted the run
+        INTERRUPTS.raise_pending()  # stops here if the user has interrupted the run
         with mitsuba_lock:
             self._discard_if_stale(inputs)
             self.scene.set_inputs(inputs)
-            if population.unused:
-                population.free_unused()
+            if scene_registry.unused_keys:
+                scene_registry.free_unused()
             spp = self.scene.round_sample_count(spp)
             radiance, guides = self._render(seeds["path"], spp)
             guides[..., :3].clamp_(0.0, 1.0)
@@ -126,21 +126,21 @@ class SharedPaths:
         If images of the seed are stored, only the samples that have met a changed
         surface are traced again.
         """
-        key = (seed, spp, self.scene.depth)
+        key = (seed, spp, self.scene.current_max_depth)
         height, width = self.scene.resolution
         # sums over samples of the light that depends on changed surfaces
         changing = np.zeros((height * width, N_CHANNELS))
         if key in self._stored:
             # Taken out, and stored again below: so the seed used last is at the end.
             stored = self._stored.pop(key)
-            for samples in stored.samples:
+            for samples in stored.changed_sample_indices:
                 if dr.width(samples):
                     _unchanged, values, _has_met = self._trace(seed, spp, samples)
                     _add_samples(changing, samples, values, spp)
         else:
             stored = self._trace_all(seed, spp, changing)
         self._store(key, stored)
-        image = torch.from_numpy((stored.sums + changing) / spp).float()
+        image = torch.from_numpy((stored.channel_sums + changing) / spp).float()
         image = image.reshape(height, width, N_CHANNELS)
         return image[..., :3].contiguous(), image[..., 3:].contiguous()
 
@@ -190,8 +190,8 @@ class SharedPaths:
         # it needs the variant
         from advsearch.scene.mitsuba_backend import paths
 
-        is_stratified = self.scene.sampler == "multijitter"
-        depth = self.scene.depth
+        is_stratified = self.scene.sampler_name == "multijitter"
+        depth = self.scene.current_max_depth
         roulette_depth = self.scene.roulette_depth
 
         def trace(
@@ -231,9 +231,9 @@ def can_share_paths(scene: MitsubaScene) -> bool:
     light soon leaves the scene. `MitsubaScene` has chosen the integrator "path" for
     such scenes. The other conditions exclude what `trace_paths` does not support.
     """
-    description, filter_name = scene.definition
-    has_long_paths = scene.integrator == "path"
-    has_known_samples = filter_name == "box" and scene.sampler in SAMPLERS
+    description, filter_name = scene.description_and_filter
+    has_long_paths = scene.integrator_name == "path"
+    has_known_samples = filter_name == "box" and scene.sampler_name in SAMPLERS
     has_lens = bool(description.thin_lens) or description.camera_model is not None
     passes_surfaces = (
         bool(description.backdrop) or description.has_opacity or scene.is_volumetric

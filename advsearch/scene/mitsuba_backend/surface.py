@@ -96,9 +96,9 @@ class ViewSamples:
     # (k,) int64 index of the ray of each sample, ascending. Each pixel has
     # `RAYS_PER_PIXEL` rays; pixels are in the order of camera, row, column. A ray that
     # goes through cut-outs may have several samples
-    sample: Tensor
+    ray_index: Tensor
     uv: Tensor  # (k, 2) texture coordinates, with v as in Mitsuba
-    weight: Tensor  # (k,) diffuse fraction over pi, and over the rays of a pixel
+    diffuse_weight: Tensor  # (k,) diffuse fraction over pi, and over the rays of a pixel
     is_back: Tensor  # (k,) bool, whether the ray meets the surface from behind
 
 
@@ -578,7 +578,7 @@ class ViewTracer:
             lit: the light.
         """
         # The cell after those of all grids is the ground far away.
-        far_cell = mi.UInt32(self._grids[-1].first_cell + self._grids[-1].n_cells)
+        far_cell = mi.UInt32(self._grids[-1].first_cell_index + self._grids[-1].n_cells)
         far_texel = _gather_color(lit.texels, far_cell)
         relative_brightness = texel / far_texel
         to_local = texel_rays.get_world_to_map(self._scene)
@@ -647,7 +647,7 @@ class ViewTracer:
             y = dr.select(mask, grid_y, y)
             x = dr.select(mask, grid_x, x)
             on_any_grid = on_any_grid | mask
-            first_cell = dr.select(mask, mi.UInt32(grid.first_cell), first_cell)
+            first_cell = dr.select(mask, mi.UInt32(grid.first_cell_index), first_cell)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
         # y and x are fractions of the grid's height and width. Rows and columns are
@@ -726,9 +726,9 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
         return ViewSamples(
             radiance=torch.from_numpy(radiance).reshape(*size, 3),
             coverage=torch.from_numpy(coverage).reshape(*size, 1),
-            sample=torch.from_numpy(ray),
+            ray_index=torch.from_numpy(ray),
             uv=torch.from_numpy(np.stack([u[hits], v[hits]], axis=1)),
-            weight=torch.from_numpy(np.abs(weight[hits])),
+            diffuse_weight=torch.from_numpy(np.abs(weight[hits])),
             is_back=torch.from_numpy(weight[hits] < 0.0),
         )
 

@@ -38,19 +38,19 @@ class TexelGrid:
     """Grid of texels over one surface: a shape in Mitsuba's scene."""
 
     name: str  # name of the shape
-    first_cell: int  # index of its first cell among the cells of all grids
+    first_cell_index: int  # index of its first cell among the cells of all grids
     shape: tuple[int, int]  # rows and columns
     # None for a grid over texture coordinates. For a grid over a level ground, (center
     # x, center y, scale, rate): its cells are small at the center, with coordinate =
     # center + scale sinh(rate s), s in [-1, 1]
-    warp: tuple[float, float, float, float] | None = None
+    ground_warp: tuple[float, float, float, float] | None = None
     # side of the faces that the grid is on: 1 the front, -1 the back, 0 both
     face_side: int = 0
 
     @property
     def is_ground(self) -> bool:
         """Whether the grid is over a ground, and not over texture coordinates."""
-        return self.warp is not None
+        return self.ground_warp is not None
 
     @property
     def n_cells(self) -> int:
@@ -144,7 +144,7 @@ def _find_nearest_cell(grid: TexelGrid, si: Any) -> Any:
     """Return the cell of a grid that is nearest to a hit on its surface."""
     y, x = compute_grid_position(grid, si.p, si.uv)
     return mi.Int32(
-        grid.first_cell
+        grid.first_cell_index
         + _compute_cell_index(y, grid.shape[0]) * grid.shape[1]
         + _compute_cell_index(x, grid.shape[1])
     )
@@ -181,7 +181,7 @@ def _trace_batch(
 
     # Rays that leave the scene meet a cell of the environment. Its cells are counted
     # after those of all grids.
-    n_cells = grids[-1].first_cell + grids[-1].n_cells
+    n_cells = grids[-1].first_cell_index + grids[-1].n_cells
     sky_cell = mi.Int32(n_cells + _find_sky_cell(scene, direction, sky_shape))
     met = dr.select(si.is_valid(), mi.Int32(-1), sky_cell)
 
@@ -266,7 +266,7 @@ def is_visible_from_behind(
     thresholds = _sample_thresholds(n_layers, N_OUTSIDE_RAYS, seed=(0,))
     si = find_opaque_hits(scene._scene, ray, n_layers, thresholds)
     # `find_hit_grids` finds the hits on the shape by a grid; its cells do not matter.
-    grid = TexelGrid(name, first_cell=0, shape=(1, 1), face_side=0)
+    grid = TexelGrid(name, first_cell_index=0, shape=(1, 1), face_side=0)
     (is_hit,) = find_hit_grids(scene._scene, [grid], si, ray.d)
     # The normal `si.n` is that of the face, which is not turned towards the ray.
     is_back = is_hit & (dr.dot(si.n, ray.d) > 0.0)
@@ -291,7 +291,7 @@ def _sample_outside_rays(positions: Float32Array) -> Any:
 
 def count_cut_out_layers(scene: MitsubaScene) -> int:
     """Return how many cut-outs a scene's rays go through; 0 where it has none."""
-    return MAX_CUT_OUT_LAYERS if scene.definition[0].has_opacity else 0
+    return MAX_CUT_OUT_LAYERS if scene.description_and_filter[0].has_opacity else 0
 
 
 def find_opaque_hits(
@@ -406,9 +406,9 @@ def compute_grid_position(grid: TexelGrid, position: Any, uv: Any) -> tuple[Any,
         position: points in the world, which a plane needs.
         uv: their texture coordinates, which a mesh needs.
     """
-    if grid.warp is None:
+    if grid.ground_warp is None:
         return uv.y - dr.floor(uv.y), uv.x - dr.floor(uv.x)
-    center_x, center_y, scale, rate = grid.warp
+    center_x, center_y, scale, rate = grid.ground_warp
 
     def unwarp(offset: Any) -> Any:
         return dr.clip(0.5 + dr.asinh(offset) / (2.0 * rate), 0.0, 1.0)

@@ -39,7 +39,7 @@ ROUNDING_ERROR = 1e-4  # relative change of a BSDF that counts as no change
 
 
 @dataclass(frozen=True, eq=False)
-class Vertices:
+class PathVertices:
     """Vertices of light paths that have the same index in their path."""
 
     pixel: Tensor  # (n,) int64, row by row
@@ -52,17 +52,17 @@ class Vertices:
     # (n,) bool: the camera sees the vertex directly, or through mirrors and clear glass
     is_sharp: Tensor
 
-    def select(self, mask: Tensor) -> Vertices:
+    def select(self, mask: Tensor) -> PathVertices:
         """Return the vertices that a mask (n,) selects."""
         if bool(mask.all()):
             return self
-        return Vertices(
+        return PathVertices(
             self.pixel[mask], self.uv[mask], self.weight[mask], self.is_sharp[mask]
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Paths:
+class TracedPaths:
     """The images and the vertices of one pass of light paths."""
 
     # (H, W, 3) float32, with the same noise as the weights; the environment is in it
@@ -73,17 +73,17 @@ class Paths:
     # (H, W, 3), reflectance in [0, 1] of the first hit that light does not pass
     albedo: Tensor
     normal: Tensor  # (H, W, 3), and its shading normal
-    vertices: list[Vertices]  # vertices by their index in the path
+    vertices: list[PathVertices]  # vertices by their index in the path
 
 
-def average_passes(passes: Sequence[Paths]) -> Paths:
+def average_passes(passes: Sequence[TracedPaths]) -> TracedPaths:
     """Return the mean images of passes with equal sample counts, without vertices."""
     names = ("radiance", "coverage", "background", "albedo", "normal")
     means = {
         name: torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0)
         for name in names
     }
-    return Paths(**means, vertices=[])
+    return TracedPaths(**means, vertices=[])
 
 
 def collect_paths(
@@ -97,7 +97,7 @@ def collect_paths(
     projector: Any,
     unseen: Any = None,
     roulette_depth: int | None = None,
-) -> Paths:
+) -> TracedPaths:
     """Trace one pass of light paths and collect their vertices.
 
     It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel. The
@@ -178,7 +178,7 @@ def _light_by_projector(
     with _set_texture(parameters, key, white):
         projected = [bounce.eval_projector(scene, projector) for bounce in bounces]
     return [
-        (uv, bounce.throughput * light, bounce.sharp)
+        (uv, bounce.throughput * light, bounce.is_sharp)
         for bounce, (uv, light) in zip(bounces, projected, strict=True)
     ]
 
@@ -249,7 +249,7 @@ def _accumulate_radiance(
         weight = bounce.throughput * (
             slope_em * bounce.em_weight + slope_bsdf * incoming
         )
-        vertices.append((mi.Point2f(bounce.si.uv), weight, bounce.sharp))
+        vertices.append((mi.Point2f(bounce.si.uv), weight, bounce.is_sharp))
         reflected = (
             bounce.bsdf_value_em * bounce.em_weight + bounce.bsdf_weight * incoming
         )
@@ -277,11 +277,11 @@ def _fetch_paths(
     vertices: list[tuple[Any, Any, Any]],
     size: tuple[int, int],
     spp: int,
-) -> Paths:
+) -> TracedPaths:
     """Evaluate the kernel of a pass and fetch images and vertices into torch.
 
     Args:
-        channels: channels of the radiance and of the other images of `Paths`, in their
+        channels: channels of the radiance and of the other images of `TracedPaths`, in their
             order, for each sample.
         vertices: for each vertex its texture coordinates, its weight, and whether the
             camera sees it sharply.
@@ -297,7 +297,7 @@ def _fetch_paths(
     radiance, coverage, background, albedo, normal = torch.split(
         image, [3, 1, 3, 3, 3], dim=-1
     )
-    return Paths(
+    return TracedPaths(
         radiance=radiance.contiguous(),
         coverage=coverage.contiguous(),
         background=background.contiguous(),
@@ -312,7 +312,7 @@ def _fetch_paths(
 
 def _fetch_vertices(
     uv: Any, weight: Any, is_sharp: Any, mask: Any, spp: int
-) -> Vertices:
+) -> PathVertices:
     """Fetch one vertex of those paths that a mask selects.
 
     Args:
@@ -327,7 +327,7 @@ def _fetch_vertices(
     sample: Any = dr.compress(mask)
     if dr.width(sample) == 0:
         empty = torch.zeros(0)
-        return Vertices(
+        return PathVertices(
             empty.long(), empty.reshape(0, 2), empty.reshape(0, 3), empty.bool()
         )
     uv = dr.gather(mi.Point2f, uv, sample)
@@ -335,7 +335,7 @@ def _fetch_vertices(
     pixel = sample // spp  # the samples of a pixel follow one another
     is_sharp = dr.gather(mi.Bool, is_sharp, sample)
     dr.eval(uv, weight, pixel, is_sharp)
-    return Vertices(
+    return PathVertices(
         pixel.torch().long(),
         torch.stack([axis.torch() for axis in uv], dim=1),
         torch.stack([channel.torch() for channel in weight], dim=1),
@@ -350,7 +350,7 @@ class Bounce:
     si: Any  # surface interaction
     bsdf: Any  # BSDF there
     throughput: Any  # throughput of the path before the vertex
-    sharp: Any  # whether no vertex before it scatters light
+    is_sharp: Any  # whether no vertex before it scatters light
     wo_em: Any  # direction to the light that was sampled
     active_em: Any  # lanes in which a light was sampled
     # radiance of that light over the density, with its MIS weight against BSDF sampling
@@ -454,7 +454,7 @@ def _trace_paths(
             its throughput, but at most `MAX_SURVIVAL`.
 
     Returns:
-        The images of `Paths` after the radiance, in their order, channel by channel;
+        The images of `TracedPaths` after the radiance, in their order, channel by channel;
         what each vertex emits; and the bounces at all vertices but the last.
     """
     count = dr.width(ray.o)
@@ -587,7 +587,7 @@ def _sample_bounce(
         si=si,
         bsdf=bsdf,
         throughput=throughput,
-        sharp=sharp,
+        is_sharp=sharp,
         wo_em=wo_em,
         active_em=active_em,
         em_weight=em_weight,
@@ -674,13 +674,13 @@ class _SurfaceLayers:
             return image
 
         return Surfaces(
-            names=tuple(shape.id() for shape in self._shapes),
+            shape_names=tuple(shape.id() for shape in self._shapes),
             id=to_image(self._shape_id).long(),
             depth=to_image(self._depth),
             z_depth=to_image(self._z_depth),
             normal=torch.stack([to_image(axis) for axis in self._normal], dim=-1),
             uv=torch.stack([to_image(axis) for axis in self._uv], dim=-1),
-            face=to_image(self._face).long(),
+            face_index=to_image(self._face).long(),
         )
 
 

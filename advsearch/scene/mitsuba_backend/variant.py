@@ -1,6 +1,6 @@
 """Import Mitsuba: with a libLLVM that works, one variant, warnings only, our threads.
 
-No other module imports it. `Population` knows which scenes live inside it.
+No other module imports it. `SceneRegistry` knows which scenes live inside it.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Recordings(dict[Any, Callable[..., Any]]):
             render: the function that is recorded.
             media: Mitsuba's media that it uses besides its arguments.
         """
-        state = (population.changes, dr.thread_count())
+        state = (scene_registry.n_changes, dr.thread_count())
         if self._recorded_at != state:
             self.clear()
             self._recorded_at = state
@@ -151,7 +151,7 @@ class Recordings(dict[Any, Callable[..., Any]]):
         return self[key]
 
 
-class Population:
+class SceneRegistry:
     """The scenes inside Mitsuba that this process holds, and when they may be freed.
 
     A recorded kernel refers to the objects of all scenes that lived when it was
@@ -161,17 +161,17 @@ class Population:
     garbage collector may start in the middle of one.
 
     Attributes:
-        changes: number of changes of the population so far. A recording is valid only
+        n_changes: number of changes of the population so far. A recording is valid only
             as long as it stays the same.
-        unused: keys, in `_held`, of the objects whose owner has been freed.
+        unused_keys: keys, in `_held`, of the objects whose owner has been freed.
     """
 
     def __init__(self) -> None:
-        self.changes = 0
+        self.n_changes = 0
         self._held: dict[int, tuple[tuple[Any, ...], tuple[Any, ...]]] = {}
-        self.unused: list[int] = []
+        self.unused_keys: list[int] = []
 
-    def add(self, owner: object, *objects: Any, media: tuple[Any, ...] = ()) -> None:
+    def hold_objects(self, owner: object, *objects: Any, media: tuple[Any, ...] = ()) -> None:
         """Hold Mitsuba's objects until `free_unused` after their owner is freed.
 
         Args:
@@ -179,23 +179,23 @@ class Population:
             *objects: objects of Mitsuba.
             media: further objects, which are Mitsuba's media; see `list_media`.
         """
-        self.changes += 1
+        self.n_changes += 1
         # The count of changes is also a unique key.
-        key = self.changes
+        key = self.n_changes
         self._held[key] = (objects, media)
-        weakref.finalize(owner, self.unused.append, key)
+        weakref.finalize(owner, self.unused_keys.append, key)
 
     def free_unused(self) -> None:
         """Free the objects whose owner has been freed; call it only between renders.
 
         It counts as a change of the population: callers test `unused` before.
         """
-        while self.unused:
-            self._held.pop(self.unused.pop(), None)
+        while self.unused_keys:
+            self._held.pop(self.unused_keys.pop(), None)
         # Mitsuba's Python objects form cycles; they have to be freed now, not during a
         # later render.
         gc.collect()
-        self.changes += 1
+        self.n_changes += 1
 
     def list_media(self) -> list[Any]:
         """Return the media of all scenes.
@@ -206,4 +206,4 @@ class Population:
         return [medium for _, media in self._held.values() for medium in media]
 
 
-population = Population()  # of this process
+scene_registry = SceneRegistry()  # of this process

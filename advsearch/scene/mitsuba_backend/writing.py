@@ -76,7 +76,7 @@ def write_scene(
     Raises:
         InputError: something in it is no part of stock Mitsuba.
     """
-    description, filter_name = scene.definition
+    description, filter_name = scene.description_and_filter
     if description.camera_model is not None:
         raise InputError(
             "camera: stock Mitsuba has no sensor with distortion; export "
@@ -84,7 +84,7 @@ def write_scene(
         )
     xml_scene: Plugin = {
         "integrator": _make_integrator(scene, hide_environment),
-        **make_scene_dict(description, scene.resolution, filter_name, scene.sampler),
+        **make_scene_dict(description, scene.resolution, filter_name, scene.sampler_name),
     }
     # inputs that are not in the dictionary yet: `_put_part` takes some of them out
     remaining_inputs = {

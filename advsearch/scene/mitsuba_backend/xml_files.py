@@ -45,7 +45,7 @@ from advsearch.scene.mitsuba_backend.variant import (
     mi,
     suppress_warnings,
 )
-from advsearch.trust.named_files import References, is_inside
+from advsearch.trust.named_files import ReferencedFiles, is_inside
 from advsearch.trust.stored_files import make_size_error, record_opened, scale_limit
 
 SUFFIX = ".xml"
@@ -69,7 +69,7 @@ def read_scene(path: Path) -> Plugin:
     Raises:
         FileFormatError: it is missing, corrupt, too large, or no Mitsuba scene.
     """
-    text = _SceneText(path, References(path))
+    text = _SceneText(path, ReferencedFiles(path))
     root = text.parse(read_bytes(path, "scene", (SUFFIX,)))
     if root.tag != "scene":
         raise damaged(
@@ -135,7 +135,7 @@ class _SceneText:
     """
 
     path: Path
-    references: References
+    references: ReferencedFiles
     values: dict[str, str] = field(default_factory=dict)
     size: int = 0
     elements: int = 0
@@ -275,10 +275,10 @@ class _SceneText:
                 "include itself?"
             )
         try:
-            root = self.parse(self.references.get(name))
+            root = self.parse(self.references.read_file(name))
         except FileNotFoundError:
             # `get` has added the reason at the end.
-            reason = next(reversed(self.references.refused.values()))
+            reason = next(reversed(self.references.refusal_by_name.values()))
             raise FileFormatError(
                 f"{self.path}: includes {format_name(name)}, which {reason}"
             ) from None
@@ -513,7 +513,7 @@ class _FileReader:
         """Prepare to read a scene file's files; `notes` gets the readers' remarks."""
         self._path = path
         self._notes = notes
-        self._references = References(path)
+        self._references = ReferencedFiles(path)
         self._readers: dict[str, Callable[[Plugin], Plugin]] = {
             "obj": self._check_mesh,
             "ply": self._check_mesh,
@@ -573,10 +573,10 @@ class _FileReader:
         """
         try:
             # checks that the name is allowed; its content is not needed
-            self._references.get(str(name))
+            self._references.read_file(str(name))
         except FileNotFoundError:
             # why the file that was requested last was refused
-            refused = self._references.refused
+            refused = self._references.refusal_by_name
             reason = refused.get(next(reversed(refused)), "is missing")
             raise FileFormatError(
                 f"{self._path}: {kind} needs {format_name(str(name))}, which {reason}"

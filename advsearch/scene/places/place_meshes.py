@@ -44,7 +44,7 @@ from advsearch.scene.importing.gltf_entries import (
 from advsearch.scene.importing.gltf_parts import (
     GltfSurfaces,
     PrimitiveData,
-    note_left_out,
+    note_skipped_contents,
     read_primitive,
 )
 from advsearch.scene.importing.parts import (
@@ -185,7 +185,7 @@ def read_place_meshes(
     variant_index = None if variant is None else _find_variant(path, header, variant)
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
-    note_left_out(_drop_supported_extensions(header), notes)
+    note_skipped_contents(_drop_supported_extensions(header), notes)
     _note_omissions(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
     groups = _group_by_material(header, primitives)
@@ -272,7 +272,7 @@ def _select_material(
 def _list_posed_meshes(header: Header) -> list[tuple[int, Float64Array]]:
     """Return mesh and pose of each node that has a mesh, in the order of nodes."""
     posed_meshes = []
-    posed_nodes = sorted(gltf_skeleton.iterate_poses(header), key=lambda item: item[0])
+    posed_nodes = sorted(gltf_skeleton.iterate_node_poses(header), key=lambda item: item[0])
     for node, pose in posed_nodes:
         mesh = header.nodes[node].mesh
         if mesh is not None:
@@ -307,13 +307,13 @@ def _read_primitives(
             piece = pieces.get((mesh, index))
             if piece is None:  # it is made of points or lines
                 continue
-            _surface, uv_scale, uv_shift = fitted[piece.material]
+            _surface, uv_scale, uv_shift = fitted[piece.material_index]
             part = transform_part(_fit_uvs(piece.part, uv_scale, uv_shift), pose)
             # `piece` has the material of the variant, and names the surface. The
             # original material names the mesh, see `_group_by_material`.
             primitives.append(
                 PosedPrimitive(
-                    primitive.material, variant_material=piece.material, part=part
+                    primitive.material, variant_material=piece.material_index, part=part
                 )
             )
     surfaces = {material: surface for material, (surface, _, _) in fitted.items()}
@@ -387,7 +387,7 @@ def _fit_surfaces(
     """
     pieces_by_material: dict[int | None, list[PrimitiveData]] = {}
     for piece in pieces.values():
-        pieces_by_material.setdefault(piece.material, []).append(piece)
+        pieces_by_material.setdefault(piece.material_index, []).append(piece)
     _check_materials(file.path, len(pieces_by_material))
     surfaces = GltfSurfaces(file, notes, TEXTURE_LIMIT)
     fit_by_material: dict[

@@ -99,15 +99,15 @@ class SurfaceView:
         # this camera's samples lie between its first ray and the next camera's.
         n_rays = height * width * RAYS_PER_PIXEL
         first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
-        start, end = torch.searchsorted(samples.sample, first_rays).tolist()
-        ray = samples.sample[start:end] - camera_index * n_rays
+        start, end = torch.searchsorted(samples.ray_index, first_rays).tolist()
+        ray = samples.ray_index[start:end] - camera_index * n_rays
         pixel = ray // RAYS_PER_PIXEL
         # Each look-up reads four cells: `columns` and `fractions` are (n, 4).
         columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
         # The columns of the back follow the `n_cells` columns of the front.
         is_back = samples.is_back[start:end].numpy()
         columns += np.int32(n_cells) * is_back[:, None]
-        weights = fractions * samples.weight[start:end].numpy()[:, None]
+        weights = fractions * samples.diffuse_weight[start:end].numpy()[:, None]
         # The samples are sorted by pixel, and each has four entries. So the entries of
         # row p begin at 4 times the number of samples in the pixels before p.
         row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
@@ -182,21 +182,21 @@ class ArrangementLight:
 
     # (sides x cells of the fine grid, 3) irradiance of the object's front, followed by
     # that of its back if the back stores its own
-    on_object: Tensor
+    object_irradiance: Tensor
     maps: LightMaps  # all other light, for look-ups
 
     @property
-    def bytes(self) -> int:
+    def n_bytes(self) -> int:
         """Memory of the light, bytes."""
-        return 4 * (self.on_object.numel() + self.maps.size)
+        return 4 * (self.object_irradiance.numel() + self.maps.size)
 
-    def compute_reflected(self, fine: Tensor) -> Tensor:
+    def compute_reflected(self, fine_color: Tensor) -> Tensor:
         """Return what a base color (cells of the fine grid, 3) reflects on each side.
 
         The result is differentiable.
         """
-        n_sides = len(self.on_object) // len(fine)
-        return fine.repeat(n_sides, 1) * self.on_object
+        n_sides = len(self.object_irradiance) // len(fine_color)
+        return fine_color.repeat(n_sides, 1) * self.object_irradiance
 
 
 class Arrangement:
@@ -222,7 +222,7 @@ class Arrangement:
         self,
         renderer: Renderer,
         inputs: Mapping[str, Tensor],
-        texture: tuple[int, int],
+        texture_shape: tuple[int, int],
         seed: int,
     ) -> None:
         """Lay texels over all surfaces, trace their views, and measure reflection.
@@ -231,7 +231,7 @@ class Arrangement:
             renderer: renderer of the scene.
             inputs: scene inputs, which fix where everything stands. Those that change
                 only the finished image are ignored.
-            texture: rows and columns of the texture whose color is searched.
+            texture_shape: rows and columns of the texture whose color is searched.
             seed: seed of the rays.
         """
         scene = renderer.scene
@@ -240,7 +240,7 @@ class Arrangement:
             name: inputs[name] for name in inputs if name not in IMAGE_INPUTS
         }
         scene.set_inputs(self.inputs)
-        description = scene.definition[0]
+        description = scene.description_and_filter[0]
         vertices = self._get_object_buffer("vertices")
         normals = self._get_object_buffer("normals")
         object_center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
@@ -257,11 +257,11 @@ class Arrangement:
         if self._has_ground:
             surfaces.append(self._make_ground_texels(object_center))
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
-        refinement = max(1, math.ceil(MIN_FINE_SIZE / min(texture)))
-        self.fine_shape = (texture[0] * refinement, texture[1] * refinement)
+        refinement = max(1, math.ceil(MIN_FINE_SIZE / min(texture_shape)))
+        self.fine_shape = (texture_shape[0] * refinement, texture_shape[1] * refinement)
         self._upsampling = None
         if refinement > 1:
-            self._upsampling = _make_upsampling_matrix(texture, self.fine_shape)
+            self._upsampling = _make_upsampling_matrix(texture_shape, self.fine_shape)
 
         # what texels see of the sky and of each other
         met_cells = self._trace_texels(seed)
@@ -292,7 +292,7 @@ class Arrangement:
 
     def _make_ground_texels(self, object_center: Float32Array) -> texels.LitTexels:
         """Return the texels of the ground, which goes on from below the object (3,)."""
-        is_photographed = self._scene.definition[0].photograph is not None
+        is_photographed = self._scene.description_and_filter[0].photograph is not None
         reach = self._compute_ground_reach(is_photographed)
         center = (float(object_center[0]), float(object_center[1]))
         return texels.make_ground_texels(GROUND_NAME, 0.0, reach, center)
@@ -315,9 +315,9 @@ class Arrangement:
         Args:
             object_center: (3,) center of the object in world space.
         """
-        model = self._scene.definition[0].camera_model
+        model = self._scene.description_and_filter[0].camera_model
         if model is not None and "camera.lens" in self.inputs:
-            model = model.with_numbers(self.inputs["camera.lens"])
+            model = model.with_intrinsics(self.inputs["camera.lens"])
         return ViewTracer(
             self._scene,
             self.texels.grids,
@@ -389,7 +389,7 @@ class Arrangement:
         """Return half the width of the ground; a photographed one has no end."""
         if is_photographed:
             return math.inf
-        return self._scene.definition[0].get_number("ground.size") / 2.0
+        return self._scene.description_and_filter[0].get_number("ground.size") / 2.0
 
     def _find_buried(self, met_cells: Ints, side: int) -> BoolArray:
         """Return which texels (n,) of one side of the object lie inside something.
@@ -410,8 +410,8 @@ class Arrangement:
             return np.asarray(is_back.mean(axis=1) > BURIED_FRACTION)
         # the grids are the object's front, its back, and the ground's
         back_grid = self.texels.grids[1]
-        is_back = (cells >= back_grid.first_cell) & (
-            cells < back_grid.first_cell + back_grid.n_cells
+        is_back = (cells >= back_grid.first_cell_index) & (
+            cells < back_grid.first_cell_index + back_grid.n_cells
         )
         sees_sky = self._is_sky(cells).any(axis=1)
         return np.asarray((is_back.mean(axis=1) > BURIED_FRACTION) & ~sees_sky)
@@ -425,11 +425,11 @@ class Arrangement:
         # The object's front is the first grid, so that its texels and cells are
         # numbered from 0.
         front = self.texels.select_grid(0)
-        opacity = self._scene.definition[0].meshes[OBJECT].opacity
+        opacity = self._scene.description_and_filter[0].meshes[OBJECT].opacity
         candidates = np.arange(front.start, front.stop)
         if opacity is not None:
             n_rows, n_columns = self.texels.grids[0].shape
-            row, column = np.divmod(self.texels.cells[front], n_columns)
+            row, column = np.divmod(self.texels.cell_of_texel[front], n_columns)
             opacity_row = row * opacity.shape[0] // n_rows
             opacity_column = column * opacity.shape[1] // n_columns
             texel_opacity = opacity[opacity_row, opacity_column]
@@ -482,15 +482,15 @@ class Arrangement:
         return goes_down & is_in_reach, photograph_directions
 
     @property
-    def entries(self) -> int:
+    def n_entries(self) -> int:
         """Number of entries of all matrices, for one color channel."""
         matrices = (*self._view_matrices, *self._to_fine)
         return sum(int(matrix.values().numel()) for matrix in matrices)
 
     @property
-    def bytes(self) -> int:
+    def n_bytes(self) -> int:
         """Memory of the matrices, bytes: a column index and a value for each entry."""
-        return 8 * self.entries
+        return 8 * self.n_entries
 
     def start_tracing(
         self, cameras: Sequence[Mapping[str, Tensor]], light: ArrangementLight
@@ -537,7 +537,7 @@ class Arrangement:
             # What a camera sees of each texel: the radiance of a diffuse surface. The
             # texels of a photographed ground get a factor on the photograph instead.
             visible_light = reflectance * irradiance / math.pi
-            gloss_map = sky.map  # what gloss on the object reflects
+            gloss_map = sky.coarse_map  # what gloss on the object reflects
             # Without a ground this is only a filler: no ray looks it up.
             far_ground = torch.ones(1, 3)
             if self._has_ground:
@@ -668,7 +668,7 @@ class Arrangement:
         pooled = functional.adaptive_avg_pool2d(fine, front_grid.shape)[0]
         cell_colors = pooled.permute(1, 2, 0).reshape(-1, 3)
         # The cells of the first grid are numbered from 0.
-        front_cells = self.texels.cells[self.texels.select_grid(0)]
+        front_cells = self.texels.cell_of_texel[self.texels.select_grid(0)]
         return cell_colors[torch.from_numpy(front_cells)]
 
     def _compute_ground_color(self, padded: Tensor) -> Tensor:
@@ -682,7 +682,7 @@ class Arrangement:
         """
         ground_points = self.texels.positions[self._select_ground()]
         if self._capture_height is None:  # a plain ground
-            srgb = torch.tensor(self._scene.definition[0].ground_color)
+            srgb = torch.tensor(self._scene.description_and_filter[0].ground_color)
             return srgb_to_linear(srgb).expand(len(ground_points), 3)
         capture_position = torch.tensor([0.0, 0.0, self._capture_height])
         world_directions = torch.from_numpy(ground_points) - capture_position

@@ -66,7 +66,7 @@ class MapFingerprint:
         stride = max(1, len(texels) // N_COMPARED_TEXELS)
         return cls(mean, texels[::stride] / mean.clamp_min(1e-12))
 
-    def find_factor(self, other: MapFingerprint) -> Tensor | None:
+    def compute_map_ratio(self, other: MapFingerprint) -> Tensor | None:
         """Return the factor (3,), by channel, with which this map becomes another one.
 
         None if the other map is not a multiple of this one.
@@ -135,7 +135,7 @@ class SurfaceRenderer(Predictor):
     def compute_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a configuration (d,), without a graph."""
         with torch.no_grad():
-            return self.path_renderer.scene.assembly(self.path_renderer.space.inputs(u))
+            return self.path_renderer.scene.input_assembler(self.path_renderer.space.inputs(u))
 
     def get_color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """Return the base color (h, w, 3) of scene inputs."""
@@ -177,7 +177,7 @@ class SurfaceRenderer(Predictor):
     @property
     def n_entries(self) -> int:
         """Number of entries of the arrangement's matrices."""
-        return self.arrangement.entries
+        return self.arrangement.n_entries
 
     @property
     def n_bytes(self) -> int:
@@ -187,9 +187,9 @@ class SurfaceRenderer(Predictor):
         that only its light counts.
         """
         if self.fixed_light is not None:  # the rest is shared
-            return self.fixed_light.bytes
-        lights = sum(light.bytes for light in self.stored_lights.values())
-        return self.arrangement.bytes + lights
+            return self.fixed_light.n_bytes
+        lights = sum(light.n_bytes for light in self.stored_lights.values())
+        return self.arrangement.n_bytes + lights
 
     def compute_light(self, inputs: Mapping[str, Tensor]) -> ArrangementLight:
         """Compute the light under the environment of scene inputs."""
@@ -198,7 +198,7 @@ class SurfaceRenderer(Predictor):
         ).detach()
         return self.arrangement.compute_light(padded, self.base_color)
 
-    def get_light(
+    def get_light_and_factor(
         self, inputs: Mapping[str, Tensor]
     ) -> tuple[ArrangementLight, Tensor]:
         """Return the light under the environment of scene inputs, and a factor (3,).
@@ -214,7 +214,7 @@ class SurfaceRenderer(Predictor):
             ).detach()
         )
         for stored_fingerprint, light in self.stored_lights.items():
-            factor = stored_fingerprint.find_factor(fingerprint)
+            factor = stored_fingerprint.compute_map_ratio(fingerprint)
             if factor is not None:
                 return light, factor
         light = self.compute_light(inputs)
@@ -231,7 +231,7 @@ class SurfaceRenderer(Predictor):
     ) -> tuple[ArrangementLight, Tensor | float]:
         """Return the light of scene inputs and its factor, or the fixed light."""
         if self.fixed_light is None:
-            return self.get_light(inputs)
+            return self.get_light_and_factor(inputs)
         return self.fixed_light, 1.0
 
     def _select_camera_inputs(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -361,7 +361,7 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
     for group in renderer.plan.groups:
         if group.control in varying or group.estimator == "image":
             continue
-        if renderer.routes.get(group.name, frozenset()) != {COLOR_INPUT}:
+        if renderer.inputs_by_group.get(group.name, frozenset()) != {COLOR_INPUT}:
             return Refusal(f"{group.name} changes more than the object's base color")
     changed = find_changed_inputs(renderer, varying)
     # A change of anything else moves or repaints surfaces, so that the stored light
@@ -382,7 +382,7 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
     It can be if the scene is an object with one texture on a ground, under an
     environment, and if images are denoised: predictions have no noise.
     """
-    description = renderer.scene.definition[0]
+    description = renderer.scene.description_and_filter[0]
     mesh_part = description.meshes[OBJECT]
     if mesh_part.mesh.repeats or mesh_part.surface is not None:
         return Refusal(
@@ -414,13 +414,13 @@ def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozens
     """
     changed: set[str] = set()
     with torch.no_grad():
-        start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+        start_inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
         for fraction in PROBE_FRACTIONS:
             u = renderer.start.clone()
             for group in renderer.space.groups:
                 if group.control in varying or group.name in varying:
                     u[group.coordinates] = fraction
-            inputs = renderer.scene.assembly(renderer.space.inputs(u))
+            inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
             for name in start_inputs.keys() | inputs.keys():
                 if inputs_differ(start_inputs.get(name), inputs.get(name)):
                     changed.add(name)

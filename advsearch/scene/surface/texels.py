@@ -59,7 +59,7 @@ class LitTexels:
     grids: tuple[TexelGrid, ...]  # grid of each surface, the searched one first
     positions: Float32Array  # (n, 3) positions in world space
     normals: Float32Array  # (n, 3)
-    cells: IntArray  # (n,) index of each texel's cell, among the cells of all grids
+    cell_of_texel: IntArray  # (n,) index of each texel's cell, among the cells of all grids
     texel_of_cell: IntArray  # (cells of all grids,) index of each cell's nearest texel
     # index of the first texel of each grid, followed by the number of all texels
     first_texels: tuple[int, ...]
@@ -85,14 +85,14 @@ def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
     for texels, texel_offset, cell_offset in zip(
         surfaces, texel_bounds[:-1], cell_bounds[:-1], strict=True
     ):
-        grids.append(replace(texels.grids[0], first_cell=int(cell_offset)))
-        cells.append(texels.cells + cell_offset)
+        grids.append(replace(texels.grids[0], first_cell_index=int(cell_offset)))
+        cells.append(texels.cell_of_texel + cell_offset)
         texel_of_cell.append(texels.texel_of_cell + texel_offset)
     return LitTexels(
         grids=tuple(grids),
         positions=np.concatenate([texels.positions for texels in surfaces]),
         normals=np.concatenate([texels.normals for texels in surfaces]),
-        cells=np.concatenate(cells),
+        cell_of_texel=np.concatenate(cells),
         texel_of_cell=np.concatenate(texel_of_cell),
         first_texels=tuple(texel_bounds.tolist()),
     )
@@ -123,23 +123,23 @@ def make_mesh_texels(
     rows, columns = np.nonzero(charts.is_covered)
     grid = TexelGrid(
         name,
-        first_cell=0,
+        first_cell_index=0,
         shape=charts.is_covered.shape,
-        warp=None,
+        ground_warp=None,
         face_side=side,
     )
     return LitTexels(
         grids=(grid,),
         positions=position[rows, columns],
         normals=normal[rows, columns],
-        cells=np.flatnonzero(charts.is_covered),
+        cell_of_texel=np.flatnonzero(charts.is_covered),
         texel_of_cell=texel_of_covered[nearest_covered],
         first_texels=(0, len(rows)),
     )
 
 
 def make_ground_texels(
-    name: str, height: float, reach: float, center: tuple[float, float]
+    name: str, height: float, half_width: float, center: tuple[float, float]
 ) -> LitTexels:
     """Return the texels over a level plane, small under the object and larger outwards.
 
@@ -150,16 +150,16 @@ def make_ground_texels(
     Args:
         name: name of the ground.
         height: height of the plane, in object sizes.
-        reach: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no texels.
+        half_width: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no texels.
         center: x and y of the object's center.
     """
-    reach = min(reach, MAX_GROUND_REACH)
+    half_width = min(half_width, MAX_GROUND_REACH)
     # At the center the slope of scale * sinh(rate * p) is scale * rate; with equal
     # texels it would be the reach. Their ratio is sinh(rate) / rate, and the texel at
     # the center gets the width `MIN_TEXEL_WIDTH`.
-    equal_width = 2.0 * reach / GROUND_TEXELS
+    equal_width = 2.0 * half_width / GROUND_TEXELS
     rate = _find_warp_rate(equal_width / MIN_TEXEL_WIDTH)
-    scale = reach / math.sinh(rate)
+    scale = half_width / math.sinh(rate)
     axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
     axis_offset = scale * np.sinh(rate * axis_position)
     y, x = np.meshgrid(axis_offset + center[1], axis_offset + center[0], indexing="ij")
@@ -169,16 +169,16 @@ def make_ground_texels(
     normals = np.broadcast_to(up, positions.shape).copy()
     grid = TexelGrid(
         name,
-        first_cell=0,
+        first_cell_index=0,
         shape=(GROUND_TEXELS, GROUND_TEXELS),
-        warp=(center[0], center[1], scale, rate),
+        ground_warp=(center[0], center[1], scale, rate),
     )
     cells = np.arange(GROUND_TEXELS * GROUND_TEXELS)
     return LitTexels(
         grids=(grid,),
         positions=np.asarray(positions, np.float32),
         normals=normals,
-        cells=cells,  # every cell is a texel
+        cell_of_texel=cells,  # every cell is a texel
         texel_of_cell=cells,
         first_texels=(0, GROUND_TEXELS * GROUND_TEXELS),
     )
@@ -323,7 +323,7 @@ def make_lookup_matrix(
     position, normal = _interpolate(fine_charts, vertices, normals)
     # Cells up to `BORDER_TEXELS` outside of a chart count too: interpolation at the
     # chart's border reads them.
-    rows, columns = np.nonzero(fine_charts.distance <= BORDER_TEXELS)
+    rows, columns = np.nonzero(fine_charts.texels_to_covered <= BORDER_TEXELS)
     points = position[rows, columns]
     point_normals = normal[rows, columns]
     texel_width = _compute_texel_width(charts, vertices)
@@ -450,7 +450,7 @@ def _interpolate(
         vertices: (V, 3) in world space.
         normals: (V, 3) in world space.
     """
-    corners = charts.mesh.faces[charts.face]
+    corners = charts.mesh.faces[charts.face_index]
     position = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
     normal = np.einsum("hwk,hwkc->hwc", charts.weights, normals[corners])
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
@@ -503,8 +503,8 @@ class SkyLight:
 
     padded: Tensor  # (H, W + 2, 3) map, with a copied column at each end
     # (rows x columns, 3) mean radiance of each cell of `SKY_SHAPE`, without hot light
-    cells: Tensor
-    map: Tensor  # (h, w, 3) all light, in the shape `BLURRED_SHAPE`
+    cell_radiance: Tensor
+    coarse_map: Tensor  # (h, w, 3) all light, in the shape `BLURRED_SHAPE`
     hot_directions: Tensor  # (k, 3) unit directions of hot light, in the map's axes
     hot_light: Tensor  # (k, 3) radiance times solid angle from each of them
 
@@ -544,8 +544,8 @@ def prepare_sky(padded: Tensor) -> SkyLight:
         remaining = radiance
     return SkyLight(
         padded=padded,
-        cells=_average_cells(remaining, sine, SKY_SHAPE).reshape(-1, 3),
-        map=_average_cells(radiance, sine, BLURRED_SHAPE),
+        cell_radiance=_average_cells(remaining, sine, SKY_SHAPE).reshape(-1, 3),
+        coarse_map=_average_cells(radiance, sine, BLURRED_SHAPE),
         hot_directions=hot_directions,
         hot_light=hot_light,
     )
@@ -700,7 +700,7 @@ def compute_irradiance(
         bounces: how often light goes from texel to texel.
     """
     sky_view, texel_view = view_matrices
-    from_sky = sky_view @ sky.cells
+    from_sky = sky_view @ sky.cell_radiance
     if hot_cosines is not None:
         # Radiance times solid angle times cosine is an irradiance.
         from_sky = from_sky + hot_cosines @ sky.hot_light

@@ -76,7 +76,7 @@ def has_fixed_lights(renderer: Renderer) -> bool:
     """
     return any(
         isinstance(part, PluginPart) and part.emits_light
-        for part in renderer.scene.definition[0].parts
+        for part in renderer.scene.description_and_filter[0].parts
     )
 
 
@@ -84,7 +84,7 @@ def has_fixed_lights(renderer: Renderer) -> bool:
 
 
 @dataclass(frozen=True)
-class Lighting:
+class LightGroups:
     """The groups of coordinates that change only light, exposure or the finished image.
 
     A group is one parameter of a control, such as "environment.exposure".
@@ -92,7 +92,7 @@ class Lighting:
 
     # inputs that each group changes, by its name `control.parameter`; none if it only
     # changes the finished image
-    groups: Mapping[str, frozenset[str]]
+    inputs_by_group: Mapping[str, frozenset[str]]
     # names of groups that add spherical harmonics to the environment
     harmonic_groups: frozenset[str]
     # For each other group that changes the environment, its coordinates and the values
@@ -102,10 +102,10 @@ class Lighting:
     @property
     def changed_inputs(self) -> frozenset[str]:
         """The scene's inputs that change."""
-        return frozenset[str]().union(*self.groups.values()) - IMAGE_INPUTS
+        return frozenset[str]().union(*self.inputs_by_group.values()) - IMAGE_INPUTS
 
 
-def find_lighting(renderer: Renderer) -> Lighting:
+def find_light_groups(renderer: Renderer) -> LightGroups:
     """Find the groups of coordinates that change only light and the finished image.
 
     Each group is varied alone, and the scene inputs are compared. So the result does
@@ -124,7 +124,7 @@ def find_lighting(renderer: Renderer) -> Lighting:
     harmonic_groups = set()
     brightest_values = []
     with torch.no_grad():
-        base_inputs = renderer.scene.assembly(renderer.space.inputs(reference))
+        base_inputs = renderer.scene.input_assembler(renderer.space.inputs(reference))
         for group in renderer.space.groups:
             effect = _measure_effect(renderer, group, reference, base_inputs)
             if effect is None:  # the group changes more than light
@@ -140,7 +140,7 @@ def find_lighting(renderer: Renderer) -> Lighting:
             elif ENVIRONMENT_INPUT in effect.changed:
                 brightest = effect.brightest[group.coordinates]
                 brightest_values.append((group.coordinates, brightest))
-    return Lighting(groups, frozenset(harmonic_groups), tuple(brightest_values))
+    return LightGroups(groups, frozenset(harmonic_groups), tuple(brightest_values))
 
 
 class _Effect(NamedTuple):
@@ -165,7 +165,7 @@ def _measure_effect(
     max_power = -1.0  # below that of any environment
     brightest = reference
     for configuration in _sample_configurations(group, reference):
-        inputs = renderer.scene.assembly(renderer.space.inputs(configuration))
+        inputs = renderer.scene.input_assembler(renderer.space.inputs(configuration))
         for name in base_inputs.keys() | inputs.keys():
             change = _find_change(
                 name,
@@ -373,7 +373,7 @@ class LightBasis:
             scene without light has one dark light.
     """
 
-    def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
+    def __init__(self, renderer: Renderer, lighting: LightGroups, inputs: Inputs) -> None:
         """Split the light of scene inputs into lights of which each has its own image.
 
         Radiance is the sum over lights, so that an image under any mixture of them is
@@ -448,7 +448,7 @@ def _get_values(
     return values
 
 
-def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> Tensor:
+def _make_basis_maps(renderer: Renderer, lighting: LightGroups, first: Tensor) -> Tensor:
     """Return the environment's basis maps (k, H, W, 3).
 
     The first is `first`. If a group adds spherical harmonics to the environment, the
@@ -461,7 +461,7 @@ def _make_basis_maps(renderer: Renderer, lighting: Lighting, first: Tensor) -> T
     """
     if not lighting.harmonic_groups:
         return first[None]
-    start_inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+    start_inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
     start_map = start_inputs[ENVIRONMENT_INPUT]
     # A texel in which the sum with harmonics was negative is cut off at zero: it is
     # black in `first`, but not at the start. Harmonics are added to all others.
@@ -482,7 +482,7 @@ class BasisRenderer(Predictor):
     Args:
         traced, seed, tick: as for `LinearRenderer`.
         u: (d,) configuration; everything that does not change has its value there.
-        changing: result of `find_lighting`, which is called if this is None.
+        changing: result of `find_light_groups`, which is called if this is None.
 
     Attributes:
         non_finite: how many numbers were not finite, and were replaced by 0.
@@ -495,7 +495,7 @@ class BasisRenderer(Predictor):
         seed: int,
         tick: ProgressCallback = ignore_progress,
         *,
-        changing: Lighting | None = None,
+        changing: LightGroups | None = None,
     ) -> None:
         """Trace an image for each light, and the matrices of base colors under it.
 
@@ -504,22 +504,22 @@ class BasisRenderer(Predictor):
             u: (d,) configuration at which the images are traced.
             seed: seed of the samples.
             tick: called as the passes are done, with the progress.
-            changing: result of `find_lighting`, which is called if this is None.
+            changing: result of `find_light_groups`, which is called if this is None.
         """
         super().__init__(traced)
         with torch.no_grad():
-            changing = changing or find_lighting(traced)
+            changing = changing or find_light_groups(traced)
             # The basis map of the environment is its brightest: other environments are
             # predicted by scaling its image, which fails if a channel of it is black.
             brightest = u.detach().clone()
             for coordinates, values in changing.brightest_values:
                 brightest[coordinates] = values
-            inputs = traced.scene.assembly(traced.space.inputs(brightest))
+            inputs = traced.scene.input_assembler(traced.space.inputs(brightest))
             self._lights = LightBasis(traced, changing, inputs)
             # Everything but light is traced at u: each light's inputs are replaced by
             # those of `self._lights`.
             self._renderers = self._trace_lights(traced, u, seed, tick)
-        self.non_finite = sum(renderer.non_finite for renderer in self._renderers)
+        self.n_non_finite = sum(renderer.n_non_finite for renderer in self._renderers)
 
     @property
     def n_traced_images(self) -> int:
@@ -537,7 +537,7 @@ class BasisRenderer(Predictor):
             seed: seed of the noise; each light gets its own.
             tick: called with the samples per pixel of each pass as it is done.
         """
-        set_inputs = traced.scene.assembly(traced.space.inputs(u)).keys()
+        set_inputs = traced.scene.input_assembler(traced.space.inputs(u)).keys()
         linear_names = set_inputs & find_linear_inputs(traced)
         base_colors = {
             name for name in linear_names if not name.endswith(PATTERN_SUFFIX)
@@ -550,7 +550,7 @@ class BasisRenderer(Predictor):
                 LinearRenderer(
                     traced,
                     u,
-                    seeds.stream(seed, "light", index),
+                    seeds.derive_seed(seed, "light", index),
                     tick,
                     names=linear_names if has_projectors else base_colors,
                     light=light_inputs,
@@ -602,14 +602,14 @@ def find_refusal(renderer: Renderer, varying: Collection[str] = ()) -> Refusal |
             theirs, so that they may change anything. If there are any, light may not
             change.
     """
-    if renderer.scene.definition[0].get_number("ground.gloss") > 0.0:
+    if renderer.scene.description_and_filter[0].get_number("ground.gloss") > 0.0:
         return Refusal("the ground reflects the object")
     searched_groups = [
         group for group in renderer.plan.groups if group.control not in varying
     ]
     light_groups: Mapping[str, frozenset[str]] = {}
     if not varying:
-        light_groups = find_lighting(renderer).groups
+        light_groups = find_light_groups(renderer).inputs_by_group
     # With a photographed ground, a lamp also changes the photograph around the object,
     # which no basis image contains.
     if light_groups and renderer.scene.plane_radiance is not None:
@@ -637,8 +637,8 @@ def _find_group_refusal(
     # renders would not get it.
     if group.is_forced and group.estimator not in ("none", "image"):
         return Refusal(f"the estimator of {group.name} is forced")
-    changed_inputs = renderer.routes.get(group.name, frozenset())
-    parts = renderer.scene.definition[0].parts
+    changed_inputs = renderer.inputs_by_group.get(group.name, frozenset())
+    parts = renderer.scene.description_and_filter[0].parts
     haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
     is_haze = bool(changed_inputs) and all(
         name.startswith(haze_prefixes) for name in changed_inputs
@@ -674,7 +674,7 @@ def _find_general_refusal(
     """
     # If only the finished image changed, one render would serve for all images anyway.
     needs_render = any(
-        renderer.routes.get(group.name) or light_groups.get(group.name)
+        renderer.inputs_by_group.get(group.name) or light_groups.get(group.name)
         for group in searched_groups
     )
     if not needs_render:
@@ -696,7 +696,7 @@ def make_predictor(
     It is a `BasisRenderer` if light changes, and else a `LinearRenderer`, whose
     arguments it takes.
     """
-    lighting = find_lighting(renderer)
+    lighting = find_light_groups(renderer)
     if lighting.changed_inputs:
         return BasisRenderer(renderer, u, seed, tick, changing=lighting)
     return LinearRenderer(renderer, u, seed, tick)
@@ -704,10 +704,10 @@ def make_predictor(
 
 def count_lights(renderer: Renderer) -> int:
     """Return the number of lights that have a basis image; 1 if no light changes."""
-    lighting = find_lighting(renderer)
+    lighting = find_light_groups(renderer)
     if not lighting.changed_inputs:
         return 1
-    inputs = renderer.scene.assembly(renderer.space.inputs(renderer.start))
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
     return len(LightBasis(renderer, lighting, inputs).inputs_of_light)
 
 
@@ -720,7 +720,7 @@ def count_samples(renderer: Renderer) -> int:
     """
     changed_inputs: set[str] = set()
     for group in renderer.plan.groups:
-        changed_inputs |= renderer.routes.get(group.name, frozenset())
+        changed_inputs |= renderer.inputs_by_group.get(group.name, frozenset())
     n_matrices = len(changed_inputs & find_linear_inputs(renderer))
     samples_per_light = COLLECTED_SPP
     if n_matrices:

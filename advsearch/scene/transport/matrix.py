@@ -37,7 +37,7 @@ from advsearch import seeds
 from advsearch.scene.assembly import IMAGE_INPUTS
 from advsearch.scene.assets import Float32Array, IntArray
 from advsearch.scene.mitsuba_backend.denoise import denoise
-from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, average_passes
+from advsearch.scene.mitsuba_backend.transport import TracedPaths, PathVertices, average_passes
 from advsearch.scene.parts import PATTERN_SUFFIX
 from advsearch.scene.predictor import MAX_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
@@ -315,16 +315,16 @@ class TextureTransport:
         self._scattered = ColoredRows(n_pixels, n_cells, small)
 
     @property
-    def entries(self) -> int:
+    def n_entries(self) -> int:
         """Number of entries of both matrices."""
         return self._sharp.entries + self._scattered.entries
 
     @property
-    def bytes(self) -> int:
+    def n_bytes(self) -> int:
         """Memory of both matrices when they are finished."""
         return self._sharp.bytes + self._scattered.bytes
 
-    def add_pass(self, vertices: Sequence[Vertices], pass_weight: float) -> None:
+    def add_pass(self, vertices: Sequence[PathVertices], pass_weight: float) -> None:
         """Add the vertices of one pass of paths to both matrices.
 
         A vertex that a pixel sees sharply counts for the four texels of a bilinear
@@ -539,13 +539,13 @@ class LinearizedScene:
     It can be sent to another process.
     """
 
-    transports: Mapping[str, TextureTransport]  # finished matrices by input
+    transport_by_input: Mapping[str, TextureTransport]  # finished matrices by input
     # values of the inputs with a matrix, at which the image is linearized
     linearized_at: dict[str, Tensor]
     image_inputs: Inputs  # inputs of the finished image, not of the scene
     # linear radiance at `linearized_at`; with a backdrop also coverage
     base_image: PackedImage
-    non_finite: int = 0  # how many values were not finite
+    n_non_finite: int = 0  # how many values were not finite
 
 
 class LinearRenderer(Predictor):
@@ -615,21 +615,21 @@ class LinearRenderer(Predictor):
                     light=light,
                 )
         self.collected = collected
-        self.non_finite = collected.non_finite
+        self.n_non_finite = collected.n_non_finite
         self.linearized_at = collected.linearized_at
 
     @property
     def n_entries(self) -> int:
         """Number of entries of all matrices."""
-        transports = self.collected.transports.values()
-        return sum(transport.entries for transport in transports)
+        transports = self.collected.transport_by_input.values()
+        return sum(transport.n_entries for transport in transports)
 
     @property
     def n_bytes(self) -> int:
         """Memory of all matrices and the base image, 8 bytes a pixel."""
         height, width = self.path_renderer.formation.resolution
-        transports = self.collected.transports.values()
-        return sum(transport.bytes for transport in transports) + 8 * height * width
+        transports = self.collected.transport_by_input.values()
+        return sum(transport.n_bytes for transport in transports) + 8 * height * width
 
     def release_scene(self, space: InputSpace) -> None:
         """Release the scene, which only tracing needs. Predictions stay possible.
@@ -655,7 +655,7 @@ class LinearRenderer(Predictor):
         base = self.collected.base_image()
         radiance = base[..., :3]
         crop = self.path_renderer.crop
-        for name, transport in self.collected.transports.items():
+        for name, transport in self.collected.transport_by_input.items():
             color_change = inputs[name] - self.linearized_at[name]
             change = transport(color_change)
             if crop is not None:
@@ -705,9 +705,9 @@ def _collect(
         light: scene inputs that replace those of u.
     """
     # The renderer counts the values of all calls; those of this call are the increase.
-    non_finite_before = renderer.non_finite
+    non_finite_before = renderer.n_non_finite
     # `find_front` adds which part of a photograph is in front of the object.
-    inputs = renderer.find_front(renderer.scene.assembly(renderer.space.inputs(u)))
+    inputs = renderer.replace_photograph_depth(renderer.scene.input_assembler(renderer.space.inputs(u)))
     # inputs of the finished image, and inputs of the scene
     image_inputs = {
         name: value for name, value in inputs.items() if name in IMAGE_INPUTS
@@ -742,11 +742,11 @@ def _collect(
         base = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
         tick(spp)
     return LinearizedScene(
-        transports=transports,
+        transport_by_input=transports,
         linearized_at=linearized_at,
         image_inputs=image_inputs,
         base_image=PackedImage(base, is_small=quick),
-        non_finite=renderer.non_finite - non_finite_before,
+        n_non_finite=renderer.n_non_finite - non_finite_before,
     )
 
 
@@ -796,7 +796,7 @@ def _trace_matrices(
         base = torch.cat([base, paths.coverage], dim=-1)
         base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
     if renderer.crop is not None:
-        base = renderer.crop.window.paste(base, renderer.crop.surroundings)
+        base = renderer.crop.window.paste(base, renderer.crop.surrounding_image)
     return base
 
 
@@ -820,7 +820,7 @@ def _append_plane_change(
     has_backdrop = True
     image = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
     if renderer.crop is not None:
-        image = renderer.crop.window.select(image)
+        image = renderer.crop.window.crop_image(image)
     # The first channels are radiance and coverage, which `base` has already.
     plane_channels = image[..., 4:]
     return torch.cat([base, plane_channels], dim=-1)
@@ -833,7 +833,7 @@ def _fill_transports(
     seed: int,
     tick: ProgressCallback,
     spp: int,
-) -> Paths:
+) -> TracedPaths:
     """Trace paths for each matrix and add them; return the mean images of all.
 
     The paths differ only in the texture at whose vertices they collect weights, and in
@@ -848,15 +848,15 @@ def _fill_transports(
     samples, n_passes = plan_passes(renderer, spp)
     height, width = _get_traced_size(renderer)
     base_image_bytes = 2 * 4 * height * width  # up to four channels of 16 bits
-    images: list[Paths] = []
+    images: list[TracedPaths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
-            noise_seed = seeds.stream(seed, f"transport {name}", index)
+            noise_seed = seeds.derive_seed(seed, f"transport {name}", index)
             paths = renderer.scene.collect_paths(
                 scene_inputs, name, noise_seed, samples
             )
             transport.add_pass(paths.vertices, pass_weight=1.0 / n_passes)
-            matrix_bytes = sum(filled.bytes for filled in transports.values())
+            matrix_bytes = sum(filled.n_bytes for filled in transports.values())
             if matrix_bytes + base_image_bytes > scale_limit(MAX_BYTES):
                 raise TransportTooLargeError(
                     f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
@@ -867,7 +867,7 @@ def _fill_transports(
 
 
 def _denoise_base(
-    renderer: Renderer, radiance: Tensor, paths: Paths, quick: bool
+    renderer: Renderer, radiance: Tensor, paths: TracedPaths, quick: bool
 ) -> tuple[Tensor, Smooth | None]:
     """Denoise the base image; also return the function that denoises a matrix's colors.
 

@@ -15,18 +15,18 @@ from torch import Tensor
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Query, Random, SearchResult, search
 from advsearch.attacks.evaluation import Policy, limit_to_single_thread, seeded
 from advsearch.attacks.policies.auto import make_plan
-from advsearch.attacks.policies.surrogate import find_box_coordinates, fit
+from advsearch.attacks.policies.surrogate import find_box_coordinates, fit_gaussian_process
 from covering import once_each
 
 POSE = (Block(3, name="position"), Block(3, periodic=True, name="rotation"))
 BALL = Block(40, "linf", 0.1, name="texture")
-CHOICE = Block(1, options=4, name="backdrop")
+CHOICE = Block(1, n_options=4, name="backdrop")
 
 DOMAINS = {
     "box": (Block(2, low=0.25, high=0.75),),
     "pose": POSE,
     "choice": (CHOICE,),
-    "choices and numbers": (CHOICE, Block(2), Block(1, options=2)),
+    "choices and numbers": (CHOICE, Block(2), Block(1, n_options=2)),
     "many": (Block(30),),
     "texture and pose": (BALL, *POSE, CHOICE),
     "pose between balls": (Block(5, "l2", 0.2), Block(2, periodic=True), BALL),
@@ -62,7 +62,7 @@ class Smooth:
         assert u.dtype == torch.float32
         self.asked.append(gradient)
         self.seen.append(u.clone())
-        rng = np.random.default_rng([self.seed, query.index, zlib.crc32(u.numpy().tobytes())])
+        rng = np.random.default_rng([self.seed, query.row_index, zlib.crc32(u.numpy().tobytes())])
         value = self.value(u) + self.noise * rng.normal()
         slope = None
         if gradient:
@@ -140,7 +140,7 @@ def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> Non
     x = box.sample_screen(3, 60)
     y = torch.sin(5 * x[:, 0]) + 0.2 * torch.randn(60, generator=seeded(0, 0))
     with limit_to_single_thread():
-        surrogate = fit(box, x, y)
+        surrogate = fit_gaussian_process(box, x, y)
     new = box.sample_screen(4, 200)
     mean, deviation = surrogate.predict(new)
     error = (mean - torch.sin(5 * new[:, 0])).square().mean().sqrt()
@@ -180,7 +180,7 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
 
     def reached(policy: Policy[Any]) -> float:
         def evaluate(query: Query) -> Evaluation:
-            rng = np.random.default_rng([seed, query.index, zlib.crc32(query.u.numpy().tobytes())])
+            rng = np.random.default_rng([seed, query.row_index, zlib.crc32(query.u.numpy().tobytes())])
             value = function(query.u.double().numpy()) + noise * rng.normal()
             return Evaluation(value, None, value > 0)
 

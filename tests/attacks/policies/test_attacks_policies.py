@@ -51,7 +51,7 @@ class Problem:
         `noise` x the gradient's root mean square (so with noise 1 half of the gradient's energy is noise)."""
 
         def evaluate(query: Query) -> Evaluation:
-            rng = seeded(seed, query.index)
+            rng = seeded(seed, query.row_index)
             exact = self.gradient(query.u)
             rough = exact + noise * exact.square().mean().sqrt() * torch.randn(exact.shape, generator=rng)
             value = self.value(query.u) + noise * 0.05 * self.optimum * float(torch.randn(1, generator=rng))
@@ -72,7 +72,7 @@ def linear(d: int, norm: str, seed: int) -> Problem:
     rng = seeded(seed, d)
     start, w = torch.rand(d, generator=rng), torch.randn(d, generator=rng)
     domain = domain_of(start, norm)
-    best = domain.project(start + 1e4 * w) if norm == "l2" else torch.where(w > 0, domain.upper, domain.lower)
+    best = domain.project(start + 1e4 * w) if norm == "l2" else torch.where(w > 0, domain.upper_bounds, domain.lower_bounds)
 
     def value(u: Tensor) -> float:
         return float((w.double() * (u - start).double()).sum())
@@ -156,7 +156,7 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
     climbing = Domain(torch.zeros(4), (Block(4),))
 
     def evaluate(query: Query) -> Evaluation:
-        return Evaluation(float(query.index), torch.ones(4), False)
+        return Evaluation(float(query.row_index), torch.ones(4), False)
 
     assert search(partial(map, evaluate), climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
 
@@ -182,7 +182,7 @@ MIXED = Domain(
 FEW = Domain(torch.tensor([0.4, 0.5, 0.7]), (Block(1, "linf", 0.1), Block(1, "l2", 0.2), Block(1)))
 CHOOSY = Domain(
     torch.tensor([0.1, 0.3, 0.6, 0.2, 0.7]),
-    (Block(1, options=3), Block(1, periodic=True), Block(2, low=0.1, high=0.9), Block(1, options=2)),
+    (Block(1, n_options=3), Block(1, periodic=True), Block(2, low=0.1, high=0.9), Block(1, n_options=2)),
     gradient_cost=2,
 )
 
@@ -246,13 +246,13 @@ def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1) -> Eval
 
     def evaluate(query: Query) -> Evaluation:
         x = query.u.clone().requires_grad_(bool(query.gradient))
-        noise = 0.01 / math.sqrt(query.samples) * torch.randn(d, generator=seeded(7, query.index))
+        noise = 0.01 / math.sqrt(query.samples) * torch.randn(d, generator=seeded(7, query.row_index))
         logits = (((x + noise) @ first).tanh() @ second)[None]
         value = get_objective(objective)(logits, torch.zeros(1, 1, 1, 3), (0, 2))[0]
         slope = torch.autograd.grad(value, x)[0] if query.gradient else None
-        if slope is not None and query.index % 3 == 1:
-            slope[query.index % d] = math.nan
-        number = math.nan if query.index == nan_at else float(value.detach())
+        if slope is not None and query.row_index % 3 == 1:
+            slope[query.row_index % d] = math.nan
+        number = math.nan if query.row_index == nan_at else float(value.detach())
         return Evaluation(number, slope, bool(logits.argmax() % 2), cost=query.samples)
 
     return partial(map, evaluate)
@@ -298,7 +298,7 @@ def test_half_of_the_domain_cannot_be_evaluated(policy: Policy[Any], bad: float)
 
     def evaluate(query: Query) -> Evaluation:
         (evaluation,) = inner([query])
-        if float(query.u[-1]) <= float(domain.start[-1]) + 1e-3 or query.index % 3 == 0:
+        if float(query.u[-1]) <= float(domain.start[-1]) + 1e-3 or query.row_index % 3 == 0:
             return evaluation
         return replace(evaluation, objective=bad, gradient=query.u * math.nan if query.gradient else None)
 
@@ -342,7 +342,7 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
         for k in range(index, index + steps):
             (proposal,), state = policy.propose(state, 1)
             seen.append(proposal.u)
-            query = Query(proposal.u, k, index=3 * k, gradient=proposal.gradient, samples=proposal.samples)
+            query = Query(proposal.u, k, row_index=3 * k, gradient=proposal.gradient, samples=proposal.samples)
             (evaluation,) = evaluate([query])
             state = policy.update(state, [(proposal.u, evaluation)])
         return state, torch.stack(seen)
@@ -368,7 +368,7 @@ def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
     """A peak that only the first steps see; then the gradient leads away from it, downhill."""
 
     def evaluate(query: Query) -> Evaluation:
-        return Evaluation(5.0 if query.index == 2 else -0.1 * query.index, torch.ones(2), False)
+        return Evaluation(5.0 if query.row_index == 2 else -0.1 * query.row_index, torch.ones(2), False)
 
     seen: list[Tensor] = []
     domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))

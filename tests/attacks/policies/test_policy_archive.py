@@ -32,7 +32,7 @@ def failing_cells(scene: str, policy: str, renders: int, noise: float, seed: int
     cells = set()
 
     def evaluate(query: Query) -> Evaluation:
-        generator = torch.Generator().manual_seed(100_003 * seed + query.index)
+        generator = torch.Generator().manual_seed(100_003 * seed + query.row_index)
         exact = margin(query.u)
         if exact > 0.0:
             first, second = (min(int(SIDE * float(value)), SIDE - 1) for value in query.u[:2])
@@ -63,7 +63,7 @@ def choice(u: Tensor) -> float:
 
 BOX = Domain(torch.full((6,), 0.2), tuple(Block(1, name=f"number {k}") for k in range(6)))
 MIXED = Domain(
-    torch.full((5,), 0.25), tuple(Block(1, name=f"number {k}", options=6 if k == 2 else 0) for k in range(5))
+    torch.full((5,), 0.25), tuple(Block(1, name=f"number {k}", n_options=6 if k == 2 else 0) for k in range(5))
 )
 SCENES: dict[str, tuple[Domain, Callable[[Tensor], float]]] = {
     "ball": (BOX, ball),
@@ -95,14 +95,14 @@ def test_a_cell_keeps_the_largest_objective_and_nothing_that_could_not_be_evalua
 
 
 def test_failing_cells_are_told_with_their_ends_and_those_of_a_generation_that_is_not_whole() -> None:
-    domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, name="a"), Block(1, name="b", options=2)))
+    domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, name="a"), Block(1, name="b", n_options=2)))
     policy = MapElites(over="a,b", cells=4, population=5)
     state = policy.start(domain, torch.Generator().manual_seed(0), 100)
     points = [torch.tensor(point) for point in ([0.1, 0.25], [0.2, 0.25], [0.3, 0.25], [0.8, 0.75])]
     state = replace(state, points=torch.stack([*points, points[0]]))
     told = [(u, Evaluation(v, None, v > 1.5)) for u, v in zip(points, [2.0, 3.0, 1.0, 4.0], strict=True)]
     known = policy.failures(policy.update(state, told))
-    assert (known.over, known.n_failures, known.n_visited, known.n_cells) == ((0, 1), 2, 3, 8)
+    assert (known.cell_parameter_indices, known.n_failures, known.n_visited, known.n_cells) == ((0, 1), 2, 3, 8)
     assert [one.objective for one in known.examples] == [4.0, 3.0]
     assert known.examples[1].u.tolist() == pytest.approx([0.2, 0.25])
     assert [one.ranges for one in known.examples] == [{0: (0.75, 1.0), 1: (0.5, 1.0)}, {0: (0.0, 0.25), 1: (0.0, 0.5)}]

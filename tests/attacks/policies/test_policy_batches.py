@@ -12,7 +12,7 @@ from advsearch.attacks.policies.choices import wrap_choices
 from covering import once_each
 
 NUMBERS = Domain(torch.tensor([0.3, 0.6, 0.5, 0.5]), (Block(2), Block(2, "linf", 0.2)))
-CHOICES = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, options=3), Block(1), Block(1, options=2)))
+CHOICES = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, n_options=3), Block(1), Block(1, n_options=2)))
 COSTLY = Domain(torch.tensor([0.3, 0.6]), (Block(2),), gradient_cost=4)
 DOMAINS = {"numbers": NUMBERS, "choices": CHOICES, "differences": COSTLY}
 FORMS: dict[str, Policy[Any]] = {

@@ -19,7 +19,7 @@ both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: po
 
 def evaluator(value: Callable[[Tensor], float], noise: float = 0.0) -> Evaluate:
     def evaluate(query: Query) -> Evaluation:
-        error = noise * float(torch.randn(1, generator=seeded(5, query.index)))
+        error = noise * float(torch.randn(1, generator=seeded(5, query.row_index)))
         return Evaluation(value(query.u) + error, None, False)
 
     return partial(map, evaluate)
@@ -94,7 +94,7 @@ def test_an_optimum_in_a_corner_is_reached_and_the_mean_stays_inside(policy: Pol
     domain = Domain(torch.full((5,), 0.45), (Block(5, norm, {"linf": 0.2, "l2": 0.3, "box": None}[norm]),))  # type: ignore[arg-type]
     w = torch.tensor([1.0, -2.0, 0.5, 1.5, -1.0])
     far = domain.project(domain.start + 1e4 * w)
-    best = float(w @ far if norm == "l2" else w @ torch.where(w > 0, domain.upper, domain.lower))
+    best = float(w @ far if norm == "l2" else w @ torch.where(w > 0, domain.upper_bounds, domain.lower_bounds))
     result = search(evaluator(lambda u: float(w @ u)), domain, policy, steps=400, seed=0, candidates=0)
     start = float(w @ domain.start)
     assert result.distribution is not None

@@ -43,7 +43,7 @@ def points(policy: Policy[Any], domain: Domain, steps: int, seed: int = 0) -> tu
 
 
 def test_a_grid_is_full_and_each_point_comes_once() -> None:
-    domain = Domain(torch.tensor([0.5, 0.5, 0.1]), (Block(1, low=0.2, high=0.8), Block(1), Block(1, options=3)))
+    domain = Domain(torch.tensor([0.5, 0.5, 0.1]), (Block(1, low=0.2, high=0.8), Block(1), Block(1, n_options=3)))
     seen, result = points(Grid(), domain, 40)
     assert result.stopped is Ending.STALLED
     assert len(seen) == 36  # 4 x 3 x 3; 5 x 3 x 3 and 4 x 4 x 3 are over 40
@@ -87,7 +87,7 @@ def test_a_grid_of_given_size_and_a_grid_that_does_not_fit() -> None:
     with pytest.raises(InputError, match="are billions of renders"):
         points(Grid(), Domain(torch.full((50_000,), 0.5), (Block(50_000, "linf", 0.1),)), 40)
     with pytest.raises(InputError, match="32 renders"):
-        points(Grid(), Domain(torch.full((3,), 0.5), (Block(2), Block(1, options=8))), 31)
+        points(Grid(), Domain(torch.full((3,), 0.5), (Block(2), Block(1, n_options=8))), 31)
     with pytest.raises(InputError, match="25 renders"):
         points(Grid(points=5), Domain(torch.full((2,), 0.5), (Block(2),)), 24)
     with pytest.raises(InputError, match="points"):

@@ -18,7 +18,7 @@ BOX = Domain(
         Block(1, name="yaw", periodic=True),
         Block(1, name="height"),
         Block(1, name="light"),
-        Block(1, name="kind", options=4),
+        Block(1, name="kind", n_options=4),
     ),
 )
 Margin = Callable[[Tensor], Tensor]

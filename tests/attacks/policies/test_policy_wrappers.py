@@ -32,7 +32,7 @@ def test_restarts_find_the_higher_of_two_hills() -> None:
 
 def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
     domain = Domain(
-        torch.tensor([0.5, 0.1, 0.5, 0.5]), (Block(1, "linf", 0.1), Block(1, options=3), Block(2, "l2", 0.2))
+        torch.tensor([0.5, 0.1, 0.5, 0.5]), (Block(1, "linf", 0.1), Block(1, n_options=3), Block(2, "l2", 0.2))
     )
     w = torch.tensor([1.0, 0.0, -1.0, 1.0])
 

@@ -95,7 +95,7 @@ def test_every_claim_is_held_failed_or_undecided_and_stops_when_it_is(tested: tu
     found = {one.name: one for one in result.claims}
     answers = {name: one.verdict for name, one in found.items()}
     assert answers == {"in-front": "held", "behind": "failed", "too-few": "undecided", "no-worse": "held"}
-    assert (result.verdict, result.status, result.brief) == ("failed", 1, "2 held, 1 failed, 1 undecided")
+    assert (result.verdict, result.status, result.outcome_summary) == ("failed", 1, "2 held, 1 failed, 1 undecided")
     assert 6 <= found["in-front"].pictures < 20 and found["in-front"].interval[0] >= 0.5  # type: ignore[index]
     assert found["behind"].rate == 0.0 and "right in 0 of" in found["behind"].reason
     picture = advsearch.load_run(folder / "run").run  # type: ignore[union-attr]

@@ -121,10 +121,10 @@ def test_rays_go_where_those_of_the_camera_do(size: tuple[int, int]) -> None:
     camera = {"shift_x": 0.2, "shift_y": -0.1, "fov": 50.0, "roll": 20.0, "azimuth": [0, 360]}
     of = scene.renderer({"camera": camera}, resolution=size)
     made = SurfaceRenderer(of, of.start, seed=0)
-    inputs = of.scene.assembly(of.space.inputs(of.start))
+    inputs = of.scene.input_assembler(of.space.inputs(of.start))
     cameras = [{name: inputs.get(name, of.scene.get_base_value(name)) for name in arrangement.CAMERA_INPUTS}]
     covered = made.arrangement.start_tracing(cameras, made.compute_light(inputs))().coverage[0, ..., 0]
-    same = (covered > 0.5) == (of.surfaces(of.start).id > 0)
+    same = (covered > 0.5) == (of.find_surfaces(of.start).id > 0)
     assert 0.1 < float((covered > 0.5).float().mean()) < 0.9
     assert float(same.float().mean()) > 0.97
 
@@ -137,7 +137,7 @@ def test_what_is_seen_of_a_photographed_room_is_its_map() -> None:
     made, u = SurfaceRenderer(of, of.start, seed=0), torch.tensor([0.4, 0.1])
     with torch.no_grad():
         truth = of(u, seed=1, spp=256)
-        away = ~of.mask(u)
+        away = ~of.compute_object_mask(u)
         assert levels(made(u)[away], truth[away]) < 8.0
 
 
@@ -244,8 +244,8 @@ def test_exposures_of_one_map_share_its_light(traced: Renderer, light: SurfaceRe
                 changed[group.coordinates] = 1.0 - 0.8 * first[group.coordinates]
     assert not torch.equal(brighter, first) and not torch.equal(turned, first)
     with torch.no_grad():
-        inputs = [traced.scene.assembly(traced.space.inputs(u)) for u in (first, brighter, turned)]
-        lights, factors = zip(*map(light.get_light, inputs), strict=True)
+        inputs = [traced.scene.input_assembler(traced.space.inputs(u)) for u in (first, brighter, turned)]
+        lights, factors = zip(*map(light.get_light_and_factor, inputs), strict=True)
         own = SurfaceRenderer(traced, traced.start, seed=0)(brighter)
         assert lights[1] is lights[0] and lights[2] is not lights[0]
         assert float((factors[1] - factors[0]).abs().min()) > 0.05

@@ -121,7 +121,7 @@ def write_projector(
     inputs_with_marks = control.scene_inputs(
         {**values, "pattern": color.linear_to_srgb(texel_marks)}, earlier_inputs={}
     )
-    seed = seeds.stream(adversarial.problem.seed, "marks")
+    seed = seeds.derive_seed(adversarial.problem.seed, "marks")
     view = adversarial.render(
         {**adversarial.inputs, **inputs_with_marks}, seed, MARKS_SPP
     )
@@ -200,7 +200,7 @@ def has_pattern(control: Control) -> bool:
     projector does.
     """
     return control.competes_with_ambient and any(
-        slot.parameter.name == "pattern" for slot in control.slots
+        slot.parameter.name == "pattern" for slot in control.parameter_slots
     )
 
 

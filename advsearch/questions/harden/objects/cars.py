@@ -16,17 +16,17 @@ from scipy.special import logsumexp
 
 import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.extend import assets
-from advsearch.questions.harden.objects.family import Instance, family
+from advsearch.questions.harden.objects.family import Instance, make_family
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
-    mix,
+    blend_colors,
     painter,
     parse_hex_color,
-    solid,
-    step,
+    paint_solid_color,
+    compute_soft_step,
 )
 
 AXLES = (1.29, -1.33)  # x of the front and the rear axle
@@ -39,7 +39,7 @@ WHEEL_SIDE = 0.852  # distance of a wheel's outer side from the middle of the ca
 CABIN_X = -0.5  # x of the middle of the cabin
 COLUMNS = 92  # faces around the body
 OUTSIDE = -1.0
-"""Value of `_inside...` functions for points at another end or side of the car: they
+"""Value of `_compute_depths_inside...` functions for points at another end or side of the car: they
 are not inside the opening.
 """
 FAR = 9.0
@@ -109,7 +109,7 @@ def _shell(
         u = shapes.mean_lengths(points[columns], axis=1)
         v = shapes.mean_lengths(points[columns], axis=0)
         patches.append(
-            shapes.grid(
+            shapes.make_grid_patch(
                 "paint",
                 points[columns],
                 normals[columns],
@@ -185,9 +185,9 @@ def _shell_normals(points: Array) -> Array:
     return shapes.normalize(np.cross(column_tangent, np.gradient(points, axis=0)))
 
 
-def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
+def _make_height_curve(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
     """Return the function from x to z of a spline through knots (x, z), x ascending."""
-    curve = shapes.spline(knots, count=200)
+    curve = shapes.sample_spline(knots, count=200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
@@ -205,10 +205,10 @@ def _soft_minimum(*fields: Array) -> Array:
 
 # Functions from x to the height of the body's lower edge, of the lower edge of the
 # windows (the waist), and of the roof.
-_bottom_z = _line(
+_bottom_z = _make_height_curve(
     [(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)]
 )
-_waist_z = _line(
+_waist_z = _make_height_curve(
     [
         (-2.2, 1.0),
         (-1.9, 0.995),
@@ -222,7 +222,7 @@ _waist_z = _line(
         (2.2, 0.62),
     ]
 )
-_roof_z = _line(
+_roof_z = _make_height_curve(
     [
         (-2.2, 1.26),
         (-1.75, 1.345),
@@ -279,7 +279,7 @@ def _cabin_height(height_fraction: Array, x: Array, y: Array) -> Array:
     return np.asarray(bottom + height_fraction * (roof - bottom))
 
 
-def _inside(points: Array) -> dict[str, Array]:
+def _compute_depths_inside(points: Array) -> dict[str, Array]:
     """Return how far points (N, 3) lie inside each opening, by its name in `OPENINGS`.
 
     The values (N,) are approximate distances to the edge in metres, below 0 outside.
@@ -411,7 +411,7 @@ An opening without a tag (None) is removed.
 
 def _opening(name: str) -> shapes.Field:
     """Return the field of an opening, positive inside it."""
-    return lambda points: _inside(points)[name]
+    return lambda points: _compute_depths_inside(points)[name]
 
 
 def _body_and_cabin() -> list[Patch]:
@@ -430,8 +430,8 @@ def _body_and_cabin() -> list[Patch]:
         (1.0, scale * 0.5, CABIN_X + scale * 0.28, CABIN_X - scale * 0.8)
         for scale in (0.75, 0.45, 0.15, 0.002)
     ]
-    body_levels = np.array([*shapes.spline(_BODY, count=23), *deck])
-    cabin_levels = np.array([*shapes.spline(_CABIN, count=16), *roof])
+    body_levels = np.array([*shapes.sample_spline(_BODY, count=23), *deck])
+    cabin_levels = np.array([*shapes.sample_spline(_CABIN, count=16), *roof])
     shells = {
         "body": _shell(
             body_levels, _BODY_POWER, center_x=0.0, height=_body_height, corner=0.085
@@ -459,8 +459,8 @@ def _wheels() -> list[Patch]:
     for axle_x, side in WHEEL_POSITIONS:
         # The wheel's axis is laid along y, outwards. Then the wheel rolls a little:
         # front and rear wheels by different angles, so that their spokes differ.
-        outwards = shapes.rotation("x", -90.0 * side)
-        rolled = shapes.rotation("y", 17.0 * axle_x)
+        outwards = shapes.make_rotation_matrix("x", -90.0 * side)
+        rolled = shapes.make_rotation_matrix("y", 17.0 * axle_x)
         center = (axle_x, side * (WHEEL_SIDE - TYRE / 2), WHEEL)
         patches += shapes.transform_patches(wheel, rolled @ outwards, center)
     return patches
@@ -485,11 +485,11 @@ def _wheel() -> list[Patch]:
     ]
     round_hub = shapes.round_corners(hub, radius=0.008, steps=2)
     return [
-        *shapes.lathe([("rubber", _tyre_profile(RIM, outer_z))], columns=28),
-        *shapes.lathe([("rim", rim_edge)], columns=28),
-        *shapes.lathe([("well", ground)], columns=24),
+        *shapes.revolve_profile([("rubber", _tyre_profile(RIM, outer_z))], columns=28),
+        *shapes.revolve_profile([("rim", rim_edge)], columns=28),
+        *shapes.revolve_profile([("well", ground)], columns=24),
         *_spokes(outer_z),
-        *shapes.lathe([("rim", round_hub)], columns=20),
+        *shapes.revolve_profile([("rim", round_hub)], columns=20),
     ]
 
 
@@ -511,8 +511,8 @@ def _spokes(outer_z: float) -> list[Patch]:
     for number, side in product(range(5), (-1.0, 1.0)):
         bar[:, 1] = side * np.array([0.012, 0.018, 0.04])
         patches += shapes.transform_patches(
-            shapes.sweep("rim", bar, section, (1.0, 1.0, 1.15)),
-            shapes.rotation("z", 72.0 * number),
+            shapes.sweep_section("rim", bar, section, (1.0, 1.0, 1.15)),
+            shapes.make_rotation_matrix("z", 72.0 * number),
         )
     return patches
 
@@ -549,7 +549,7 @@ def _wells() -> list[Patch]:
         center_x=0.0,
     )
     floor = np.stack([x, y, np.full_like(x, 0.2)], axis=1)
-    return [*patches, shapes.cap("well", floor, np.array([0.0, 0.0, -1.0]))]
+    return [*patches, shapes.make_cap_face("well", floor, np.array([0.0, 0.0, -1.0]))]
 
 
 def _well(axle: float, side: float) -> list[Patch]:
@@ -572,7 +572,7 @@ def _well(axle: float, side: float) -> list[Patch]:
     if side > 0:
         edges = edges[::-1]
         inner_edge = inner_edge[::-1]
-    curved_wall = shapes.grid(
+    curved_wall = shapes.make_grid_patch(
         "well",
         edges,
         np.broadcast_to(-outwards, edges.shape),
@@ -581,12 +581,12 @@ def _well(axle: float, side: float) -> list[Patch]:
         down=np.array([0.0, 1.0]),
         across=np.linspace(0.0, 1.0, len(angle)),
     )
-    return [curved_wall, shapes.cap("well", inner_edge, np.array([0.0, side, 0.0]))]
+    return [curved_wall, shapes.make_cap_face("well", inner_edge, np.array([0.0, side, 0.0]))]
 
 
 def _fittings() -> list[Patch]:
     """Create mirrors, plates, badges, door handles and a spoiler."""
-    spoiler = shapes.box(
+    spoiler = shapes.make_rounded_box(
         "paint", (0, 0, 0), (0.2, 1.04, 0.035), bevel=0.015, steps=2, cells=2
     )
     return [
@@ -594,7 +594,7 @@ def _fittings() -> list[Patch]:
         *_plates_and_badges(),
         *_door_handles(),
         *shapes.transform_patches(
-            spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364)
+            spoiler, shapes.make_rotation_matrix("y", 9.0), (-1.60, 0.0, 1.364)
         ),
     ]
 
@@ -603,13 +603,13 @@ def _mirrors() -> list[Patch]:
     """Create the two mirrors, each a painted shell on a dark arm."""
     patches = []
     for side in (1.0, -1.0):
-        shell = shapes.box(
+        shell = shapes.make_rounded_box(
             "paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), bevel=0.055, steps=3
         )
         patches += shapes.transform_patches(
-            shell, shapes.rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005)
+            shell, shapes.make_rotation_matrix("z", -14.0 * side), (0.57, side * 0.93, 1.005)
         )
-        patches += shapes.box(
+        patches += shapes.make_rounded_box(
             "trim",
             (0.58, side * 0.83, 0.955),
             (0.06, 0.14, 0.035),
@@ -621,8 +621,8 @@ def _mirrors() -> list[Patch]:
 
 def _plates_and_badges() -> list[Patch]:
     """Create a licence plate and a badge at the front, and the same at the rear."""
-    plate = shapes.box("plate", (0, 0, 0), (0.014, 0.52, 0.112), bevel=0.004, steps=1)
-    badge = shapes.lathe(
+    plate = shapes.make_rounded_box("plate", (0, 0, 0), (0.014, 0.52, 0.112), bevel=0.004, steps=1)
+    badge = shapes.revolve_profile(
         [("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])],
         columns=24,
     )
@@ -634,7 +634,7 @@ def _plates_and_badges() -> list[Patch]:
         (badge, -80.0, (-2.075, 0.0, 0.86)),
     ):
         patches += shapes.transform_patches(
-            fitting, shapes.rotation("y", tilt), position
+            fitting, shapes.make_rotation_matrix("y", tilt), position
         )
     return patches
 
@@ -643,7 +643,7 @@ def _door_handles() -> list[Patch]:
     """Create the handles of the four doors."""
     patches = []
     for side, x in product((1.0, -1.0), (0.05, -0.92)):
-        patches += shapes.box(
+        patches += shapes.make_rounded_box(
             "paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), bevel=0.011, steps=1
         )
     return patches
@@ -674,9 +674,9 @@ def _lacquer(t: Texels, color: Array) -> Array:
     fold_distance = shapes.distance_to_polylines(x, np.abs(y), fold_line)
     fold = np.clip(1.0 - fold_distance / 0.05, 0.0, 1.0)
     is_hood = (x > 0.8) & (z > 0.7)
-    shaded = mix(color, 0.75 * color, 0.4 * np.where(is_hood, fold, 0.0))
-    gap = step(0.005 - _gap_distance(t), 0.0, soft=0.011)
-    return mix(shaded, 0.12 * color, 0.9 * gap)
+    shaded = blend_colors(color, 0.75 * color, 0.4 * np.where(is_hood, fold, 0.0))
+    gap = compute_soft_step(0.005 - _gap_distance(t), 0.0, soft=0.011)
+    return blend_colors(shaded, 0.12 * color, 0.9 * gap)
 
 
 def _gap_distance(t: Texels) -> Array:
@@ -708,13 +708,13 @@ def _panes(t: Texels) -> Array:
     x, y, z = t.xyz.T
     abs_y = np.abs(y)
     height_fraction = np.clip((z - 0.95) / 0.5, 0.0, 1.0)  # lighter towards the roof
-    glass = mix(parse_hex_color("20272b"), parse_hex_color("414d55"), height_fraction)
+    glass = blend_colors(parse_hex_color("20272b"), parse_hex_color("414d55"), height_fraction)
     backrest = np.hypot((abs_y - 0.36) / 0.24, (z - 1.0) / 0.2)
     headrest = np.hypot((abs_y - 0.36) / 0.11, (z - 1.23) / 0.055)
-    seat = step(1.0 - np.minimum(backrest, headrest), 0.0, soft=0.15)
-    pillar = step(0.035 - np.abs(x + 0.25), 0.0, soft=0.01)
+    seat = compute_soft_step(1.0 - np.minimum(backrest, headrest), 0.0, soft=0.15)
+    pillar = compute_soft_step(0.035 - np.abs(x + 0.25), 0.0, soft=0.01)
     dark = np.maximum(np.where(abs_y > 0.55, pillar, 0.0), np.where(x > 0.0, seat, 0.0))
-    return mix(glass, parse_hex_color("0b0c0d"), dark)
+    return blend_colors(glass, parse_hex_color("0b0c0d"), dark)
 
 
 def _lamps(t: Texels) -> Array:
@@ -725,16 +725,16 @@ def _lamps(t: Texels) -> Array:
     lamp_distance = np.minimum(
         np.hypot(abs_y - 0.58, z - 0.62), np.hypot(abs_y - 0.71, z - 0.64)
     )
-    lamp = step(0.032 - lamp_distance, 0.0, soft=0.01)
-    ring = step(0.01 - np.abs(lamp_distance - 0.039), 0.0, soft=0.008)
-    lit = mix(parse_hex_color("9aa4ab"), parse_hex_color("f4f7f8"), lamp)
-    return mix(lit, parse_hex_color("3a4045"), ring)
+    lamp = compute_soft_step(0.032 - lamp_distance, 0.0, soft=0.01)
+    ring = compute_soft_step(0.01 - np.abs(lamp_distance - 0.039), 0.0, soft=0.008)
+    lit = blend_colors(parse_hex_color("9aa4ab"), parse_hex_color("f4f7f8"), lamp)
+    return blend_colors(lit, parse_hex_color("3a4045"), ring)
 
 
 def _taillights(t: Texels) -> Array:
     """Paint taillights: dark red with a bright stripe."""
-    stripe = step(0.018 - np.abs(t.xyz[:, 2] - 0.87), 0.0, soft=0.01)
-    return mix(parse_hex_color("8e0d12"), parse_hex_color("d8392f"), stripe)
+    stripe = compute_soft_step(0.018 - np.abs(t.xyz[:, 2] - 0.87), 0.0, soft=0.01)
+    return blend_colors(parse_hex_color("8e0d12"), parse_hex_color("d8392f"), stripe)
 
 
 def _slats(t: Texels) -> Array:
@@ -742,8 +742,8 @@ def _slats(t: Texels) -> Array:
     x, _, z = t.xyz.T
     is_upper_grille = (x > 1.9) & (z > 0.48)
     from_middle = np.abs((z % 0.034) - 0.017)  # slats are 3.4 cm apart
-    slat = np.where(is_upper_grille, step(0.006 - from_middle, 0.0, soft=0.006), 0.0)
-    return mix(parse_hex_color("17181a"), parse_hex_color("8b9095"), slat)
+    slat = np.where(is_upper_grille, compute_soft_step(0.006 - from_middle, 0.0, soft=0.006), 0.0)
+    return blend_colors(parse_hex_color("17181a"), parse_hex_color("8b9095"), slat)
 
 
 @painter
@@ -764,7 +764,7 @@ def _plate(t: Texels, ground: Array) -> Array:
     is_upright = np.abs(from_middle - 0.27) < 0.09
     is_bar = (from_middle < 0.3) & (np.abs(np.abs(z) - 0.5) < 0.13)
     strokes = is_within_margin & is_filled & (is_upright | is_bar)
-    return mix(ground, parse_hex_color("16181c"), strokes.astype(np.float64))
+    return blend_colors(ground, parse_hex_color("16181c"), strokes.astype(np.float64))
 
 
 GLASS = assets.Material(roughness=0.04, specular=0.6)
@@ -782,7 +782,7 @@ FINISHES = {
 
 
 # built in metres; the texture is 384 texels wide
-@family(metres=1.0, texels=384)
+@make_family(unit_in_metres=1.0, texels=384)
 def car(sampler: ParameterSampler) -> Instance:
     """Make a car of random proportions and paint.
 
@@ -806,11 +806,11 @@ def car(sampler: ParameterSampler) -> Instance:
         "glass": _panes,
         "headlight": _lamps,
         "taillight": _taillights,
-        "rubber": solid("1c1c1d"),
-        "rim": solid(metal),
+        "rubber": paint_solid_color("1c1c1d"),
+        "rim": paint_solid_color(metal),
         "trim": _slats,
         "plate": _plate(sampler.sample_color("f2f2ec", "f0d264", p_random=0.0)),
-        "well": solid("0a0a0b"),
+        "well": paint_solid_color("0a0a0b"),
     }
     return Instance(
         shapes.stretch_patches(patches, stretch),
@@ -825,6 +825,6 @@ def car(sampler: ParameterSampler) -> Instance:
             "trim": 0.7,
             "plate": 3.0,
         },
-        finishes=FINISHES,
+        materials_by_tag=FINISHES,
         drives=True,  # it can move along a path as a vehicle does
     )

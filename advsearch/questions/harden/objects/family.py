@@ -172,7 +172,7 @@ def paint_atlas(
     is_used = np.zeros((side, side), dtype=bool)
     for patch, rectangle in zip(patches, rectangles, strict=True):
         u, v = _chart_coordinates(rectangle)
-        color = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
+        color = paints[patch.tag](Texels(patch.compute_rest_points(u, v), u, v, patch.size))
         area = np.s_[
             rectangle.y : rectangle.y + rectangle.height,
             rectangle.x : rectangle.x + rectangle.width,
@@ -280,7 +280,7 @@ class Instance:
         material: parameters of the surface other than its color.
         texel_density: texels per length by tag, relative to the rest of the object:
             lower for parts that are hardly visible.
-        finishes: materials by tag, if the object has several; then its tags are the
+        materials_by_tag: materials by tag, if the object has several; then its tags are the
             names of materials.
         rig: moves the vertices of all patches, in the order of the patches; None if the
             object has no pose.
@@ -291,7 +291,7 @@ class Instance:
     paints: Mapping[str, Paint]
     material: assets.Material
     texel_density: Mapping[str, float] = field(default_factory=dict)
-    finishes: Mapping[str, assets.Material] = field(default_factory=dict)
+    materials_by_tag: Mapping[str, assets.Material] = field(default_factory=dict)
     rig: assets.MeshRig | None = None
     drives: bool = False
 
@@ -302,15 +302,15 @@ class ObjectFamily:
 
     Attributes:
         name: name of the class, usable on the command line.
-        make: function that builds an instance from a `ParameterSampler`.
-        size_in_metres: length of the unit in which instances are built, in metres.
-        texels: width of the texture.
+        make_instance: function that builds an instance from a `ParameterSampler`.
+        unit_in_metres: length of the unit in which instances are built, in metres.
+        atlas_size: width of the texture.
     """
 
     name: str
-    make: Callable[[ParameterSampler], Instance]
-    size_in_metres: float
-    texels: int = DEFAULT_ATLAS_SIZE
+    make_instance: Callable[[ParameterSampler], Instance]
+    unit_in_metres: float
+    atlas_size: int = DEFAULT_ATLAS_SIZE
 
     @property
     def label(self) -> str:
@@ -327,32 +327,32 @@ class ObjectFamily:
             rng: random generator that all parameters are sampled from; None for the
                 canonical instance.
         """
-        instance = self.make(ParameterSampler(rng))
-        if instance.finishes:
+        instance = self.make_instance(ParameterSampler(rng))
+        if instance.materials_by_tag:
             instance = _sort_by_material(instance)
         patches = instance.patches
-        rectangles = pack_charts(_scale_charts(instance), self.texels)
-        mesh = join_patches(patches, rectangles, self.texels)
+        rectangles = pack_charts(_scale_charts(instance), self.atlas_size)
+        mesh = join_patches(patches, rectangles, self.atlas_size)
         surface = None
-        if instance.finishes:
+        if instance.materials_by_tag:
             materials = _faces_by_material(patches)
             mesh = replace(mesh, materials=materials, rig=instance.rig)
             surface = workbench.library.make_finished_surface(
-                mesh, instance.finishes, instance.material
+                mesh, instance.materials_by_tag, instance.material
             )
         vertices = np.concatenate([patch.vertices for patch in patches])
         extent = np.ptp(vertices, axis=0).max()
         return assets.ObjectAsset(
             name=self.name,
             mesh=mesh,
-            base_color=paint_atlas(patches, rectangles, instance.paints, self.texels),
+            base_color=paint_atlas(patches, rectangles, instance.paints, self.atlas_size),
             material=instance.material,
             label=self.label,
             source=workbench.library.BUNDLED_OBJECT,
             surface=surface,
-            finishes=instance.finishes,
+            finishes=instance.materials_by_tag,
             # The size of the object is its extent times the length of a unit.
-            size_in_metres=round(float(extent) * self.size_in_metres, 4),
+            size_in_metres=round(float(extent) * self.unit_in_metres, 4),
             drives=instance.drives,
         )
 
@@ -389,17 +389,17 @@ def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.IntArray]:
     }
 
 
-def family(
-    metres: float, texels: int = DEFAULT_ATLAS_SIZE
+def make_family(
+    unit_in_metres: float, texels: int = DEFAULT_ATLAS_SIZE
 ) -> Callable[[Callable[[ParameterSampler], Instance]], ObjectFamily]:
     """Turn a function that makes instances into a family with the function's name.
 
     Args:
-        metres: length in metres of the unit in which instances are built.
+        unit_in_metres: length in metres of the unit in which instances are built.
         texels: width of their texture.
     """
     return lambda make: ObjectFamily(
-        make.__name__.replace("_", "-"), make, metres, texels
+        make.__name__.replace("_", "-"), make, unit_in_metres, texels
     )
 
 
@@ -422,10 +422,10 @@ def sample_material(
     )
     # Few objects have another clearcoat, and very few are partly of metal, as among
     # real objects of this kind.
-    if sampler.chance(0.3):
+    if sampler.sample_bool(0.3):
         clearcoat = sampler(clearcoat, low=0.0, high=1.0)
     metallic = 0.0
-    if sampler.chance(0.06):
+    if sampler.sample_bool(0.06):
         metallic = sampler(0.0, low=0.3, high=0.8)
     values = {
         # no mirror, whose reflections would be noisy, and not completely dull

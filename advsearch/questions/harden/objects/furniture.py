@@ -8,23 +8,23 @@ from typing import NamedTuple
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, family, sample_material
+from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Color,
     Paint,
     ParameterSampler,
-    between,
+    make_range_mask,
     checks,
-    clouded,
+    paint_shaded_clouds,
     dots,
     gradient,
-    over,
-    paint_or_random,
+    paint_over,
+    choose_paint_or_random,
     parse_hex_color,
     rings,
-    shade,
-    solid,
+    scale_brightness,
+    paint_solid_color,
     stripes,
     wood,
 )
@@ -68,13 +68,13 @@ def _post(
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
     bevel = np.array([0.9, 1.0, 1.0, 1.0, 0.9])  # the first and last ring are smaller
     scale = (radii[0] + (radii[1] - radii[0]) * t) * bevel
-    # `sweep` needs a first axis of the section that is not along the post
+    # `sweep_section` needs a first axis of the section that is not along the post
     is_lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
     first_axis = (0.0, 0.0, 1.0) if is_lying else (1.0, 0.0, 0.0)
-    return shapes.sweep(tag, path, section, scale, first=first_axis, caps=True)
+    return shapes.sweep_section(tag, path, section, scale, start_axis=first_axis, has_caps=True)
 
 
-@family(metres=0.01)  # built in centimeters
+@make_family(unit_in_metres=0.01)  # built in centimeters
 def chair(sampler: ParameterSampler) -> Instance:
     """Make a chair that faces +x, with its back at -x, and turn it a little about z.
 
@@ -100,11 +100,11 @@ def chair(sampler: ParameterSampler) -> Instance:
     )
     patches = _chair_legs(legs, seat_height - seat_thickness)
     patches += _chair_seat(sampler, (depth, width, seat_thickness), seat_height)
-    if sampler.chance(0.55, canonical=True):
+    if sampler.sample_bool(0.55, canonical=True):
         patches += _chair_rungs(sampler, legs, seat_height)
     patches += _chair_back(sampler, legs, seat_height, total_height, lean)
     rotated = shapes.transform_patches(
-        patches, shapes.rotation("z", sampler(8.0, low=-25.0, high=25.0))
+        patches, shapes.make_rotation_matrix("z", sampler(8.0, low=-25.0, high=25.0))
     )
     return Instance(
         rotated,
@@ -115,7 +115,7 @@ def chair(sampler: ParameterSampler) -> Instance:
 
 def _leg_section(sampler: ParameterSampler) -> Array:
     """Sample the section (M, 2) of the legs of a chair: square or round."""
-    if sampler.chance(0.5, canonical=True):
+    if sampler.sample_bool(0.5, canonical=True):
         return shapes.rectangle(2.0, 2.0, bevel=0.5, steps=2)
     return shapes.ellipse(1.0, 1.0, count=16)
 
@@ -148,7 +148,7 @@ def _chair_seat(
         seat_height: height of its upper side.
     """
     depth, width, thickness = size
-    patches = shapes.box(
+    patches = shapes.make_rounded_box(
         "seat",
         (0.0, 0.0, seat_height - thickness / 2),
         size,
@@ -156,9 +156,9 @@ def _chair_seat(
         steps=3,
         cells=2,
     )
-    if sampler.chance(0.35):
+    if sampler.sample_bool(0.35):
         # The cushion overlaps the seat a little, so that there is no gap.
-        patches += shapes.box(
+        patches += shapes.make_rounded_box(
             "cushion",
             (0.5, 0.0, seat_height + 1.4),
             (depth - 4.0, width - 4.0, 4.4),
@@ -206,16 +206,16 @@ def _chair_paints(sampler: ParameterSampler, total_height: float) -> dict[str, P
         sampler: samples the paints.
         total_height: height of the chair.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     timber = sampler.sample_color(
         "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", p_random=0.0
     )
     paint_color = sampler.sample_color(
         "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040"
     )
-    is_painted = sampler.chance(0.4)
-    wood_paint = paint_or_random(
-        sampler, total_height, solid(paint_color), p_random=0.5
+    is_painted = sampler.sample_bool(0.4)
+    wood_paint = choose_paint_or_random(
+        sampler, total_height, paint_solid_color(paint_color), p_random=0.5
     )
 
     def wood_along(axis: int) -> Paint:
@@ -227,13 +227,13 @@ def _chair_paints(sampler: ParameterSampler, total_height: float) -> dict[str, P
     fabric_color = sampler.sample_color(
         "8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f"
     )
-    fabric = sampler.pick(
-        clouded(fabric_color, factor=0.8, scale=1.5, offset=offset),
-        stripes(fabric_color, shade(fabric_color, 1.5), cell=6.0),
+    fabric = sampler.sample_choice(
+        paint_shaded_clouds(fabric_color, factor=0.8, scale=1.5, offset=offset),
+        stripes(fabric_color, scale_brightness(fabric_color, 1.5), cell=6.0),
         checks(fabric_color, parse_hex_color("efe6d4"), cell=4.0),
-        dots(solid(fabric_color), parse_hex_color("f4efe4"), cell=6.0),
+        dots(paint_solid_color(fabric_color), parse_hex_color("f4efe4"), cell=6.0),
     )
-    seat_paint = fabric if sampler.chance(0.25) else wood_along(0)
+    seat_paint = fabric if sampler.sample_bool(0.25) else wood_along(0)
     return {
         "up": wood_along(2),
         "along": wood_along(0),
@@ -282,10 +282,10 @@ class _ChairBack(NamedTuple):
         """
         tilt = -float(np.degrees(np.arctan2(self.lean, self.height)))
         return shapes.transform_patches(
-            shapes.box(
+            shapes.make_rounded_box(
                 tag, (0.0, 0.0, 0.0), (self.board_thickness, width, height), bevel=0.5
             ),
-            shapes.rotation("y", tilt),
+            shapes.make_rotation_matrix("y", tilt),
             (self.x_at(z), y, z),
         )
 
@@ -309,7 +309,7 @@ def _chair_back(
         total_height: height of the top of the back.
         lean: how far the top is behind the seat.
     """
-    style = sampler.pick("slats", "ladder", "panel", "arch")
+    style = sampler.sample_choice("slats", "ladder", "panel", "arch")
     back = _ChairBack(
         bottom=seat_height,
         top=total_height,
@@ -359,7 +359,7 @@ def _slatted_back(
             "cross", back.bottom + 0.2 * back.height, back.width, 0.09 * back.height
         )
     high = back.top - 0.15 * back.height
-    n_slats = int(sampler.pick(5, 3, 4, 6))
+    n_slats = int(sampler.sample_choice(5, 3, 4, 6))
     for i in range(n_slats):
         patches += back.make_board(
             "up",
@@ -375,7 +375,7 @@ def _slatted_back(
 def _ladder_back(sampler: ParameterSampler, back: _ChairBack) -> list[Patch]:
     """Create two to four horizontal bars, evenly spaced up to the top."""
     patches = list[Patch]()
-    n_bars = int(sampler.pick(3, 2, 4))
+    n_bars = int(sampler.sample_choice(3, 2, 4))
     for i in range(n_bars):
         z = back.bottom + back.height * (0.28 + 0.66 * i / max(1, n_bars - 1))
         height = back.height * sampler(0.15, low=0.1, high=0.2)
@@ -386,7 +386,7 @@ def _ladder_back(sampler: ParameterSampler, back: _ChairBack) -> list[Patch]:
 def _panel_back(sampler: ParameterSampler, back: _ChairBack) -> list[Patch]:
     """Create a single board, sometimes with the fabric of a cushion."""
     height = sampler(0.6, low=0.35, high=0.75) * back.height
-    tag = "cushion" if sampler.chance(0.3) else "up"
+    tag = "cushion" if sampler.sample_bool(0.3) else "up"
     z = back.top - height / 2 - 0.04 * back.height
     return back.make_board(tag, z, back.width, height)
 
@@ -419,7 +419,7 @@ def _shade(sampler: ParameterSampler, size: _ShadeSize) -> list[Patch]:
     wall = 0.25  # thickness
     bulge = sampler(0.0, low=-0.1, high=0.12) * size.bottom_radius
     middle_radius = (size.bottom_radius + size.top_radius) / 2 + bulge
-    outer = shapes.spline(
+    outer = shapes.sample_spline(
         [
             (size.bottom_radius, size.bottom),
             (middle_radius, (size.bottom + size.top) / 2),
@@ -435,7 +435,7 @@ def _shade(sampler: ParameterSampler, size: _ShadeSize) -> list[Patch]:
         ("lining", inner),
         ("rim", [inner[-1], outer[0]]),
     ]
-    return shapes.lathe(pieces, columns=56)
+    return shapes.revolve_profile(pieces, columns=56)
 
 
 def _lamp_base(
@@ -486,7 +486,7 @@ def _disc_base(
         top[0],
     ]
     side = shapes.round_corners(corners, radius=[0.3, 0.5, 1.0, 1.2], steps=5)
-    return shapes.lathe(
+    return shapes.revolve_profile(
         [
             ("base", under),
             ("base", shapes.subdivide(side, longest=1.6)),
@@ -535,11 +535,11 @@ def _body_base(
         radius=[0.15, 0.3],
         steps=3,
     )
-    return shapes.lathe(
+    return shapes.revolve_profile(
         [
             ("base", under),
             ("foot", foot_ring),
-            ("body", shapes.spline(knots, count=34)),
+            ("body", shapes.sample_spline(knots, count=34)),
             ("base", [knots[-1], top[0]]),
             ("base", top),
         ],
@@ -562,17 +562,17 @@ def _shade_paint(
         offset: (3,) into the noise.
         bottom, top: heights of the shade's edges.
     """
-    cloth = clouded(linen, factor=0.93, scale=1.2, offset=offset)
-    pattern = sampler.pick("plain", "band", "stripes", "dots", "rings", "gradient")
+    cloth = paint_shaded_clouds(linen, factor=0.93, scale=1.2, offset=offset)
+    pattern = sampler.sample_choice("plain", "band", "stripes", "dots", "rings", "gradient")
     accent = sampler.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
 
     def with_edges(color: Color, width: float) -> Paint:
         """Return the cloth with both edges of a color, `width` wide."""
-        lower_edge = over(cloth, between(0.0, bottom + width), solid(color))
-        return over(lower_edge, between(top - width, 2 * top), solid(color))
+        lower_edge = paint_over(cloth, make_range_mask(0.0, bottom + width), paint_solid_color(color))
+        return paint_over(lower_edge, make_range_mask(top - width, 2 * top), paint_solid_color(color))
 
     if pattern == "plain":
-        paint = with_edges(shade(linen, 0.75), 0.5)  # hems
+        paint = with_edges(scale_brightness(linen, 0.75), 0.5)  # hems
     elif pattern == "band":
         paint = with_edges(accent, 1.4)
     elif pattern == "stripes":
@@ -587,11 +587,11 @@ def _shade_paint(
     elif pattern == "rings":
         paint = rings(linen, accent, period=sampler(6.0, low=3.0, high=10.0))
     else:
-        paint = gradient(linen, shade(linen, 0.6), low=bottom, high=top)
-    return paint_or_random(sampler, top, paint, p_random=0.3)
+        paint = gradient(linen, scale_brightness(linen, 0.6), low=bottom, high=top)
+    return choose_paint_or_random(sampler, top, paint, p_random=0.3)
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def lamp(sampler: ParameterSampler) -> Instance:
     """Make a table lamp of random proportions, shade and base.
 
@@ -612,12 +612,12 @@ def lamp(sampler: ParameterSampler) -> Instance:
     )
     foot_radius = sampler(7.4, low=6.0, high=9.5)
     stem_radius = sampler(0.8, low=0.6, high=1.3)
-    style = sampler.pick("body", "disc", "gourd")  # style of the base
+    style = sampler.sample_choice("body", "disc", "gourd")  # style of the base
     # The base reaches into the shade, to just under the bulb.
     base_height = size.bottom + 0.25 * shade_height
     patches = _lamp_base(sampler, style, base_height, foot_radius, stem_radius)
     patches += _shade(sampler, size)
-    patches += shapes.sphere(
+    patches += shapes.make_sphere_patches(
         "bulb",
         min(3.0, 0.4 * top_radius),
         center=(0.0, 0.0, size.bottom + 0.42 * shade_height),
@@ -644,12 +644,12 @@ def _lamp_frame(size: _ShadeSize) -> list[Patch]:
     spoke_z = size.top - 0.12 * size.height
     spoke_length = size.top_radius + (size.bottom_radius - size.top_radius) * 0.12
     for angle in (20.0, 140.0, 260.0):
-        spoke = shapes.sweep(
+        spoke = shapes.sweep_section(
             "base",
             [(0.0, 0.0, spoke_z), (spoke_length, 0.0, spoke_z)],
             shapes.ellipse(0.22, 0.22, count=8),
         )
-        patches += shapes.transform_patches(spoke, shapes.rotation("z", angle))
+        patches += shapes.transform_patches(spoke, shapes.make_rotation_matrix("z", angle))
     # from the bulb up to a small knob above the spokes
     rod_heights = (
         size.bottom + 0.2 * size.height,
@@ -657,12 +657,12 @@ def _lamp_frame(size: _ShadeSize) -> list[Patch]:
         spoke_z + 0.8,
         spoke_z + 1.0,
     )
-    patches += shapes.sweep(
+    patches += shapes.sweep_section(
         "base",
         [(0, 0, z) for z in rod_heights],
         shapes.ellipse(0.35, 0.35, count=10),
         (1.0, 1.0, 1.6, 0.0),
-        first=(1.0, 0.0, 0.0),
+        start_axis=(1.0, 0.0, 0.0),
     )
     return patches
 
@@ -678,7 +678,7 @@ def _lamp_paints(
         total_height: height of its upper edge.
         style: style of the base, as for `_lamp_base`.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     linen = sampler.sample_color(
         "f1e3c4",
         "f4f1e8",
@@ -693,21 +693,21 @@ def _lamp_paints(
     clay = sampler.sample_color(
         "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b"
     )
-    body = paint_or_random(
+    body = choose_paint_or_random(
         sampler,
         total_height,
-        clouded(clay, factor=1.3, scale=4.0, offset=offset),
+        paint_shaded_clouds(clay, factor=1.3, scale=4.0, offset=offset),
         p_random=0.35,
     )
     metal = sampler.sample_color("b08d3c", "2b2d30", "b4b8bd", "8a5a32", p_random=0.15)
     # a flat foot may be painted as a body is
-    is_base_painted = style == "disc" and sampler.chance(0.5)
+    is_base_painted = style == "disc" and sampler.sample_bool(0.5)
     return {
         "shade": cloth,
-        "rim": solid(shade(linen, 0.8)),
-        "lining": solid("f4f0e4"),
-        "bulb": solid("fbf6e6"),
+        "rim": paint_solid_color(scale_brightness(linen, 0.8)),
+        "lining": paint_solid_color("f4f0e4"),
+        "bulb": paint_solid_color("fbf6e6"),
         "body": body,
-        "foot": solid(metal),
-        "base": body if is_base_painted else solid(metal),
+        "foot": paint_solid_color(metal),
+        "base": body if is_base_painted else paint_solid_color(metal),
     }

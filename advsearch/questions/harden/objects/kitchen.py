@@ -6,24 +6,24 @@ import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.extend import assets
-from advsearch.questions.harden.objects.family import Instance, family, sample_material
+from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch, Points
 from advsearch.questions.harden.objects.textures import (
     Color,
     Paint,
     ParameterSampler,
     Texels,
-    between,
-    clouded,
+    make_range_mask,
+    paint_shaded_clouds,
     dots,
-    over,
-    paint_or_random,
+    paint_over,
+    choose_paint_or_random,
     painter,
     rings,
-    shade,
-    solid,
-    speckled,
-    step,
+    scale_brightness,
+    paint_solid_color,
+    add_specks,
+    compute_soft_step,
     stripes,
     wood,
 )
@@ -52,7 +52,7 @@ def _spout(sampler: ParameterSampler, radius: float, height: float) -> list[Patc
     ring_index, radii, ahead = _spout_rings(outer_radii)
     path_frame = shapes.compute_frames(path, (0.0, 1.0, 0.0))
     tangent, first, second = (axis[ring_index] for axis in path_frame)
-    return shapes.sweep(
+    return shapes.sweep_section(
         "spout",
         path[ring_index] + ahead[:, None] * tangent,
         shapes.ellipse(1.0, 1.0, count=20),
@@ -98,7 +98,7 @@ def _spout_path(sampler: ParameterSampler, radius: float, height: float) -> Arra
     Returns:
         The path (`SPOUT_POINTS`, 3).
     """
-    style = sampler.pick("curved", "straight")
+    style = sampler.sample_choice("curved", "straight")
     start_z = height * sampler(0.34, low=0.26, high=0.42)
     tip_x = radius * sampler(1.85, low=1.6, high=2.0)
     tip_z = height * sampler(0.94, low=0.8, high=1.02)
@@ -110,24 +110,24 @@ def _spout_path(sampler: ParameterSampler, radius: float, height: float) -> Arra
     bend_back = np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
     middle = (start + tip) / 2 + bulge
     before_tip = start + (tip - start) * 0.8 + bend_back
-    return shapes.spline([start, middle, before_tip, tip], count=SPOUT_POINTS)
+    return shapes.sample_spline([start, middle, before_tip, tip], count=SPOUT_POINTS)
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def teapot(sampler: ParameterSampler) -> Instance:
     """Make a teapot with spout, handle and lid of random proportions."""
     radius = sampler(7.2, low=6.4, high=8.0)
     height = sampler(10.2, low=8.0, high=12.5)
     side, body = _teapot_body(sampler, radius, height)
     handle = _teapot_handle(sampler, side, radius, height)
-    opposite = shapes.rotation("z", 180.0)  # both are made at +x; the handle turns
+    opposite = shapes.make_rotation_matrix("z", 180.0)  # both are made at +x; the handle turns
     patches = [
         *body,
         *_spout(sampler, radius, height),
         *shapes.transform_patches(handle, opposite),
     ]
     return Instance(
-        shapes.transform_patches(patches, shapes.rotation("z", VIEW_DEGREES)),
+        shapes.transform_patches(patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)),
         _teapot_paints(sampler, height),
         sample_material(sampler, roughness=0.25, clearcoat=0.7),
         texel_density={"base": 0.6},
@@ -159,14 +159,14 @@ def _teapot_body(
         (radius * (0.97 * fullness), (0.42 * belly_height + 0.58) * height),
         (mouth, height),
     ]
-    side = shapes.spline(knots, count=26)
+    side = shapes.sample_spline(knots, count=26)
     under = [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]
     profile: list[tuple[str, Points]] = [
         ("base", under),
         ("body", [under[-1], *side]),
         *_lid_profile(sampler, mouth, height),
     ]
-    return side, shapes.lathe(profile, columns=56)
+    return side, shapes.revolve_profile(profile, columns=56)
 
 
 def _lid_profile(
@@ -202,8 +202,8 @@ def _lid_profile(
         (0.7 * knob_radius, top + 0.45 + 1.35 * knob_radius),
         (0.0, top + 0.45 + 1.6 * knob_radius),
     ]
-    lid = shapes.spline(lid_knots, count=10)
-    knob = shapes.spline(knob_knots, count=12)
+    lid = shapes.sample_spline(lid_knots, count=10)
+    knob = shapes.sample_spline(knob_knots, count=12)
     return [("body", rim), ("lid", lid), ("knob", [lid[-1], *knob])]
 
 
@@ -238,28 +238,28 @@ def _teapot_handle(
         sampler(0.5, low=0.4, high=0.7), sampler(0.62, low=0.45, high=0.85), count=16
     )
     root_flare = 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3  # thicker at both ends
-    curve = shapes.spline(knots, count=26)
-    return shapes.sweep("handle", shapes.to_xz_plane(curve), section, root_flare)
+    curve = shapes.sample_spline(knots, count=26)
+    return shapes.sweep_section("handle", shapes.to_xz_plane(curve), section, root_flare)
 
 
 def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
     """Sample the paints of a teapot of a height, by the tags of its parts."""
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     clay = sampler.sample_color(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
     )
-    glaze = clouded(clay, factor=1.25, scale=3.5, offset=offset, contrast=1.6)
+    glaze = paint_shaded_clouds(clay, factor=1.25, scale=3.5, offset=offset, contrast=1.6)
     accent = sampler.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
     decoration = _teapot_decoration(sampler, clay, glaze, accent, height, offset)
-    paint = paint_or_random(sampler, height + 4.0, decoration)
-    trim = sampler.pick(glaze, solid(accent), paint)
+    paint = choose_paint_or_random(sampler, height + 4.0, decoration)
+    trim = sampler.sample_choice(glaze, paint_solid_color(accent), paint)
     return {
-        "base": solid("a98663"),
+        "base": paint_solid_color("a98663"),
         "body": paint,
-        "lid": sampler.pick(paint, trim),
-        "spout": sampler.pick(glaze, paint),
-        "handle": sampler.pick(glaze, trim),
-        "knob": solid(accent) if sampler.chance(0.5, canonical=True) else trim,
+        "lid": sampler.sample_choice(paint, trim),
+        "spout": sampler.sample_choice(glaze, paint),
+        "handle": sampler.sample_choice(glaze, trim),
+        "knob": paint_solid_color(accent) if sampler.sample_bool(0.5, canonical=True) else trim,
     }
 
 
@@ -281,11 +281,11 @@ def _teapot_decoration(
         height: height of the teapot.
         offset: (3,) into the noise.
     """
-    kind = sampler.pick("bands", "plain", "dots", "stripes", "rings", "speckle")
+    kind = sampler.sample_choice("bands", "plain", "dots", "stripes", "rings", "speckle")
     if kind == "bands":
-        lower_band = between(0.7 * height, 0.74 * height, soft=0.1)
-        upper_band = between(0.77 * height, 0.785 * height, soft=0.1)
-        return over(over(glaze, lower_band, solid(accent)), upper_band, solid(accent))
+        lower_band = make_range_mask(0.7 * height, 0.74 * height, soft=0.1)
+        upper_band = make_range_mask(0.77 * height, 0.785 * height, soft=0.1)
+        return paint_over(paint_over(glaze, lower_band, paint_solid_color(accent)), upper_band, paint_solid_color(accent))
     if kind == "dots":
         return dots(
             glaze,
@@ -303,18 +303,18 @@ def _teapot_decoration(
     if kind == "rings":
         return rings(clay, accent, period=sampler(2.0, low=1.0, high=4.0))
     if kind == "speckle":
-        return speckled(glaze, accent, scale=0.5, offset=offset)
+        return add_specks(glaze, accent, scale=0.5, offset=offset)
     return glaze
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def frying_pan(sampler: ParameterSampler) -> Instance:
     """Make a frying pan with a random handle."""
     base_radius = sampler(10.5, low=9.0, high=11.5)
     rim_radius = sampler(13.0, low=12.2, high=14.5)
     depth = sampler(4.2, low=2.8, high=5.5)
     wall = sampler(0.38, low=0.3, high=0.55)
-    side = shapes.spline(
+    side = shapes.sample_spline(
         [
             (base_radius - 0.8, 0.0),
             (base_radius, 0.25),
@@ -323,7 +323,7 @@ def frying_pan(sampler: ParameterSampler) -> Instance:
         ],
         count=14,
     )
-    body = shapes.vessel(side, wall=wall, floor=0.5, columns=64, step=1.6)
+    body = shapes.make_vessel(side, wall=wall, floor=0.5, columns=64, step=1.6)
 
     length = sampler(18.0, low=14.0, high=21.0)
     root = np.array([rim_radius - 0.6, 0.0, 0.78 * depth])
@@ -335,7 +335,7 @@ def frying_pan(sampler: ParameterSampler) -> Instance:
     rivets = _pan_rivets(shapes.radius_at_height(side, rivet_z) - wall, rivet_z)
     patches = [*body, *handle, *rivets, *bracket]
     return Instance(
-        shapes.transform_patches(patches, shapes.rotation("z", VIEW_DEGREES)),
+        shapes.transform_patches(patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)),
         _pan_paints(sampler, rim_radius, depth),
         sample_material(sampler, roughness=0.38, clearcoat=0.3),
         texel_density={"base": 0.5},
@@ -358,12 +358,12 @@ def _pan_bracket(
         (rim_radius - 0.3, 0.75 * depth),
         (rim_radius + 0.2 * length, 0.78 * depth + 0.5 * rise),
     ]
-    return shapes.sweep(
+    return shapes.sweep_section(
         "bracket",
         shapes.to_xz_plane(np.array(path)),
         shapes.rectangle(0.7, 3.0, bevel=0.25),
         (1.0, 1.0, 0.62),
-        caps=True,
+        has_caps=True,
     )
 
 
@@ -384,7 +384,7 @@ def _pan_handle(
     end_rise = rise * sampler(1.05, low=0.8, high=1.2)
     knots = [(0.0, 0.0), (0.22 * length, 0.55 * rise), (0.6 * length, rise)]
     curve = shapes.to_xz_plane(np.array([*knots, (length, end_rise)]))
-    path = shapes.spline(root + curve, count=26)
+    path = shapes.sample_spline(root + curve, count=26)
     t = np.linspace(0.0, 1.0, 26)  # from the root to the end
     max_width = sampler(1.15, low=0.85, high=1.5)
     max_thickness = sampler(0.62, low=0.45, high=0.9)
@@ -400,11 +400,11 @@ def _pan_handle(
         [max_thickness * relative_thickness, max_width * relative_width], axis=1
     )
     # Sections reach from -1 to 1; `scale` makes them as wide as the handle.
-    if sampler.chance(0.5, canonical=True):
+    if sampler.sample_bool(0.5, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=20)
     else:
         section = shapes.rectangle(2.0, 2.0, bevel=0.7)
-    return shapes.sweep("handle", path, section, scale * rounding[:, None])
+    return shapes.sweep_section("handle", path, section, scale * rounding[:, None])
 
 
 def _pan_rivets(radius: float, height: float) -> list[Patch]:
@@ -415,7 +415,7 @@ def _pan_rivets(radius: float, height: float) -> list[Patch]:
         height: height of the rivets.
     """
     center = (radius + 0.02, 0.0, height)
-    rivet = shapes.sphere("rivet", 0.38, center=center, rows=8, columns=12)
+    rivet = shapes.make_sphere_patches("rivet", 0.38, center=center, rows=8, columns=12)
     left = shapes.transform_patches(rivet, offset=(0.0, -1.1, 0.0))
     right = shapes.transform_patches(rivet, offset=(0.0, 1.1, 0.0))
     return left + right
@@ -431,31 +431,31 @@ def _pan_paints(
         rim_radius: radius of its rim.
         depth: height of its rim.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     coating = _pan_coating(sampler, offset)
     enamel = _pan_enamel(sampler, depth, offset)
-    outside = paint_or_random(sampler, 2 * rim_radius, enamel, p_random=0.3)
-    inside = paint_or_random(sampler, 2 * rim_radius, coating, p_random=0.2)
-    handle_kind = sampler.pick("black", "wood", "colored")
+    outside = choose_paint_or_random(sampler, 2 * rim_radius, enamel, p_random=0.3)
+    inside = choose_paint_or_random(sampler, 2 * rim_radius, coating, p_random=0.2)
+    handle_kind = sampler.sample_choice("black", "wood", "colored")
     # All three are sampled, whichever is used.
     handle_paints = {
-        "black": solid(sampler.sample_color("1b1b1d", "2a2a2c", p_random=0.1)),
+        "black": paint_solid_color(sampler.sample_color("1b1b1d", "2a2a2c", p_random=0.1)),
         "wood": wood(
             sampler.sample_color("8a5a32", "b98550", p_random=0.0),
             scale=1.4,
             offset=offset,
             axis=0,
         ),
-        "colored": solid(sampler.sample_color("a9231f")),
+        "colored": paint_solid_color(sampler.sample_color("a9231f")),
     }
-    steel = solid(sampler.sample_color("b9bcc0", "8c8f94", p_random=0.1))
+    steel = paint_solid_color(sampler.sample_color("b9bcc0", "8c8f94", p_random=0.1))
     return {
         "outside": outside,
         "inside": inside,
         "handle": handle_paints[handle_kind],
         "rivet": steel,
         "bracket": steel,
-        "base": solid(sampler.sample_color("77797c", "2b2c2e")),
+        "base": paint_solid_color(sampler.sample_color("77797c", "2b2c2e")),
     }
 
 
@@ -469,15 +469,15 @@ def _pan_coating(sampler: ParameterSampler, offset: Array) -> Paint:
     coat = sampler.sample_color(
         "2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", p_random=0.2
     )
-    coating = speckled(
-        clouded(coat, factor=1.2, scale=5.0, offset=offset),
-        shade(coat, 1.7),
+    coating = add_specks(
+        paint_shaded_clouds(coat, factor=1.2, scale=5.0, offset=offset),
+        scale_brightness(coat, 1.7),
         scale=0.5,
         offset=offset,
         amount=0.06,
     )
-    if sampler.chance(0.4, canonical=True):
-        return over(coating, _turning_rings(), solid(shade(coat, 1.6)))
+    if sampler.sample_bool(0.4, canonical=True):
+        return paint_over(coating, _turning_rings(), paint_solid_color(scale_brightness(coat, 1.6)))
     return coating
 
 
@@ -485,7 +485,7 @@ def _pan_coating(sampler: ParameterSampler, offset: Array) -> Paint:
 def _turning_rings(t: Texels) -> Array:
     """Return the mask of faint rings around the z axis, as turning leaves."""
     phase = 2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9
-    return step(np.sin(phase), 0.6, soft=0.8) * 0.35
+    return compute_soft_step(np.sin(phase), 0.6, soft=0.8) * 0.35
 
 
 def _pan_enamel(sampler: ParameterSampler, depth: float, offset: Array) -> Paint:
@@ -499,7 +499,7 @@ def _pan_enamel(sampler: ParameterSampler, depth: float, offset: Array) -> Paint
     color = sampler.sample_color(
         "a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b"
     )
-    enamel = clouded(color, factor=0.85, scale=5.0, offset=offset)
-    is_bottom = between(-1.0, 0.25 * depth, soft=0.6 * depth)
-    enamel = over(enamel, is_bottom, solid(shade(color, 0.6)))
-    return over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))
+    enamel = paint_shaded_clouds(color, factor=0.85, scale=5.0, offset=offset)
+    is_bottom = make_range_mask(-1.0, 0.25 * depth, soft=0.6 * depth)
+    enamel = paint_over(enamel, is_bottom, paint_solid_color(scale_brightness(color, 0.6)))
+    return paint_over(enamel, make_range_mask(depth - 0.1, 2 * depth, soft=0.15), paint_solid_color("2b2c2e"))

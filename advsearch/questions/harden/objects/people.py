@@ -11,17 +11,17 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from advsearch.extend import assets, workbench
-from advsearch.questions.harden.objects.family import Instance, family
+from advsearch.questions.harden.objects.family import Instance, make_family
 from advsearch.questions.harden.objects.shapes import Array, ChartToPoints, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
-    mix,
-    noise,
+    blend_colors,
+    compute_value_noise,
     painter,
     parse_hex_color,
-    step,
+    compute_soft_step,
 )
 
 FINISHES = {
@@ -88,7 +88,7 @@ def _patches(person: Any) -> list[Patch]:
                 faces=faces[first_face[number] : first_face[number + 1]],
                 size=(float(data["sizes"][number][0]), float(data["sizes"][number][1])),
                 # The paint of a texel depends on its point of the reference body.
-                rest=_interpolate_chart(charts[in_chart], reference[in_chart]),
+                compute_rest_points=_interpolate_chart(charts[in_chart], reference[in_chart]),
             )
         )
     return patches
@@ -161,8 +161,8 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 
     `depth` is about by how much they change the color, as a fraction.
     """
-    folds = noise(t.xyz * np.array([9.0, 9.0, 4.0])) - 0.5
-    threads = noise(t.xyz * 180.0) - 0.5
+    folds = compute_value_noise(t.xyz * np.array([9.0, 9.0, 4.0])) - 0.5
+    threads = compute_value_noise(t.xyz * 180.0) - 0.5
     brightness = 1.0 + depth * (1.2 * folds + 0.6 * threads)
     return np.clip(color * brightness[:, None], 0.0, 1.0)
 
@@ -176,8 +176,8 @@ def _jeans(t: Texels, color: Array) -> Array:
     far = 9.0  # a distance in metres that stands for no seam
     seam_distance = np.where(has_seam, np.abs(x - 0.005), far)
     hem_distance = np.abs(z - 0.085)
-    line = step(0.004 - np.minimum(seam_distance, hem_distance), 0.0, soft=0.003)
-    return mix(_woven(color, depth=0.25)(t), 0.6 * color, 0.8 * line)
+    line = compute_soft_step(0.004 - np.minimum(seam_distance, hem_distance), 0.0, soft=0.003)
+    return blend_colors(_woven(color, depth=0.25)(t), 0.6 * color, 0.8 * line)
 
 
 @painter
@@ -196,38 +196,38 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
     x, y, z = t.xyz.T
     abs_y = np.abs(y)
     is_front = x > 0.1
-    mottling = 1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5)
+    mottling = 1.0 + 0.1 * (compute_value_noise(t.xyz * 14.0) - 0.5)
     skin = np.clip(color * mottling[:, None], 0.0, 1.0)
 
     # how far inside an ellipse; -1 at the back of the head
     in_lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
     lip_color = color * np.array([0.86, 0.62, 0.6])
-    skin = mix(skin, lip_color, 0.75 * step(in_lips, 0.0, soft=0.25))
+    skin = blend_colors(skin, lip_color, 0.75 * compute_soft_step(in_lips, 0.0, soft=0.25))
 
     in_cheeks = np.where(
         is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
     )
     cheek_color = color * np.array([1.0, 0.84, 0.8])
-    skin = mix(skin, cheek_color, 0.5 * step(in_cheeks, 0.0, soft=0.6))
+    skin = blend_colors(skin, cheek_color, 0.5 * compute_soft_step(in_cheeks, 0.0, soft=0.6))
 
     brow_height = 1.659 - 14.0 * (abs_y - 0.034) ** 2  # an arch over each eye
     has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # above an eye
     in_brow = np.where(has_brow, 0.0038 - np.abs(z - brow_height), -1.0)
-    return mix(skin, hair, 0.8 * step(in_brow, 0.0, soft=0.0015))
+    return blend_colors(skin, hair, 0.8 * compute_soft_step(in_brow, 0.0, soft=0.0015))
 
 
 @painter
 def _strands(t: Texels, color: Array) -> Array:
     """Paint hair of a color, a little lighter than that, in vertical strands."""
-    strands = noise(t.xyz * np.array([60.0, 160.0, 40.0])) - 0.5
+    strands = compute_value_noise(t.xyz * np.array([60.0, 160.0, 40.0])) - 0.5
     return np.clip(color * (1.0 + 0.7 * strands)[:, None] + 0.02, 0.0, 1.0)
 
 
 @painter
 def _leather(t: Texels, color: Array) -> Array:
     """Paint shoes of a color with light soles, which are 1.2 cm high."""
-    sole = step(0.012 - t.xyz[:, 2], 0.0, soft=0.004)
-    return mix(color, parse_hex_color("cfcac0"), sole)
+    sole = compute_soft_step(0.012 - t.xyz[:, 2], 0.0, soft=0.004)
+    return blend_colors(color, parse_hex_color("cfcac0"), sole)
 
 
 @painter
@@ -242,16 +242,16 @@ def _irises(t: Texels, color: Array) -> Array:
     # distance from the nearest pupil; all that is not at the front is white
     is_front = x > 0.128
     pupil_distance = np.where(is_front, np.hypot(np.abs(y) - 0.031, z - middle_z), 1.0)
-    iris = step(0.0065 - pupil_distance, 0.0, soft=0.001)
-    pupil = step(0.003 - pupil_distance, 0.0, soft=0.001)
-    eye = mix(parse_hex_color("e6e2dc"), color, iris)
-    return mix(eye, parse_hex_color("101010"), pupil)
+    iris = compute_soft_step(0.0065 - pupil_distance, 0.0, soft=0.001)
+    pupil = compute_soft_step(0.003 - pupil_distance, 0.0, soft=0.001)
+    eye = blend_colors(parse_hex_color("e6e2dc"), color, iris)
+    return blend_colors(eye, parse_hex_color("101010"), pupil)
 
 
-@family(metres=1.0, texels=512)
+@make_family(unit_in_metres=1.0, texels=512)
 def person(sampler: ParameterSampler) -> Instance:
     """Make a person of random phenotype, pose and clothes."""
-    is_woman = sampler.chance(0.5)
+    is_woman = sampler.sample_bool(0.5)
     height_reduction = 0.08 if is_woman else 0.0  # metres
     phenotype = {
         "gender": 0.0 if is_woman else 1.0,
@@ -267,7 +267,7 @@ def person(sampler: ParameterSampler) -> Instance:
         _person_paints(sampler),
         material=FINISHES["shirt"],
         texel_density={"skin": 0.8, "shoes": 0.8, "shirt": 1.15},
-        finishes=FINISHES,
+        materials_by_tag=FINISHES,
         rig=body,
     )
 
@@ -275,10 +275,10 @@ def person(sampler: ParameterSampler) -> Instance:
 def _person_paints(sampler: ParameterSampler) -> dict[str, Paint]:
     """Sample the paints of a person's skin, hair, eyes and clothes, by their tags."""
     skin = parse_hex_color(
-        sampler.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
+        sampler.sample_choice("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
     )
     hair = parse_hex_color(
-        sampler.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c")
+        sampler.sample_choice("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c")
     )
     shirt = sampler.sample_color(
         "5b86b8", "c8c4ba", "b04038", "3f6b4a", "d0a83e", "2f3338"
@@ -287,7 +287,7 @@ def _person_paints(sampler: ParameterSampler) -> dict[str, Paint]:
         "31374a", "4a4640", "1f2226", "6b6152", "5a6270", p_random=0.15
     )
     shoes = sampler.sample_color("4a3324", "1d1d1f", "8a8680", "5b2f24", p_random=0.15)
-    irises = parse_hex_color(sampler.pick("4a3424", "5a7a94", "5f6f4a"))
+    irises = parse_hex_color(sampler.sample_choice("4a3424", "5a7a94", "5f6f4a"))
     return {
         "shirt": _woven(shirt, depth=0.16),
         "trousers": _jeans(trousers),

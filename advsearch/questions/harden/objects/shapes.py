@@ -70,7 +70,7 @@ def to_xz_plane(curve: Array) -> Array:
     return np.insert(curve, 1, 0.0, axis=1)
 
 
-def rotation(axis: str, degrees: float) -> Array:
+def make_rotation_matrix(axis: str, degrees: float) -> Array:
     """Return the matrix (3, 3) of a right-handed rotation about a coordinate axis.
 
     It turns column vectors. The axis is "x", "y" or "z".
@@ -84,7 +84,7 @@ def rotation(axis: str, degrees: float) -> Array:
     return matrix
 
 
-def spline(points: Points, count: int) -> Array:
+def sample_spline(points: Points, count: int) -> Array:
     """Sample a Catmull-Rom curve through points (K, D) at `count` points, ends
     included.
 
@@ -228,7 +228,7 @@ class Patch:
         faces: vertex indices (F, 3).
         size: width and height of the chart in object units, which decide its size in
             the atlas.
-        rest: maps u (N,) and v (N,) to surface points (N, 3) before any transform. The
+        compute_rest_points: maps u (N,) and v (N,) to surface points (N, 3) before any transform. The
             patch is painted at these points.
     """
 
@@ -238,7 +238,7 @@ class Patch:
     uvs: Array
     faces: assets.IntArray
     size: tuple[float, float]
-    rest: ChartToPoints
+    compute_rest_points: ChartToPoints
 
 
 def transform_patches(
@@ -285,7 +285,7 @@ def stretch_patches(
     ]
 
 
-def grid(
+def make_grid_patch(
     tag: str,
     points: Array,
     normals: Array,
@@ -329,7 +329,7 @@ def grid(
         uvs=np.stack([u, v], axis=-1).reshape(-1, 2),
         faces=_grid_faces(vertices, rows, columns),
         size=size,
-        rest=rest,
+        compute_rest_points=rest,
     )
 
 
@@ -349,7 +349,7 @@ def _grid_faces(vertices: Array, rows: int, columns: int) -> assets.IntArray:
     return with_area
 
 
-def _along(curve: Array) -> tuple[Array, float]:
+def _compute_length_fractions(curve: Array) -> tuple[Array, float]:
     """Return the arc lengths (K,) of a polyline as fractions, and its total length."""
     arc_length = arc_lengths(curve)
     return arc_length / arc_length[-1], float(arc_length[-1])
@@ -407,7 +407,7 @@ def _profile_directions(polyline: Array) -> Array:
     return normalize(directions)
 
 
-def _around(curve: Array, theta: Array) -> Array:
+def _revolve_curve(curve: Array, theta: Array) -> Array:
     """Turn a curve (K, 2) of points (r, z) about the z axis to angles (M,), in radians.
 
     Returns:
@@ -448,7 +448,7 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         triangles = triangles[:, ::-1]
         chart_x_sign = -1.0
 
-    radial_fraction, length = _along(curve)
+    radial_fraction, length = _compute_length_fractions(curve)
     theta = 2 * np.pi * np.arange(columns) / columns
     chart_radius = 0.5 * radial_fraction[1:, None]
     ring_uvs = [
@@ -477,7 +477,7 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         uvs=uvs,
         faces=triangles,
         size=(2 * length, 2 * length),
-        rest=rest,
+        compute_rest_points=rest,
     )
 
 
@@ -488,7 +488,7 @@ def _revolve_from_pole(curve: Array, theta: Array) -> Array:
         (1 + (K - 1) * M, 3): the pole, then ring by ring.
     """
     pole = [[0.0, 0.0, curve[0, 1]]]
-    return np.concatenate([pole, _around(curve[1:], theta).reshape(-1, 3)])
+    return np.concatenate([pole, _revolve_curve(curve[1:], theta).reshape(-1, 3)])
 
 
 def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
@@ -527,9 +527,9 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     """
     theta = 2 * np.pi * np.arange(columns + 1) / columns
     theta[-1] = 0.0  # the seam's two columns are the same points, to the bit
-    points = _around(profile, theta)
-    normal = _around(normals, theta)
-    down, length = _along(profile)
+    points = _revolve_curve(profile, theta)
+    normal = _revolve_curve(normals, theta)
+    down, length = _compute_length_fractions(profile)
     # A typical circumference: at three quarters of the points the profile is narrower.
     # A maximum would depend on single points, such as a lip.
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
@@ -545,11 +545,11 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     patches = []
     for start in range(0, piece_columns * n_pieces, piece_columns):
         piece = np.s_[:, start : start + piece_columns + 1]
-        patches.append(grid(tag, points[piece], normal[piece], size, down, across))
+        patches.append(make_grid_patch(tag, points[piece], normal[piece], size, down, across))
     return patches
 
 
-def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patch]:
+def revolve_profile(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patch]:
     """Rotate a profile about the z axis.
 
     Args:
@@ -567,7 +567,7 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
         ends_on_axis = curve[-1, 0] < 1e-9
         touches_axis = starts_on_axis != ends_on_axis  # with one of its ends
         radius_change = abs(curve[-1, 0] - curve[0, 0])
-        _, length = _along(curve)
+        _, length = _compute_length_fractions(curve)
         is_flat = radius_change > 0.5 * length
         if touches_axis and is_flat:
             patches.append(_disc(tag, curve, normals, columns))
@@ -576,7 +576,7 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
     return patches
 
 
-def vessel(
+def make_vessel(
     outside: Array, wall: float, floor: float, *, columns: int = 56, step: float = 0.7
 ) -> list[Patch]:
     """Create an open container with a constant wall thickness.
@@ -611,7 +611,7 @@ def vessel(
         ("inside", subdivide(inside, longest=step)),
         ("inside", subdivide([fillet_end, (0.0, floor)], longest=3 * step)),
     ]
-    return lathe(pieces, columns=columns)
+    return revolve_profile(pieces, columns=columns)
 
 
 def _hollow_base(
@@ -681,7 +681,7 @@ def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
     return lip
 
 
-def sphere(
+def make_sphere_patches(
     tag: str,
     radius: float,
     center: Sequence[float] = (0.0, 0.0, 0.0),
@@ -708,7 +708,7 @@ def sphere(
         (tag, curve[cut : rows - cut + 1]),
         (tag, curve[rows - cut :]),
     ]
-    return transform_patches(lathe(pieces, columns=columns), offset=center)
+    return transform_patches(revolve_profile(pieces, columns=columns), offset=center)
 
 
 def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
@@ -731,14 +731,14 @@ def compute_frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, A
     return tangent, normal, np.cross(tangent, normal)
 
 
-def sweep(
+def sweep_section(
     tag: str,
     path: Points,
     section: Array,
     scale: Array | Sequence[float] | float = 1.0,
     *,
-    first: Sequence[float] = (0.0, 0.0, 1.0),
-    caps: bool = False,
+    start_axis: Sequence[float] = (0.0, 0.0, 1.0),
+    has_caps: bool = False,
     frame: tuple[Array, Array, Array] | None = None,
 ) -> list[Patch]:
     """Create the surface that a closed section sweeps along a path (N, 3).
@@ -750,24 +750,24 @@ def sweep(
             normal.
         scale: a number, (N,) or (N, 2): the section's scale at each center, (N, 2) for
             both axes of the section; 0 closes the surface in a point.
-        first: direction (3,) of the section's first axis at the start of the path.
-        caps: whether both ends are closed with flat faces and a hard edge.
+        start_axis: direction (3,) of the section's first axis at the start of the path.
+        has_caps: whether both ends are closed with flat faces and a hard edge.
         frame: tangents and normals to use in place of `compute_frames(path, first)`.
     """
     centers = np.asarray(path, dtype=np.float64)
     if frame is None:
-        frame = compute_frames(centers, first)
+        frame = compute_frames(centers, start_axis)
     tangent, first_normal, second_normal = frame
     scales = _to_axis_scales(scale, len(centers))
     points = _sweep_points(section, scales, centers, first_normal, second_normal)
-    ring_fraction, ring_length = _along(_repeat_first(section, axis=0))
+    ring_fraction, ring_length = _compute_length_fractions(_repeat_first(section, axis=0))
     # A typical circumference: the mean scale of both axes is smaller at three quarters
     # of the centers. The ends, which may shrink to a point, hardly matter.
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
     # distance along the path of each ring, for the chart's coordinate v
     down = mean_lengths(points)
     patches = [
-        grid(
+        make_grid_patch(
             tag,
             _repeat_first(points, axis=1),
             _repeat_first(_sweep_normals(points, tangent), axis=1),
@@ -776,18 +776,18 @@ def sweep(
             across=ring_fraction,
         )
     ]
-    if caps:
+    if has_caps:
         # Rings are counter-clockwise seen from the end of the path. The first face is
         # seen from the other side, so its ring is reversed.
         patches += [
-            cap(tag, points[0][::-1], -tangent[0]),
-            cap(tag, points[-1], tangent[-1]),
+            make_cap_face(tag, points[0][::-1], -tangent[0]),
+            make_cap_face(tag, points[-1], tangent[-1]),
         ]
     return patches
 
 
 def _to_axis_scales(scale: Array | Sequence[float] | float, count: int) -> Array:
-    """Return scales (count, 2) along both axes of a section; see `sweep`."""
+    """Return scales (count, 2) along both axes of a section; see `sweep_section`."""
     scales = np.asarray(scale, dtype=np.float64)
     if scales.ndim < 2:  # the same scale along both axes
         scales = scales.reshape(-1, 1)
@@ -849,7 +849,7 @@ def mean_lengths(points: Array, axis: int = 0) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def cap(tag: str, ring: Array, normal: Array) -> Patch:
+def make_cap_face(tag: str, ring: Array, normal: Array) -> Patch:
     """Create a flat face that is bounded by a convex ring (M, 3).
 
     The ring is counter-clockwise seen from outside, and `normal` (3,) is the outward
@@ -885,11 +885,11 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
         uvs=(plane_vertices - lower) / extent,
         faces=_fan(len(ring)),
         size=(float(extent[0]), float(extent[1])),
-        rest=rest,
+        compute_rest_points=rest,
     )
 
 
-def box(
+def make_rounded_box(
     tag: str,
     center: Sequence[float],
     size: Sequence[float],
@@ -932,7 +932,7 @@ def box(
             # Their u has to increase all the same.
             across = 1.0 - across[::-1]
         patches.append(
-            grid(
+            make_grid_patch(
                 tag,
                 points + np.asarray(center, dtype=np.float64),
                 normals,
@@ -1079,13 +1079,13 @@ def crop_chart(patch: Patch) -> Patch:
 
     def rest(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at coordinates (N,) of the cropped chart."""
-        return patch.rest(lower[0] + u * extent[0], lower[1] + v * extent[1])
+        return patch.compute_rest_points(lower[0] + u * extent[0], lower[1] + v * extent[1])
 
     return replace(
         patch,
         uvs=np.clip((patch.uvs - lower) / extent, 0.0, 1.0),
         size=(width * float(extent[0]), height * float(extent[1])),
-        rest=rest,
+        compute_rest_points=rest,
     )
 
 

@@ -45,7 +45,7 @@ class ParameterSampler:
         """Return a uniform sample in [low, high], or the canonical value."""
         return canonical if self.rng is None else float(self.rng.uniform(low, high))
 
-    def pick(self, canonical: T, *others: T) -> T:
+    def sample_choice(self, canonical: T, *others: T) -> T:
         """Return one of the choices, all equally likely, or the canonical one.
 
         A choice that is named twice is twice as likely.
@@ -55,11 +55,11 @@ class ParameterSampler:
         choices = (canonical, *others)
         return choices[int(self.rng.integers(len(choices)))]
 
-    def chance(self, probability: float, canonical: bool = False) -> bool:
+    def sample_bool(self, probability: float, canonical: bool = False) -> bool:
         """Return True with a probability; without a generator `canonical`."""
         return canonical if self.rng is None else bool(self.rng.random() < probability)
 
-    def offset(self) -> Array:
+    def sample_noise_offset(self) -> Array:
         """Return an offset (3,) into the noise, so that instances have other clouds."""
         if self.rng is None:
             return np.array([1.7, 9.2, 5.5])
@@ -84,7 +84,7 @@ class ParameterSampler:
             saturation = rng.random() ** 0.7  # saturated colors a little more often
             value = rng.uniform(0.15, 0.97)  # no black
             return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
-        base = parse_hex_color(self.pick(canonical, *others))
+        base = parse_hex_color(self.sample_choice(canonical, *others))
         brightness = rng.uniform(0.85, 1.12)
         tint = rng.uniform(-0.05, 0.05, 3)
         return np.clip(base * brightness + tint, 0.02, 0.98)
@@ -129,7 +129,7 @@ def painter(
     return with_options
 
 
-def shade(color: Color, factor: float) -> Color:
+def scale_brightness(color: Color, factor: float) -> Color:
     """Return a darker (factor below 1) or lighter (above 1) color, clipped to [0,
     1].
     """
@@ -139,7 +139,7 @@ def shade(color: Color, factor: float) -> Color:
 _LATTICE = np.random.Generator(np.random.PCG64(20)).random((16, 16, 16))
 
 
-def noise(points: Array) -> Array:
+def compute_value_noise(points: Array) -> Array:
     """Return smooth value noise (N,) in [0, 1] at points (N, 3).
 
     It interpolates random values at the points of a lattice whose spacing is 1. They
@@ -152,23 +152,23 @@ def noise(points: Array) -> Array:
     return np.asarray(map_coordinates(_LATTICE, smooth.T, order=1, mode="grid-wrap"))
 
 
-def mix(a: Array, b: Array, weight: Array) -> Array:
+def blend_colors(a: Array, b: Array, weight: Array) -> Array:
     """Blend colors (3,) or (N, 3) by (N,) weights: 0 gives a, 1 gives b."""
     return a + (b - a) * weight[:, None]
 
 
 def band_mask(value: Array, low: float, high: float, soft: float) -> Array:
     """Return 1 between two values and 0 outside, with ramps `soft` wide."""
-    return step(value, low, soft=soft) * step(-value, -high, soft=soft)
+    return compute_soft_step(value, low, soft=soft) * compute_soft_step(-value, -high, soft=soft)
 
 
-def step(value: Array, edge: float, soft: float) -> Array:
+def compute_soft_step(value: Array, edge: float, soft: float) -> Array:
     """Return 0 below the edge and 1 above it, with a ramp `soft` wide."""
     return np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
 
 
 @painter
-def solid(t: Texels, color: Color | str) -> Array:
+def paint_solid_color(t: Texels, color: Color | str) -> Array:
     """Paint a single color."""
     return np.broadcast_to(
         parse_hex_color(color) if isinstance(color, str) else color, (len(t.u), 3)
@@ -176,7 +176,7 @@ def solid(t: Texels, color: Color | str) -> Array:
 
 
 @painter
-def mottled(
+def paint_two_color_clouds(
     t: Texels, a: Color, b: Color, scale: float, offset: Array, contrast: float = 2.0
 ) -> Array:
     """Paint clouds of two colors, `scale` wide.
@@ -186,20 +186,20 @@ def mottled(
     """
     position = t.xyz / scale + offset
     # two octaves; the second is shifted, so that both have no common center
-    clouds = (noise(position) + noise(position * 2.0 + 5.3) * 0.5) / 1.5
-    return mix(a, b, np.clip((clouds - 0.5) * contrast + 0.5, 0.0, 1.0))
+    clouds = (compute_value_noise(position) + compute_value_noise(position * 2.0 + 5.3) * 0.5) / 1.5
+    return blend_colors(a, b, np.clip((clouds - 0.5) * contrast + 0.5, 0.0, 1.0))
 
 
-def clouded(
+def paint_shaded_clouds(
     color: Color, factor: float, scale: float, offset: Array, contrast: float = 2.0
 ) -> Paint:
     """Paint clouds of a color and a shade of it, `scale` wide."""
-    return mottled(
-        color, shade(color, factor), scale=scale, offset=offset, contrast=contrast
+    return paint_two_color_clouds(
+        color, scale_brightness(color, factor), scale=scale, offset=offset, contrast=contrast
     )
 
 
-def speckled(
+def add_specks(
     base: Paint, color: Color, scale: float, offset: Array, amount: float = 0.16
 ) -> Paint:
     """Paint small irregular specks, `scale` wide, over another paint.
@@ -209,10 +209,10 @@ def speckled(
     """
     # The noise is seldom near 1, so that the threshold falls faster than `amount` grows.
     threshold = 1.0 - 1.1 * amount
-    return over(
+    return paint_over(
         base,
-        lambda t: step(noise(t.xyz / scale + offset), threshold, soft=0.12),
-        solid(color),
+        lambda t: compute_soft_step(compute_value_noise(t.xyz / scale + offset), threshold, soft=0.12),
+        paint_solid_color(color),
     )
 
 
@@ -221,7 +221,7 @@ def gradient(
     t: Texels, a: Color, b: Color, low: float, high: float, axis: int = 2
 ) -> Array:
     """Paint a gradient from color a at `low` to color b at `high` along an axis."""
-    return mix(a, b, np.clip((t.xyz[:, axis] - low) / (high - low), 0.0, 1.0))
+    return blend_colors(a, b, np.clip((t.xyz[:, axis] - low) / (high - low), 0.0, 1.0))
 
 
 @painter
@@ -253,12 +253,12 @@ def wood(
     ring_phase = (
         grain_position[:, first_cross]
         + 0.6 * grain_position[:, second_cross]
-        + 1.6 * noise(grain_position * 0.45)
+        + 1.6 * compute_value_noise(grain_position * 0.45)
     )
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring_phase * 0.8)
     # fibers are four times as fine across the axis as the rings are
     is_axis = np.arange(3) == axis
-    fibers = noise(grain_position * np.where(is_axis, 1.0, 4.0))
+    fibers = compute_value_noise(grain_position * np.where(is_axis, 1.0, 4.0))
     grain = contrast * (0.55 * rings**2 + 0.45 * fibers)
     brightening = 1.12  # makes up for some of what the grain darkens
     return np.asarray(np.clip(color * (1.0 - grain)[:, None] * brightening, 0.0, 1.0))
@@ -273,7 +273,7 @@ def rings(
     Where the axis is z, these are rings around an upright object.
     """
     distance_from_middle = np.abs(t.xyz[:, axis] / period % 1.0 - 0.5)
-    return mix(a, b, step(fraction / 2 - distance_from_middle, 0.0, soft=0.06))
+    return blend_colors(a, b, compute_soft_step(fraction / 2 - distance_from_middle, 0.0, soft=0.06))
 
 
 def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
@@ -296,14 +296,14 @@ def stripes(
     """
     across, _ = _cells(t, cell)
     distance_from_middle = np.abs((across + slant * t.v) % 1.0 - 0.5)
-    return mix(a, b, step(fraction / 2 - distance_from_middle, 0.0, soft=0.08))
+    return blend_colors(a, b, compute_soft_step(fraction / 2 - distance_from_middle, 0.0, soft=0.08))
 
 
 @painter
 def checks(t: Texels, a: Color, b: Color, cell: float) -> Array:
     """Paint a checkerboard with squares `cell` wide."""
     across, up = _cells(t, 2 * cell)  # a pattern repeats after two squares
-    return mix(a, b, (np.floor(2 * across) + np.floor(2 * up)) % 2.0)
+    return blend_colors(a, b, (np.floor(2 * across) + np.floor(2 * up)) % 2.0)
 
 
 def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
@@ -317,9 +317,9 @@ def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
         across, up = _cells(t, cell)
         across = across + 0.5 * (np.floor(up) % 2.0)
         center_distance = np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5)
-        return step(radius - center_distance, 0.0, soft=0.1)
+        return compute_soft_step(radius - center_distance, 0.0, soft=0.1)
 
-    return over(base, dot_mask, solid(color))
+    return paint_over(base, dot_mask, paint_solid_color(color))
 
 
 @painter
@@ -328,23 +328,23 @@ def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
     across, up = _cells(t, cell)
     line_height = np.abs(across % 1.0 - 0.5)  # a triangular wave
     distance_from_line = np.abs((up + line_height) % 1.0 - 0.5)
-    return mix(a, b, step(0.25 - distance_from_line, 0.0, soft=0.1))
+    return blend_colors(a, b, compute_soft_step(0.25 - distance_from_line, 0.0, soft=0.1))
 
 
 @painter
-def over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
+def paint_over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
     """Paint one paint over another where the mask is above 0."""
     weight = mask(t)
     covered = np.nonzero(weight)[0]
     color = np.array(base(t))
     if len(covered):
         covered_texels = Texels(t.xyz[covered], t.u[covered], t.v[covered], t.size)
-        color[covered] = mix(color[covered], top(covered_texels), weight[covered])
+        color[covered] = blend_colors(color[covered], top(covered_texels), weight[covered])
     return color
 
 
 @painter
-def between(
+def make_range_mask(
     t: Texels, low: float, high: float, axis: int = 2, soft: float = 0.02
 ) -> Array:
     """Return the mask of texels between two values of a coordinate.
@@ -359,7 +359,7 @@ def between(
 
 
 @painter
-def facing(
+def make_facing_mask(
     t: Texels,
     degrees: float,
     half_width: float,
@@ -380,7 +380,7 @@ def facing(
     in_band = np.nonzero(weight)[0]
     angle = np.degrees(np.arctan2(t.xyz[in_band, 1], t.xyz[in_band, 0]))
     angle_distance = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
-    weight[in_band] *= step(half_width - angle_distance, 0.0, soft=2.0)
+    weight[in_band] *= compute_soft_step(half_width - angle_distance, 0.0, soft=2.0)
     return weight
 
 
@@ -398,8 +398,8 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
     a = sampler.sample_color("808080", p_random=1.0)
     b = sampler.sample_color("808080", p_random=1.0)
     cell = size * sampler(0.1, low=0.05, high=0.2)
-    offset = sampler.offset()
-    kind = sampler.pick(
+    offset = sampler.sample_noise_offset()
+    kind = sampler.sample_choice(
         "solid",
         "rings",
         "stripes",
@@ -421,16 +421,16 @@ def sample_paint(sampler: ParameterSampler, size: float) -> Paint:
             b,
             cell=cell,
             fraction=sampler(0.5, low=0.2, high=0.8),
-            slant=int(sampler.pick(0, 1, 3)),
+            slant=int(sampler.sample_choice(0, 1, 3)),
         )
     if kind == "dots":
         radius = sampler(0.3, low=0.18, high=0.42)
-        return dots(solid(a), b, cell=cell, radius=radius)
+        return dots(paint_solid_color(a), b, cell=cell, radius=radius)
     if kind == "checks":
         return checks(a, b, cell=cell)
     if kind == "zigzag":
         return zigzag(a, b, cell=cell)
-    return solid(a)
+    return paint_solid_color(a)
 
 
 def _sample_irregular_paint(
@@ -447,12 +447,12 @@ def _sample_irregular_paint(
     """
     if kind == "mottled":
         contrast = sampler(2.0, low=1.0, high=4.0)
-        return mottled(a, b, scale=1.5 * cell, offset=offset, contrast=contrast)
+        return paint_two_color_clouds(a, b, scale=1.5 * cell, offset=offset, contrast=contrast)
     if kind == "speckled":
         amount = sampler(0.2, low=0.1, high=0.4)
-        return speckled(solid(a), b, scale=0.4 * cell, offset=offset, amount=amount)
+        return add_specks(paint_solid_color(a), b, scale=0.4 * cell, offset=offset, amount=amount)
     timber = sampler.sample_color("9a6a3c", "c89b62", "5b3a22")
-    axis = int(sampler.pick(0, 1, 2))
+    axis = int(sampler.sample_choice(0, 1, 2))
     return wood(timber, scale=0.5 * cell, offset=offset, axis=axis)
 
 
@@ -462,17 +462,17 @@ def _sample_paint_along_axis(
     """Sample rings, or a gradient over the size of the instance, along an axis."""
     if kind == "rings":
         fraction = sampler(0.5, low=0.2, high=0.8)
-        axis = int(sampler.pick(0, 1, 2))
+        axis = int(sampler.sample_choice(0, 1, 2))
         return rings(a, b, period=cell, fraction=fraction, axis=axis)
-    axis = int(sampler.pick(0, 1, 2))
+    axis = int(sampler.sample_choice(0, 1, 2))
     return gradient(a, b, low=0.0, high=size, axis=axis)
 
 
-def paint_or_random(
+def choose_paint_or_random(
     sampler: ParameterSampler, size: float, paint: Paint, p_random: float = 0.35
 ) -> Paint:
     """Return the paint, or with probability `p_random` a sample of `sample_paint`.
 
     The canonical instance has the paint.
     """
-    return sample_paint(sampler, size) if sampler.chance(p_random) else paint
+    return sample_paint(sampler, size) if sampler.sample_bool(p_random) else paint

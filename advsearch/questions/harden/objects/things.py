@@ -11,23 +11,23 @@ import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.extend import assets
-from advsearch.questions.harden.objects.family import Instance, family, sample_material
+from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
-    clouded,
-    mix,
-    noise,
-    over,
-    paint_or_random,
+    paint_shaded_clouds,
+    blend_colors,
+    compute_value_noise,
+    paint_over,
+    choose_paint_or_random,
     painter,
     parse_hex_color,
     sample_paint,
-    shade,
-    solid,
-    step,
+    scale_brightness,
+    paint_solid_color,
+    compute_soft_step,
 )
 
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
@@ -135,10 +135,10 @@ def _press_seams(
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
     """Paint dark pentagons, light hexagons and gray seams on a sphere at the origin."""
     seam_distance, is_pentagon = football_seams(shapes.normalize(t.xyz))
-    panels = mix(light, dark, is_pentagon.astype(np.float64))
-    clouds = 1.0 - 0.06 * noise(t.xyz / 2.0 + offset)  # up to 6 % darker
-    off_seam = step(seam_distance, 0.012, soft=0.016)
-    return mix(parse_hex_color("3a3a3a"), panels * clouds[:, None], off_seam)
+    panels = blend_colors(light, dark, is_pentagon.astype(np.float64))
+    clouds = 1.0 - 0.06 * compute_value_noise(t.xyz / 2.0 + offset)  # up to 6 % darker
+    off_seam = compute_soft_step(seam_distance, 0.012, soft=0.016)
+    return blend_colors(parse_hex_color("3a3a3a"), panels * clouds[:, None], off_seam)
 
 
 @painter
@@ -154,7 +154,7 @@ def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array
 @painter
 def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
     """Return the mask of texels of a sphere that are within `reach` of a seam."""
-    return step(-seam(shapes.normalize(t.xyz)), -reach, soft=0.02)
+    return compute_soft_step(-seam(shapes.normalize(t.xyz)), -reach, soft=0.02)
 
 
 @painter
@@ -163,10 +163,10 @@ def _star(t: Texels, radius: float) -> Array:
     x = t.xyz[:, 0]
     y = t.xyz[:, 1]
     points = np.cos(5 * np.arctan2(y, x)) * 0.25  # five maxima around z
-    return step(points - np.hypot(x, y) / radius, -0.55, soft=0.04)
+    return compute_soft_step(points - np.hypot(x, y) / radius, -0.55, soft=0.04)
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def ball(sampler: ParameterSampler) -> Instance:
     """Make a football, or a ball of another pattern.
 
@@ -175,18 +175,18 @@ def ball(sampler: ParameterSampler) -> Instance:
     """
     radius = 11.0
     # "random" is named twice, to be sampled twice as often
-    style = sampler.pick(
+    style = sampler.sample_choice(
         "football", "beach", "basket", "tennis", "star", "plain", "random", "random"
     )
     # a factor along z, after the rotations, so that the ball is flat where it lies
     squash = sampler(1.0, low=0.95, high=1.03)
-    about_z = shapes.rotation("z", sampler(12.0, low=0.0, high=360.0))
-    about_x = shapes.rotation("x", sampler(24.0, low=0.0, high=180.0))
-    offset = sampler.offset()
+    about_z = shapes.make_rotation_matrix("z", sampler(12.0, low=0.0, high=360.0))
+    about_x = shapes.make_rotation_matrix("x", sampler(24.0, low=0.0, high=180.0))
+    offset = sampler.sample_noise_offset()
     light = sampler.sample_color("f1f0ea", "f4f4f2", "e8d34a", p_random=0.3)
     dark = sampler.sample_color("1d1f22", "23395d", "b5442e", p_random=0.3)
     paint = _ball_paint(sampler, style, light, dark, radius, offset)
-    sphere = shapes.sphere("ball", radius, rows=28, columns=48)
+    sphere = shapes.make_sphere_patches("ball", radius, rows=28, columns=48)
     patches = [
         replace(patch, vertices=patch.vertices * np.array([1.0, 1.0, squash]))
         for patch in shapes.transform_patches(
@@ -240,22 +240,22 @@ def _ball_paint(
         return _beach(_beach_colors(sampler, light), light, radius)
     if style == "basket":
         skin = sampler.sample_color("c8642b", "b5532a", "7a3b22", p_random=0.2)
-        return over(
-            clouded(skin, factor=0.85, scale=0.7, offset=offset),
+        return paint_over(
+            paint_shaded_clouds(skin, factor=0.85, scale=0.7, offset=offset),
             _near_to(basketball_seams, reach=0.03),
-            solid("1b1715"),
+            paint_solid_color("1b1715"),
         )
     if style == "tennis":
         felt = sampler.sample_color("c9d63c", "d5dc4a", "e08a2e", p_random=0.25)
-        return over(
-            clouded(felt, factor=0.85, scale=0.6, offset=offset),
+        return paint_over(
+            paint_shaded_clouds(felt, factor=0.85, scale=0.6, offset=offset),
             _near_to(tennis_seam, reach=0.045),
-            solid("eeeee6"),
+            paint_solid_color("eeeee6"),
         )
     if style == "star":
-        return over(solid(dark), _star(radius), solid(light))
+        return paint_over(paint_solid_color(dark), _star(radius), paint_solid_color(light))
     if style == "plain":
-        return clouded(dark, factor=1.2, scale=3.0, offset=offset)
+        return paint_shaded_clouds(dark, factor=1.2, scale=3.0, offset=offset)
     if style == "random":
         return sample_paint(sampler, 2 * radius)
     return _football(light, dark, offset)
@@ -267,10 +267,10 @@ def _beach_colors(sampler: ParameterSampler, light: Array) -> list[Array]:
         sampler.sample_color(code, p_random=0.5)
         for code in "d8342c f4f4f2 2f6fb5 f4f4f2 eeb52d f4f4f2".split()
     ]
-    return [color if sampler.chance(0.7) else light for color in bright_colors]
+    return [color if sampler.sample_bool(0.7) else light for color in bright_colors]
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def banana(sampler: ParameterSampler) -> Instance:
     """Make a banana of random bend and ripeness.
 
@@ -284,19 +284,19 @@ def banana(sampler: ParameterSampler) -> Instance:
     path = _banana_path(bend, length)
     radius = _banana_radius(sampler, length, stem_length, max_radius)
     section = _banana_section(sampler)
-    patches = shapes.sweep(
-        "banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True
+    patches = shapes.sweep_section(
+        "banana", path, section, radius, start_axis=(0.0, 0.0, 1.0), has_caps=True
     )
     patches = shapes.transform_patches(
-        patches, shapes.rotation("y", sampler(9.0, low=0.0, high=14.0))
+        patches, shapes.make_rotation_matrix("y", sampler(9.0, low=0.0, high=14.0))
     )
     patches = shapes.transform_patches(
-        patches, shapes.rotation("z", sampler(78.0, low=45.0, high=120.0))
+        patches, shapes.make_rotation_matrix("z", sampler(78.0, low=45.0, high=120.0))
     )
     paint = _banana_paint(sampler, path, stem_length)
     return Instance(
         patches,
-        {"banana": paint_or_random(sampler, length, paint, p_random=0.4)},
+        {"banana": choose_paint_or_random(sampler, length, paint, p_random=0.4)},
         sample_material(sampler, roughness=0.45, clearcoat=0.1),
     )
 
@@ -365,7 +365,7 @@ def _banana_paint(sampler: ParameterSampler, path: Array, stem_length: float) ->
         path: (N, 3) of the banana, whose ends are those of the stem and of the tip.
         stem_length: length of the stem.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     skin = sampler.sample_color("f0c930", "f3d64a", "e3b62a", "b7c04a", p_random=0.0)
     dark = parse_hex_color("3a2a18")
     brown = parse_hex_color("6b4520")
@@ -376,16 +376,16 @@ def _banana_paint(sampler: ParameterSampler, path: Array, stem_length: float) ->
         """Paint the skin, then green, flecks, the brown stem and both dark ends."""
         stem_distance = np.linalg.norm(t.xyz - path[0], axis=1)
         tip_distance = np.linalg.norm(t.xyz - path[-1], axis=1)
-        color = mix(skin, shade(skin, 0.86), noise(t.xyz / 2.2 + offset))
+        color = blend_colors(skin, scale_brightness(skin, 0.86), compute_value_noise(t.xyz / 2.2 + offset))
         stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem_length) / 2.6, 0.0, 1.0)
         tip_green = np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0)
-        color = mix(color, green, stem_green * 0.75)
-        color = mix(color, green, tip_green * 0.5)
-        color = mix(color, brown, _flecks(t.xyz, offset, fleck_amount) * 0.85)
-        stem_brown = step(-stem_distance, -0.5 * stem_length, soft=1.3)
-        color = mix(color, brown, stem_brown * 0.5)
-        color = mix(color, dark, step(-stem_distance, -0.45, soft=0.5))
-        return mix(color, dark, step(-tip_distance, -0.75, soft=0.5))
+        color = blend_colors(color, green, stem_green * 0.75)
+        color = blend_colors(color, green, tip_green * 0.5)
+        color = blend_colors(color, brown, _flecks(t.xyz, offset, fleck_amount) * 0.85)
+        stem_brown = compute_soft_step(-stem_distance, -0.5 * stem_length, soft=1.3)
+        color = blend_colors(color, brown, stem_brown * 0.5)
+        color = blend_colors(color, dark, compute_soft_step(-stem_distance, -0.45, soft=0.5))
+        return blend_colors(color, dark, compute_soft_step(-tip_distance, -0.75, soft=0.5))
 
     return paint
 
@@ -398,10 +398,10 @@ def _flecks(points: Array, offset: Array, amount: float) -> Array:
         offset: (3,) into the noise.
         amount: with a larger amount flecks cover more of the surface; not a fraction.
     """
-    large_noise = noise(points * np.array([1.9, 1.9, 3.1]) + offset)
-    small_noise = noise(points * 3.7 + offset)
-    large = step(large_noise, 1.0 - amount, soft=0.08)
-    return np.maximum(large, step(small_noise, 1.02 - amount, soft=0.08))
+    large_noise = compute_value_noise(points * np.array([1.9, 1.9, 3.1]) + offset)
+    small_noise = compute_value_noise(points * 3.7 + offset)
+    large = compute_soft_step(large_noise, 1.0 - amount, soft=0.08)
+    return np.maximum(large, compute_soft_step(small_noise, 1.02 - amount, soft=0.08))
 
 
 class _BookSize(NamedTuple):
@@ -418,7 +418,7 @@ class _BookSize(NamedTuple):
     thickness: float
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def book(sampler: ParameterSampler) -> Instance:
     """Make a closed hardback that lies on its back cover.
 
@@ -435,7 +435,7 @@ def book(sampler: ParameterSampler) -> Instance:
     bulge = sampler(0.35, low=0.0, high=0.7)
     patches: list[Patch] = []
     for z in (board / 2, size.thickness - board / 2):
-        patches += shapes.box(
+        patches += shapes.make_rounded_box(
             "cover", (COVER_SHIFT, 0.0, z), (width, height, board), bevel=0.12
         )
     # Along x the pages reach from 0.55 - width / 2, near the inner side of the spine, to
@@ -447,12 +447,12 @@ def book(sampler: ParameterSampler) -> Instance:
         height - 2 * overhang,
         size.thickness - 2 * board + 0.04,  # 0.02 inside of each cover, without a gap
     )
-    patches += shapes.box("pages", pages_center, pages_size, bevel=0.05, steps=1)
+    patches += shapes.make_rounded_box("pages", pages_center, pages_size, bevel=0.05, steps=1)
     patches += _round_spine(size, bulge, board)
     # -122 degrees: seen from the usual camera, the spine is at the side and the front
     # cover is readable.
     rotated = shapes.transform_patches(
-        patches, shapes.rotation("z", sampler(-122.0, low=-150.0, high=-100.0))
+        patches, shapes.make_rotation_matrix("z", sampler(-122.0, low=-150.0, high=-100.0))
     )
     return Instance(
         rotated,
@@ -488,21 +488,21 @@ def _book_paints(sampler: ParameterSampler, size: _BookSize) -> dict[str, Paint]
         sampler: samples the paints.
         size: the size of the book.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     cloth_color = sampler.sample_color(
         "7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd"
     )
     gold = sampler.sample_color("d8b45a", "efe6cf", "1d1f22", p_random=0.25)
-    cloth = paint_or_random(
+    cloth = choose_paint_or_random(
         sampler,
         size.height,
-        clouded(cloth_color, factor=0.85, scale=0.6, offset=offset, contrast=1.2),
+        paint_shaded_clouds(cloth_color, factor=0.85, scale=0.6, offset=offset, contrast=1.2),
         p_random=0.3,
     )
-    style = sampler.pick("frame", "blocks", "picture", "plain")
+    style = sampler.sample_choice("frame", "blocks", "picture", "plain")
     cover = _cover_paint(sampler, style, cloth, gold, size)
     paper = parse_hex_color("f4f2ea")
-    if sampler.chance(0.7, canonical=True):
+    if sampler.sample_bool(0.7, canonical=True):
         paper = parse_hex_color("ece2c8")
     return {
         "cover": cover,
@@ -517,7 +517,7 @@ def _page_edges(t: Texels, paper: Array, offset: Array) -> Array:
     x, y, z = t.xyz.T
     # The noise is fine across the sheets (z), and long along them.
     position = np.stack([z * 9.0, 0.08 * x, 0.08 * y], axis=1)
-    lines = noise(position + offset)
+    lines = compute_value_noise(position + offset)
     return np.asarray(paper * (0.72 + 0.28 * lines)[:, None])
 
 
@@ -531,16 +531,16 @@ def _spine_paint(t: Texels, cloth: Paint, gold: Array, size: _BookSize) -> Array
     _, y, z = t.xyz.T
     end_fraction = np.abs(y) / size.height  # 0 in the middle, 1/2 at the ends
     bands = np.maximum(
-        step(0.008 - np.abs(end_fraction - 0.36), 0.0, soft=0.006),
-        step(0.008 - np.abs(end_fraction - 0.42), 0.0, soft=0.006),
+        compute_soft_step(0.008 - np.abs(end_fraction - 0.36), 0.0, soft=0.006),
+        compute_soft_step(0.008 - np.abs(end_fraction - 0.42), 0.0, soft=0.006),
     )
-    in_length = step(0.16 - end_fraction, 0.0, soft=0.01)
+    in_length = compute_soft_step(0.16 - end_fraction, 0.0, soft=0.01)
     from_middle = np.abs(z - size.thickness / 2)
-    in_thickness = step(0.22 * size.thickness - from_middle, 0.0, soft=0.05)
+    in_thickness = compute_soft_step(0.22 * size.thickness - from_middle, 0.0, soft=0.05)
     # noise that changes mostly along the spine: it gives bars instead of letters
     position = np.stack([y * 1.8, z * 0.2, 0 * end_fraction], axis=1)
-    words = step(noise(position + 3.0), 0.36, soft=0.1)
-    return mix(cloth(t), gold, np.maximum(bands, in_length * in_thickness * words))
+    words = compute_soft_step(compute_value_noise(position + 3.0), 0.36, soft=0.1)
+    return blend_colors(cloth(t), gold, np.maximum(bands, in_length * in_thickness * words))
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
@@ -560,7 +560,7 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
     first_normal = np.tile([1.0, 0.0, 0.0], (2, 1))
     second_normal = np.tile([0.0, 0.0, 1.0], (2, 1))
     path = [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)]
-    patches = shapes.sweep(
+    patches = shapes.sweep_section(
         "spine", path, section, frame=(tangent, first_normal, second_normal)
     )
     for side in (1.0, -1.0):
@@ -586,7 +586,7 @@ def _spine_end(outer: Array, inner: Array, side: float, height: float) -> Patch:
     chart_width = float(np.ptp(outer[:, 1]))
     bulge = float(np.ptp(outer[:, 0]))
     thickness = float(np.linalg.norm(outer[0] - inner[0]))
-    return shapes.grid(
+    return shapes.make_grid_patch(
         "spine",
         points,
         normals=np.broadcast_to([0.0, side, 0.0], points.shape),
@@ -624,13 +624,13 @@ def _cover_paint(
         is_front = (t.xyz[:, 2] > size.thickness - 0.1).astype(np.float64)
         if style == "picture":
             picture = _picture_mask(x, y, size) * is_front
-            color = mix(color, accent, picture)
-            color = mix(color, gold, picture * _picture_spot(x, y, size))
+            color = blend_colors(color, accent, picture)
+            color = blend_colors(color, gold, picture * _picture_spot(x, y, size))
         if style == "frame":
-            color = mix(color, gold, _frame_mask(x, y, size) * is_front)
-        color = mix(color, gold, _word_mask(x, y, size) * is_front)
+            color = blend_colors(color, gold, _frame_mask(x, y, size) * is_front)
+        color = blend_colors(color, gold, _word_mask(x, y, size) * is_front)
         if style != "picture":
-            color = mix(color, gold, _seal_mask(x, y, size) * is_front)
+            color = blend_colors(color, gold, _seal_mask(x, y, size) * is_front)
         return color
 
     return paint
@@ -638,8 +638,8 @@ def _cover_paint(
 
 def _in_rectangle(x: Array, y: Array, half_width: float, half_height: float) -> Array:
     """Return the mask of a rectangle around the origin, for points (x, y), each (N,)."""
-    in_width = step(half_width - np.abs(x), 0.0, soft=0.12)
-    return in_width * step(half_height - np.abs(y), 0.0, soft=0.12)
+    in_width = compute_soft_step(half_width - np.abs(x), 0.0, soft=0.12)
+    return in_width * compute_soft_step(half_height - np.abs(y), 0.0, soft=0.12)
 
 
 # Masks (N,) of what is on the front of a book. They take x and y (N,) from the middle
@@ -655,7 +655,7 @@ def _picture_mask(x: Array, y: Array, size: _BookSize) -> Array:
 def _picture_spot(x: Array, y: Array, size: _BookSize) -> Array:
     """Return the mask of a round spot in the middle of the picture."""
     center_distance = np.hypot(x, y + 0.12 * size.height)
-    return step(0.16 * size.width - center_distance, 0.0, soft=0.15)
+    return compute_soft_step(0.16 * size.width - center_distance, 0.0, soft=0.15)
 
 
 def _frame_mask(x: Array, y: Array, size: _BookSize) -> Array:
@@ -673,9 +673,9 @@ def _word_mask(x: Array, y: Array, size: _BookSize) -> Array:
     line_number = np.floor(y / 2.0)
     no_change = np.zeros_like(x)
     noise_position = np.stack([x * 1.5, no_change, line_number], axis=1)
-    words = step(noise(noise_position + 7.0), 0.3, soft=0.08)
+    words = compute_soft_step(compute_value_noise(noise_position + 7.0), 0.3, soft=0.08)
     from_line_middle = np.abs((y / 2.0) % 1.0 - 0.5)
-    lines = step(from_line_middle, 0.22, soft=0.1) * words
+    lines = compute_soft_step(from_line_middle, 0.22, soft=0.1) * words
     from_block_middle = y - 0.24 * size.height  # y is downwards
     block = _in_rectangle(x, from_block_middle, 0.32 * size.width, 0.09 * size.height)
     return np.clip(block * lines, 0.0, 1.0)
@@ -684,8 +684,8 @@ def _word_mask(x: Array, y: Array, size: _BookSize) -> Array:
 def _seal_mask(x: Array, y: Array, size: _BookSize) -> Array:
     """Return the mask of a ring above the middle."""
     center_distance = np.hypot(x, y + 0.16 * size.height)
-    disc = step(0.14 * size.width - center_distance, 0.0, soft=0.12)
-    return disc - step(0.1 * size.width - center_distance, 0.0, soft=0.12)
+    disc = compute_soft_step(0.14 * size.width - center_distance, 0.0, soft=0.12)
+    return disc - compute_soft_step(0.1 * size.width - center_distance, 0.0, soft=0.12)
 
 
 # ---- stop sign
@@ -789,16 +789,16 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
         [y * np.cos(angle) + z * np.sin(angle) for angle in side_angles], axis=0
     )
     # The rim is white between 91.5 % and 98.5 % of the apothem.
-    rim = step(texel_apothem - 0.915 * apothem, 0.0, soft=0.006)
-    rim = rim * step(0.985 * apothem - texel_apothem, 0.0, soft=0.006)
+    rim = compute_soft_step(texel_apothem - 0.915 * apothem, 0.0, soft=0.006)
+    rim = rim * compute_soft_step(0.985 * apothem - texel_apothem, 0.0, soft=0.006)
 
     strokes = _word_strokes("STOP", 0.52 * apothem)
     stroke_distance = shapes.distance_to_polylines(y, z, *strokes)
-    word = step(0.05 * apothem - stroke_distance, 0.0, soft=0.006)
-    return mix(red, parse_hex_color("f3f2ee"), np.maximum(rim, word))
+    word = compute_soft_step(0.05 * apothem - stroke_distance, 0.0, soft=0.006)
+    return blend_colors(red, parse_hex_color("f3f2ee"), np.maximum(rim, word))
 
 
-@family(metres=1.0, texels=192)
+@make_family(unit_in_metres=1.0, texels=192)
 def stop_sign(sampler: ParameterSampler) -> Instance:
     """Make a stop sign on a post, turned a little about z.
 
@@ -816,28 +816,28 @@ def stop_sign(sampler: ParameterSampler) -> Instance:
     gray = sampler.sample_color("9a9da0", "7d8083", p_random=0.0)
     paints = {
         "face": _face(red, radius),
-        "metal": solid("a4a7aa"),
-        "post": solid(gray),
-        "rubber": solid("1d1d1f"),
+        "metal": paint_solid_color("a4a7aa"),
+        "post": paint_solid_color(gray),
+        "rubber": paint_solid_color("1d1d1f"),
     }
     rotated = shapes.transform_patches(
-        patches, shapes.rotation("z", sampler(0.0, low=-25.0, high=25.0))
+        patches, shapes.make_rotation_matrix("z", sampler(0.0, low=-25.0, high=25.0))
     )
     return Instance(
         rotated,
         paints,
         FINISHES["face"],
         texel_density={"metal": 0.25, "post": 0.18, "rubber": 0.3},
-        finishes=FINISHES,
+        materials_by_tag=FINISHES,
     )
 
 
 def _sign_stand() -> list[Patch]:
     """Create the rubber foot of a stop sign, with a block that holds the post."""
-    foot = shapes.box(
+    foot = shapes.make_rounded_box(
         "rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), bevel=0.02, steps=2
     )
-    block = shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), bevel=0.01, steps=1)
+    block = shapes.make_rounded_box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), bevel=0.01, steps=1)
     return foot + block
 
 
@@ -849,7 +849,7 @@ def _sign_clamps(radius: float, height: float) -> list[Patch]:
     """
     patches = list[Patch]()
     for z in (height - 0.5 * radius, height + 0.5 * radius):
-        patches += shapes.box(
+        patches += shapes.make_rounded_box(
             "post", (0.008, 0.0, z), (0.05, 0.09, 0.03), bevel=0.006, steps=1
         )
     return patches
@@ -867,13 +867,13 @@ def _sign_plate(radius: float, height: float) -> list[Patch]:
     forwards = np.array([1.0, 0.0, 0.0])
     # an octagon whose middle is the origin
     back = np.insert(ring, 0, 0.0, axis=1)
-    edge = shapes.sweep(
-        "metal", [(0.0, 0.0, 0.0), thickness * forwards], ring, first=(0.0, 1.0, 0.0)
+    edge = shapes.sweep_section(
+        "metal", [(0.0, 0.0, 0.0), thickness * forwards], ring, start_axis=(0.0, 1.0, 0.0)
     )
     plate = [
-        shapes.cap("face", back + thickness * forwards, forwards),
+        shapes.make_cap_face("face", back + thickness * forwards, forwards),
         *edge,
-        shapes.cap("metal", back[::-1], -forwards),
+        shapes.make_cap_face("metal", back[::-1], -forwards),
     ]
     return shapes.transform_patches(plate, offset=(0.036, 0.0, height))
 
@@ -890,6 +890,6 @@ def _sign_post(height: float, plate_radius: float) -> list[Patch]:
         [(0.03, 0.0), (0.03, top), (0.0, top + 0.004)], radius=0.004, steps=2
     )
     bottom = [(0.0, 0.0), (0.03, 0.0)]
-    return shapes.lathe(
+    return shapes.revolve_profile(
         [("post", bottom), ("post", tube[:-1]), ("post", tube[-2:])], columns=20
     )

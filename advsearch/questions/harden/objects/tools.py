@@ -5,23 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, family, sample_material
+from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
     band_mask,
-    between,
-    clouded,
-    over,
-    paint_or_random,
+    make_range_mask,
+    paint_shaded_clouds,
+    paint_over,
+    choose_paint_or_random,
     painter,
     rings,
-    shade,
-    solid,
-    speckled,
-    step,
+    scale_brightness,
+    paint_solid_color,
+    add_specks,
+    compute_soft_step,
     wood,
 )
 
@@ -55,8 +55,8 @@ def _claw(
         y = start + length * (t - 0.1 * t**2)
         z = side * half_head * (0.5 + spread * t)
         curve = np.stack([x, y, z], axis=1)
-        patches += shapes.sweep(
-            "head", curve, section, scale, first=(1.0, 0.0, 0.0), caps=True
+        patches += shapes.sweep_section(
+            "head", curve, section, scale, start_axis=(1.0, 0.0, 0.0), has_caps=True
         )
     return patches
 
@@ -77,20 +77,20 @@ def _peen(
         start: y of its root.
         length: its extent along +y.
     """
-    if sampler.chance(0.5):
+    if sampler.sample_bool(0.5):
         return _ball_peen(half_head, start, length)
     path = _points_on_y(
         start, start + 0.3 * length, start + 0.9 * length, start + length
     )
     # half-thickness and half-width: it becomes thin, and stays wide
     scale = np.array([[0.95, 0.95], [0.85, 0.95], [0.22, 0.9], [0.12, 0.85]])
-    return shapes.sweep(
+    return shapes.sweep_section(
         "head",
         path,
         shapes.rectangle(2.0, 2.0, bevel=0.4),
         scale * half_head,
-        first=(1.0, 0.0, 0.0),
-        caps=True,
+        start_axis=(1.0, 0.0, 0.0),
+        has_caps=True,
     )
 
 
@@ -102,13 +102,13 @@ def _ball_peen(half_head: float, start: float, length: float) -> list[Patch]:
         start: y of the neck's root.
         length: length along +y.
     """
-    neck = shapes.sweep(
+    neck = shapes.sweep_section(
         "head",
         _points_on_y(start - 0.3, start + 0.5 * length),
         shapes.ellipse(1, 1, count=20),
         np.array([0.75, 0.6]) * half_head,
     )
-    ball = shapes.sphere(
+    ball = shapes.make_sphere_patches(
         "head",
         0.95 * half_head,
         center=(0.0, start + 0.75 * length, 0.0),
@@ -118,7 +118,7 @@ def _ball_peen(half_head: float, start: float, length: float) -> list[Patch]:
     return neck + ball
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def hammer(sampler: ParameterSampler) -> Instance:
     """Make a hammer that lies on its side.
 
@@ -132,7 +132,7 @@ def hammer(sampler: ParameterSampler) -> Instance:
     sampled_front = sampler(5.0, low=3.8, high=6.0)
     face_radius = half_head * sampler(1.1, low=1.0, high=1.35)
     # "claw" is named twice, to be sampled twice as often
-    style = sampler.pick("claw", "claw", "peen", "sledge")
+    style = sampler.sample_choice("claw", "claw", "peen", "sledge")
     half_eye = half_head * sampler(1.25, low=1.1, high=1.5)
     front = max(sampled_front, 2.2 * half_eye)  # outside the block around the eye
 
@@ -145,9 +145,9 @@ def hammer(sampler: ParameterSampler) -> Instance:
     half_face = face_radius * 1.2 if style == "sledge" else face_radius
     drop = max(half_head * 1.05, half_face) - half_grip
     tilt = -float(np.degrees(np.arctan2(drop, 0.8 * length)))
-    patches = shapes.transform_patches([*head, *handle], shapes.rotation("y", tilt))
+    patches = shapes.transform_patches([*head, *handle], shapes.make_rotation_matrix("y", tilt))
     patches = shapes.transform_patches(
-        patches, shapes.rotation("z", sampler(58.0, low=20.0, high=90.0))
+        patches, shapes.make_rotation_matrix("z", sampler(58.0, low=20.0, high=90.0))
     )
     return Instance(
         patches,
@@ -206,28 +206,28 @@ def _sledge_block(
         face_radius: radius of the face.
     """
     section = shapes.rectangle(1.8, 1.8, bevel=0.4)
-    if sampler.chance(0.5):
+    if sampler.sample_bool(0.5):
         section = shapes.polygon(8, bevel=0.1)
-    return shapes.sweep(
+    return shapes.sweep_section(
         "head",
         _points_on_y(-front, -front + 0.3, front - 0.3, front),
         section,
         np.array([0.85, 1.0, 1.0, 0.85]) * face_radius * 1.25,
-        first=(1.0, 0.0, 0.0),
-        caps=True,
+        start_axis=(1.0, 0.0, 0.0),
+        has_caps=True,
     )
 
 
 def _eye_block(half_head: float, half_eye: float) -> list[Patch]:
     """Create the beveled block around the eye, along y."""
     scale = np.array([[0.82, 0.82], [1, 1], [1, 1], [0.86, 0.86]])
-    return shapes.sweep(
+    return shapes.sweep_section(
         "head",
         _points_on_y(-half_eye * 1.1, -half_eye * 0.9, half_eye * 0.9, half_eye * 1.15),
         shapes.rectangle(2.0, 2.0, bevel=0.45),
         scale * half_head * 1.05,
-        first=(1.0, 0.0, 0.0),
-        caps=True,
+        start_axis=(1.0, 0.0, 0.0),
+        has_caps=True,
     )
 
 
@@ -255,13 +255,13 @@ def _striking_face(
     # The first three rings are of the neck, the others of the face.
     relative_scale = np.array([0.85, 0.75, 0.72, 0.85, 1.0, 1.0, 0.88])
     scale = relative_scale * np.array([half_head] * 3 + [face_radius] * 4)
-    return shapes.sweep(
+    return shapes.sweep_section(
         "head",
         path,
         shapes.ellipse(1.0, 1.0, count=28),
         scale,
-        first=(1.0, 0.0, 0.0),
-        caps=True,
+        start_axis=(1.0, 0.0, 0.0),
+        has_caps=True,
     )
 
 
@@ -301,11 +301,11 @@ def _hammer_handle(
     top = half_head * 1.18  # x of the end that sticks out of the head
     path = np.stack([top - (length + top) * t, 0 * t, 0 * t], axis=1)
     # Sections reach from -1 to 1; `scale` makes them as wide as the handle.
-    if sampler.chance(0.6, canonical=True):
+    if sampler.sample_bool(0.6, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=24)
     else:
         section = shapes.rectangle(2.0, 2.0, bevel=0.7)
-    handle = shapes.sweep("handle", path, section, scale, first=(0.0, 1.0, 0.0))
+    handle = shapes.sweep_section("handle", path, section, scale, start_axis=(0.0, 1.0, 0.0))
     return half_thickness * (1.0 + swelling), handle
 
 
@@ -334,17 +334,17 @@ def _hammer_paints(
         front: distance of the striking face from the middle of the head, at -y.
         length: length of the handle, along -x.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     steel = sampler.sample_color("4b4f55", "8d9298", "2b2d30", "6b7078", p_random=0.15)
-    metal = over(
-        clouded(steel, factor=0.8, scale=1.6, offset=offset, contrast=2.4),
-        lambda t: step(-t.xyz[:, 1], 0.86 * front, soft=0.3),
-        solid(shade(steel, 1.7)),
+    metal = paint_over(
+        paint_shaded_clouds(steel, factor=0.8, scale=1.6, offset=offset, contrast=2.4),
+        lambda t: compute_soft_step(-t.xyz[:, 1], 0.86 * front, soft=0.3),
+        paint_solid_color(scale_brightness(steel, 1.7)),
     )
     handle = _hammer_handle_paint(sampler, length, offset)
     return {
-        "head": paint_or_random(sampler, length, metal, p_random=0.3),
-        "handle": paint_or_random(sampler, length, handle, p_random=0.3),
+        "head": choose_paint_or_random(sampler, length, metal, p_random=0.3),
+        "handle": choose_paint_or_random(sampler, length, handle, p_random=0.3),
     }
 
 
@@ -365,16 +365,16 @@ def _hammer_handle_paint(
         axis=0,
     )
     accent = sampler.sample_color("8f2e22", "1f4e79", "d9a02b", "2d2d33", "3d6b4a")
-    kind = sampler.pick("wood", "dipped", "rubber")
+    kind = sampler.sample_choice("wood", "dipped", "rubber")
     beyond_end = -2 * length  # a mask from there reaches the end of the handle
     if kind == "dipped":
         dip_start = -sampler(0.5, low=0.4, high=0.7) * length
-        dipped = between(beyond_end, dip_start, axis=0, soft=0.05)
-        return over(timber, dipped, solid(accent))
+        dipped = make_range_mask(beyond_end, dip_start, axis=0, soft=0.05)
+        return paint_over(timber, dipped, paint_solid_color(accent))
     if kind == "rubber":
-        grip = between(beyond_end, -0.45 * length, axis=0, soft=0.05)
-        ribs = rings(accent, shade(accent, 0.7), period=1.1, fraction=0.2, axis=0)
-        return over(solid(shade(accent, 0.5)), grip, ribs)
+        grip = make_range_mask(beyond_end, -0.45 * length, axis=0, soft=0.05)
+        ribs = rings(accent, scale_brightness(accent, 0.7), period=1.1, fraction=0.2, axis=0)
+        return paint_over(paint_solid_color(scale_brightness(accent, 0.5)), grip, ribs)
     return timber
 
 
@@ -394,7 +394,7 @@ def _weights(
         return _hexagonal_weight(start, length, radius)
     if style == "globe":
         center_z = start + 0.8 * radius
-        return shapes.sphere("weight", radius * 0.95, center=(0.0, 0.0, center_z))
+        return shapes.make_sphere_patches("weight", radius * 0.95, center=(0.0, 0.0, center_z))
     if style == "round":
         return _plate(start, length, radius)
     n_plates = 3
@@ -414,13 +414,13 @@ def _hexagonal_weight(start: float, length: float, radius: float) -> list[Patch]
         (0, 0, start + 0.85 * length),
         (0, 0, start + length),
     ]
-    return shapes.sweep(
+    return shapes.sweep_section(
         "weight",
         path,
         shapes.polygon(6, bevel=0.14, steps=3),
         np.array([0.86, 1.0, 1.0, 0.8]) * radius,
-        first=(0.0, 1.0, 0.0),
-        caps=True,
+        start_axis=(0.0, 1.0, 0.0),
+        has_caps=True,
     )
 
 
@@ -438,7 +438,7 @@ def _plate(start: float, spacing: float, radius: float) -> list[Patch]:
         radius=min(0.25 * thickness, 0.6),
         steps=4,
     )
-    return shapes.lathe(
+    return shapes.revolve_profile(
         [
             ("weight", [(0.0, start), (hub_radius, start)]),
             ("weight", shapes.subdivide(side, longest=1.2)),
@@ -457,30 +457,30 @@ def _nut(sampler: ParameterSampler, start: float, radius: float) -> list[Patch]:
         radius: radius of the largest plate.
     """
     section = shapes.ellipse(1.0, 1.0, count=24)
-    if sampler.chance(0.5):
+    if sampler.sample_bool(0.5):
         section = shapes.polygon(6, bevel=0.1)
     # It begins inside the last plate, so that no gap shows.
     path = [(0, 0, start - 0.1), (0, 0, start + 0.6), (0, 0, start + 0.75)]
     scale = np.array([1.0, 1.0, 0.85]) * 0.42 * radius
-    return shapes.sweep("bar", path, section, scale, first=(0.0, 1.0, 0.0), caps=True)
+    return shapes.sweep_section("bar", path, section, scale, start_axis=(0.0, 1.0, 0.0), has_caps=True)
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def dumbbell(sampler: ParameterSampler) -> Instance:
     """Make a dumbbell with weights of random shape."""
     # "hex" is named twice, to be sampled twice as often
-    style = sampler.pick("hex", "plates", "hex", "round", "globe")
+    style = sampler.sample_choice("hex", "plates", "hex", "round", "globe")
     radius = sampler(4.6, low=3.6, high=6.2)
     half_grip = sampler(5.6, low=5.0, high=7.0)  # half the bar between the weights
     length = sampler(5.6, low=3.8, high=7.0)  # length of a weight
     bar = _dumbbell_bar(sampler, half_grip)
     weight = _weights(sampler, style, half_grip, length, radius)
-    other_weight = shapes.transform_patches(weight, shapes.rotation("y", 180.0))
+    other_weight = shapes.transform_patches(weight, shapes.make_rotation_matrix("y", 180.0))
     upright = bar + weight + other_weight
     # laid down, and turned
     patches = shapes.transform_patches(
-        shapes.transform_patches(upright, shapes.rotation("y", 90.0)),
-        shapes.rotation("z", sampler(118.0, low=90.0, high=150.0)),
+        shapes.transform_patches(upright, shapes.make_rotation_matrix("y", 90.0)),
+        shapes.make_rotation_matrix("z", sampler(118.0, low=90.0, high=150.0)),
     )
     paints = _dumbbell_paints(sampler, style, half_grip, length, radius)
     return Instance(
@@ -498,7 +498,7 @@ def _dumbbell_bar(sampler: ParameterSampler, half_grip: float) -> list[Patch]:
     z = np.linspace(-half_grip - 0.6, half_grip + 0.6, 25)
     swell = swelling * np.cos(np.pi * z / (2 * half_grip + 1.2)) ** 2
     profile = np.stack([radius * (1.0 + swell), z], axis=1)
-    return shapes.lathe([("bar", profile)], columns=28)
+    return shapes.revolve_profile([("bar", profile)], columns=28)
 
 
 def _dumbbell_paints(
@@ -518,13 +518,13 @@ def _dumbbell_paints(
         half_grip: half the length of the bar between the weights.
         length, radius: length and radius of a weight.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     iron = sampler.sample_color(
         "26282b", "3a3d42", "8a8d92", "7a2f8f", "2f6f8f", "c23b4a", p_random=0.25
     )
-    weight = speckled(
-        clouded(iron, factor=1.25, scale=2.5, offset=offset),
-        shade(iron, 1.9),
+    weight = add_specks(
+        paint_shaded_clouds(iron, factor=1.25, scale=2.5, offset=offset),
+        scale_brightness(iron, 1.9),
         scale=0.35,
         offset=offset,
         amount=sampler(0.08, low=0.0, high=0.2),
@@ -534,12 +534,12 @@ def _dumbbell_paints(
     weight_length = 1.75 * radius if style == "globe" else length
     tip = half_grip + weight_length
     accent = sampler.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
-    if sampler.chance(0.5, canonical=True):
-        weight = over(weight, _end_rings(tip, radius), solid(accent))
+    if sampler.sample_bool(0.5, canonical=True):
+        weight = paint_over(weight, _end_rings(tip, radius), paint_solid_color(accent))
     steel = sampler.sample_color("b4b8bd", "8d9298", "2b2d30", p_random=0.2)
-    knurl = over(solid(steel), _knurl_mask(half_grip), solid(shade(steel, 0.55)))
+    knurl = paint_over(paint_solid_color(steel), _knurl_mask(half_grip), paint_solid_color(scale_brightness(steel, 0.55)))
     return {
-        "weight": paint_or_random(sampler, 2 * tip, weight, p_random=0.35),
+        "weight": choose_paint_or_random(sampler, 2 * tip, weight, p_random=0.35),
         "bar": knurl,
     }
 
@@ -555,12 +555,12 @@ def _end_rings(t: Texels, tip: float, radius: float) -> Array:
     """
     axis_distance = np.hypot(t.xyz[:, 0], t.xyz[:, 1])
     ring = band_mask(axis_distance, 0.34 * radius, 0.44 * radius, soft=0.12)
-    return step(np.abs(t.xyz[:, 2]), tip - 0.6, soft=0.05) * ring
+    return compute_soft_step(np.abs(t.xyz[:, 2]), tip - 0.6, soft=0.05) * ring
 
 
 @painter
 def _knurl_mask(t: Texels, half_grip: float) -> Array:
     """Return the mask of fine slanted lines on the part of the bar that is held."""
-    lines = step(np.sin(90 * t.u + 60 * t.v), 0.3, soft=0.6)
-    is_held = between(-0.75 * half_grip, 0.75 * half_grip)(t)
+    lines = compute_soft_step(np.sin(90 * t.u + 60 * t.v), 0.3, soft=0.6)
+    is_held = make_range_mask(-0.75 * half_grip, 0.75 * half_grip)(t)
     return lines * is_held * 0.6  # faint

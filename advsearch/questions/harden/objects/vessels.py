@@ -12,35 +12,35 @@ from typing import NamedTuple
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, family, sample_material
+from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
-    between,
+    make_range_mask,
     checks,
-    clouded,
+    paint_shaded_clouds,
     dots,
-    facing,
+    make_facing_mask,
     gradient,
-    mottled,
-    over,
-    paint_or_random,
+    paint_two_color_clouds,
+    paint_over,
+    choose_paint_or_random,
     painter,
     parse_hex_color,
     rings,
     sample_paint,
-    shade,
-    solid,
-    speckled,
-    step,
+    scale_brightness,
+    paint_solid_color,
+    add_specks,
+    compute_soft_step,
     stripes,
     zigzag,
 )
 
 # turns the seam of a lathe away from the default camera, which is at an azimuth of 40
-SEAM_ROTATION = shapes.rotation("z", 220.0)
+SEAM_ROTATION = shapes.make_rotation_matrix("z", 220.0)
 HANDLE_POINTS = 26  # points of the curve of a handle
 LABEL_AZIMUTH = 180.0  # degrees about z; opposite the seam of the texture
 PALE = "f4efe4"  # the light color of printed patterns
@@ -72,7 +72,7 @@ def make_handle(
     curve = _handle_curve(style, (bottom_radius, bottom), (top_radius, top), reach)
     half_thickness = sampler(0.42, low=0.32, high=0.6)
     half_width = sampler(0.62, low=0.4, high=0.95)
-    if sampler.chance(0.7, canonical=True):
+    if sampler.sample_bool(0.7, canonical=True):
         section = shapes.ellipse(half_thickness, half_width, count=16)
     else:
         section = shapes.rectangle(
@@ -80,7 +80,7 @@ def make_handle(
         )
     # up to a quarter thicker at both ends
     root_flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
-    return shapes.sweep("handle", shapes.to_xz_plane(curve), section, root_flare)
+    return shapes.sweep_section("handle", shapes.to_xz_plane(curve), section, root_flare)
 
 
 def _handle_curve(
@@ -107,7 +107,7 @@ def _handle_curve(
         rounded = shapes.round_corners(corners, radius=0.45 * reach, steps=6)
         # The spline distributes its points evenly; the dense polyline keeps its
         # corners.
-        return shapes.spline(
+        return shapes.sample_spline(
             shapes.subdivide(rounded, longest=0.8), count=HANDLE_POINTS
         )
     # how far it extends near the top, the middle and the bottom, in units of `reach`
@@ -126,7 +126,7 @@ def _handle_curve(
         (wall_radius + 0.3 * reach, bottom + 0.03 * height),
         bottom_root,
     ]
-    return shapes.spline(knots, count=HANDLE_POINTS)
+    return shapes.sample_spline(knots, count=HANDLE_POINTS)
 
 
 def _ceramic(
@@ -140,7 +140,7 @@ def _ceramic(
         glaze: the ground of most decorations; alone on a plain vessel.
         accent: the paint of a single band, and of the upper part of a dipped vessel.
     """
-    kind = sampler.pick(
+    kind = sampler.sample_choice(
         "band", "plain", "bands", "dots", "stripes", "dip", "checks", "zigzag", "rings"
     )
     second_color = sampler.sample_color(
@@ -161,7 +161,7 @@ def _ceramic(
             second_color,
             cell=sampler(1.8, low=1.0, high=4.0),
             fraction=sampler(0.5, low=0.25, high=0.6),
-            slant=int(sampler.pick(0, 2)),
+            slant=int(sampler.sample_choice(0, 2)),
         )
     if kind == "rings":
         return rings(
@@ -194,26 +194,26 @@ def _ceramic_belt(
     if kind == "band":
         low = sampler(0.36, low=0.1, high=0.5) * height
         high = sampler(0.72, low=0.55, high=0.9) * height
-        return over(glaze, between(low, high, soft=0.12), accent)
+        return paint_over(glaze, make_range_mask(low, high, soft=0.12), accent)
     if kind == "dip":
         low = sampler(0.5, low=0.3, high=0.7) * height
         # twice the height: up to the top, with some margin for the lip
-        return over(glaze, between(low, 2 * height, soft=0.1), accent)
+        return paint_over(glaze, make_range_mask(low, 2 * height, soft=0.1), accent)
     if kind == "bands":
         bands = rings(parse_hex_color(PALE), second_color, period=0.13 * height)
-        return over(glaze, between(0.62 * height, 0.9 * height), bands)
+        return paint_over(glaze, make_range_mask(0.62 * height, 0.9 * height), bands)
     if kind == "checks":
         board = checks(
             sampler.sample_color(PALE),
             second_color,
             cell=sampler(1.4, low=0.9, high=2.2),
         )
-        return over(glaze, between(0.25 * height, 0.75 * height), board)
+        return paint_over(glaze, make_range_mask(0.25 * height, 0.75 * height), board)
     chevrons = zigzag(sampler.sample_color(PALE), second_color, cell=2.5)
-    return over(glaze, between(0.3 * height, 0.7 * height), chevrons)
+    return paint_over(glaze, make_range_mask(0.3 * height, 0.7 * height), chevrons)
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def mug(sampler: ParameterSampler) -> Instance:
     """Make a mug with a handle.
 
@@ -223,7 +223,7 @@ def mug(sampler: ParameterSampler) -> Instance:
     height = sampler(9.4, low=7.6, high=12.0)
     wall, side, body = _mug_body(sampler, height)
 
-    style = sampler.pick("ear", "round", "square", "loop")
+    style = sampler.sample_choice("ear", "round", "square", "loop")
     handle_top = height * sampler(0.85, low=0.76, high=0.88)
     if style == "loop":
         # never the canonical mug, whose handle is an "ear": so 0.3 is not used
@@ -244,7 +244,7 @@ def mug(sampler: ParameterSampler) -> Instance:
     patches = shapes.transform_patches(
         # -108 degrees: in the usual view the handle is at the side, where it is
         # visible.
-        [*body, *shapes.transform_patches(handle, shapes.rotation("z", -108.0))],
+        [*body, *shapes.transform_patches(handle, shapes.make_rotation_matrix("z", -108.0))],
         SEAM_ROTATION,
     )
     return Instance(
@@ -274,13 +274,13 @@ def _mug_body(
     bulge = sampler(0.0, low=-0.06, high=0.13) * rim
     wall = sampler(0.36, low=0.28, high=0.5)
     edge = sampler(0.7, low=0.3, high=1.2)  # size of the round edge at the foot
-    side = shapes.spline(
+    side = shapes.sample_spline(
         [(foot, edge), (0.5 * (foot + rim) + bulge, 0.5 * height), (rim, height)],
         count=14,
     )
     foot_edge = [(foot - edge, 0.0), (foot - 0.3 * edge, 0.25 * edge)]
     outside = np.concatenate([foot_edge, side])
-    body = shapes.vessel(outside, wall=wall, floor=sampler(0.6, low=0.5, high=0.9))
+    body = shapes.make_vessel(outside, wall=wall, floor=sampler(0.6, low=0.5, high=0.9))
     return wall, side, body
 
 
@@ -291,45 +291,45 @@ def _mug_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
         sampler: samples the paints; the canonical mug has a raw foot.
         height: height of the mug.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     clay = sampler.sample_color(
         "e9dfca", "f3f1ec", "d9c7a5", "3a3f45", "8fa7a0", "b5442e", "6f8fb0"
     )
     specks = sampler.sample_color("7d6247", p_random=0.2)
-    glaze = speckled(
-        clouded(clay, factor=0.93, scale=3.0, offset=offset),
+    glaze = add_specks(
+        paint_shaded_clouds(clay, factor=0.93, scale=3.0, offset=offset),
         specks,
         scale=0.28,
         offset=offset,
         amount=sampler(0.06, low=0.0, high=0.14),
     )
     deep_color = sampler.sample_color("1f4e79", "2c6e63", "a63c2a", "d79b2b", "2d2d33")
-    accent = clouded(deep_color, factor=1.35, scale=2.2, offset=offset)
+    accent = paint_shaded_clouds(deep_color, factor=1.35, scale=2.2, offset=offset)
     decoration = _ceramic(sampler, height, glaze, accent)
-    decorated = paint_or_random(sampler, height, decoration)
+    decorated = choose_paint_or_random(sampler, height, decoration)
     inside = _mug_inside(sampler, decorated, glaze)
-    raw_clay = solid("a98663")
+    raw_clay = paint_solid_color("a98663")
     outside = decorated
-    if sampler.chance(0.4, canonical=True):  # the foot is left without a glaze
-        outside = over(decorated, between(-1.0, 0.35, soft=0.1), raw_clay)
+    if sampler.sample_bool(0.4, canonical=True):  # the foot is left without a glaze
+        outside = paint_over(decorated, make_range_mask(-1.0, 0.35, soft=0.1), raw_clay)
     return {
         "outside": outside,
         "inside": inside,
         "base": raw_clay,
-        "handle": sampler.pick(glaze, decorated, accent),
+        "handle": sampler.sample_choice(glaze, decorated, accent),
     }
 
 
 def _mug_inside(sampler: ParameterSampler, decorated: Paint, glaze: Paint) -> Paint:
     """Sample the inside of a mug: seldom decorated, else of one color or glazed."""
-    if sampler.chance(0.15):
+    if sampler.sample_bool(0.15):
         return decorated
-    if sampler.chance(0.5, canonical=True):
-        return solid(sampler.sample_color("efe6d4", "f3f1ec", p_random=0.3))
+    if sampler.sample_bool(0.5, canonical=True):
+        return paint_solid_color(sampler.sample_color("efe6d4", "f3f1ec", p_random=0.3))
     return glaze
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def bowl(sampler: ParameterSampler) -> Instance:
     """Make a bowl."""
     radius = 8.0
@@ -356,28 +356,28 @@ def _bowl_paints(
         radius: radius of the rim.
         height: height of the rim.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     clay = sampler.sample_color(
         "3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f"
     )
-    glaze = clouded(clay, factor=0.72, scale=2.6, offset=offset)
-    accent = mottled(
+    glaze = paint_shaded_clouds(clay, factor=0.72, scale=2.6, offset=offset)
+    accent = paint_two_color_clouds(
         parse_hex_color("e8dcc0"), parse_hex_color("d6c39a"), scale=2.0, offset=offset
     )
-    raw_clay = solid("9b7352")
+    raw_clay = paint_solid_color("9b7352")
     is_canonical = sampler.rng is None
     if is_canonical:
-        with_rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
-        outside = over(with_rim, between(-1.0, 0.55, soft=0.1), raw_clay)
+        with_rim = paint_over(glaze, make_range_mask(0.93 * height, 2 * height, soft=0.25), accent)
+        outside = paint_over(with_rim, make_range_mask(-1.0, 0.55, soft=0.1), raw_clay)
     else:
         decoration = _ceramic(sampler, height, glaze, accent)
-        outside = paint_or_random(sampler, 2 * radius, decoration)
-    inside = sampler.pick(
+        outside = choose_paint_or_random(sampler, 2 * radius, decoration)
+    inside = sampler.sample_choice(
         accent,
         glaze,
         outside,
-        solid(sampler.sample_color("f3f1ec")),
-        rings(clay, shade(clay, 1.3), period=height * 0.2),
+        paint_solid_color(sampler.sample_color("f3f1ec")),
+        rings(clay, scale_brightness(clay, 1.3), period=height * 0.2),
     )
     return {"outside": outside, "inside": inside, "base": raw_clay}
 
@@ -405,15 +405,15 @@ def _bowl_body(sampler: ParameterSampler, radius: float, height: float) -> list[
         (radius * (0.5 + 0.5 * fullness), 0.8 * height),
         (radius + flare, height),
     ]
-    return shapes.vessel(
-        np.array([(foot_radius, 0.0), *shapes.spline(knots, count=22)]),
+    return shapes.make_vessel(
+        np.array([(foot_radius, 0.0), *shapes.sample_spline(knots, count=22)]),
         wall=sampler(0.45, low=0.32, high=0.65),
         floor=foot_height + 0.55,
         step=0.9,
     )
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def bottle(sampler: ParameterSampler) -> Instance:
     """Make a bottle with a cap and perhaps a label."""
     height = sampler(30.0, low=24.0, high=32.0)
@@ -459,10 +459,10 @@ def _bottle_body(sampler: ParameterSampler, height: float) -> tuple[float, list[
         corners, radius=[0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], steps=7
     )
     ring_radius = neck_radius * 0.95 + sampler(0.28, low=0.1, high=0.4)
-    has_cap = sampler.chance(0.4)
+    has_cap = sampler.sample_bool(0.4)
     mouth = _mouth_ring(ring_radius, neck_radius, height)
     outside = np.concatenate([shapes.subdivide(body, longest=1.6), mouth])
-    patches = shapes.vessel(
+    patches = shapes.make_vessel(
         outside, wall=sampler(0.35, low=0.3, high=0.45), floor=0.8, step=1.6, columns=48
     )
     if has_cap:
@@ -498,32 +498,32 @@ def _bottle_paints(
         height: height of the bottle.
         shoulder: height at which the body begins to narrow; the label ends below.
     """
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     glass = sampler.sample_color(
         "17351f", "4a2c14", "1d3f2a", "cfdde0", "2a4d69", "ece7dd", "111416"
     )
-    outside = paint_or_random(
+    outside = choose_paint_or_random(
         sampler,
         height,
-        clouded(glass, factor=1.25, scale=9.0, offset=offset),
+        paint_shaded_clouds(glass, factor=1.25, scale=9.0, offset=offset),
         p_random=0.25,
     )
     paper = sampler.sample_color("efe6cf", "f5f2ea", "20242a", "c9a24b", p_random=0.3)
     ink = sampler.sample_color("7a1f2b", "23395d", "2e2a25", "b08d3c", p_random=0.3)
     label_bottom = 0.14 * height
     label_top = min(sampler(0.44, low=0.3, high=0.5) * height, shoulder - 1.5)
-    has_label = not sampler.chance(0.2)
+    has_label = not sampler.sample_bool(0.2)
     if has_label:
         outside = _add_label(sampler, outside, paper, ink, label_bottom, label_top)
     foil = sampler.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
-    if sampler.chance(0.5, canonical=True):
-        foil_paint = speckled(solid(foil), shade(foil, 1.3), scale=0.5, offset=offset)
-        outside = over(outside, between(height * 0.8, 2 * height), foil_paint)
+    if sampler.sample_bool(0.5, canonical=True):
+        foil_paint = add_specks(paint_solid_color(foil), scale_brightness(foil, 1.3), scale=0.5, offset=offset)
+        outside = paint_over(outside, make_range_mask(height * 0.8, 2 * height), foil_paint)
     return {
         "outside": outside,
-        "inside": solid(shade(glass, 0.6)),
-        "base": solid(glass),
-        "cap": solid(sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
+        "inside": paint_solid_color(scale_brightness(glass, 0.6)),
+        "base": paint_solid_color(glass),
+        "cap": paint_solid_color(sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }
 
 
@@ -541,7 +541,7 @@ def _cap(sampler: ParameterSampler, radius: float, bottle_height: float) -> list
     side = shapes.round_corners(
         [(radius, bottom), (radius, top), (0.6 * radius, top)], radius=0.3, steps=4
     )
-    return shapes.lathe(
+    return shapes.revolve_profile(
         [
             ("cap", under),
             ("cap", shapes.subdivide(side, longest=0.8)),
@@ -580,15 +580,15 @@ def _add_label(
         base: Paint, half_width: float, low: float, high: float, color: Array
     ) -> Paint:
         """Paint a rectangle of the label, `half_width` in degrees, over a paint."""
-        mask = facing(
+        mask = make_facing_mask(
             LABEL_AZIMUTH, half_width=half_width, low=low, high=high, soft=0.05
         )
-        return over(base, mask, solid(color))
+        return paint_over(base, mask, paint_solid_color(color))
 
-    background = facing(
+    background = make_facing_mask(
         LABEL_AZIMUTH, half_width=half_angle, low=bottom, high=top, soft=0.08
     )
-    label = over(surface, background, solid(paper))
+    label = paint_over(surface, background, paint_solid_color(paper))
     half_bar_angle = half_angle - 6.0
     label = add(label, half_bar_angle, top - 0.12 * height, top - 0.07 * height, ink)
     label = add(
@@ -599,7 +599,7 @@ def _add_label(
         0.42 * half_text_angle,
         bottom + 0.6 * height,
         bottom + 0.76 * height,
-        shade(ink, 0.8),
+        scale_brightness(ink, 0.8),
     )
     # lines of text, each of another length
     for i, relative_length in enumerate((0.5, 0.36, 0.44)):
@@ -607,7 +607,7 @@ def _add_label(
         label = add(
             label, relative_length * half_text_angle, z, z + 0.035 * height, ink
         )
-    return over(label, _seal(bottom, height), solid("b08d3c"))
+    return paint_over(label, _seal(bottom, height), paint_solid_color("b08d3c"))
 
 
 @painter
@@ -625,7 +625,7 @@ def _seal(t: Texels, bottom: float, height: float) -> Array:
     center_distance = np.hypot(
         np.radians(degrees) * radius, z - (bottom + 0.2 * height)
     )
-    return step(0.09 * height - center_distance, 0.0, soft=0.08)
+    return compute_soft_step(0.09 * height - center_distance, 0.0, soft=0.08)
 
 
 class _VaseBody(NamedTuple):
@@ -644,22 +644,22 @@ class _VaseBody(NamedTuple):
     patches: list[Patch]
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def vase(sampler: ParameterSampler) -> Instance:
     """Make a vase, perhaps with handles."""
     height = 24.0
     body = _vase_body(sampler, height)
     patches = [*body.patches, *_vase_handles(sampler, body)]
-    offset = sampler.offset()
+    offset = sampler.sample_noise_offset()
     clay = sampler.sample_color(
         "f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a"
     )
-    glaze = clouded(clay, factor=0.95, scale=4.0, offset=offset)
+    glaze = paint_shaded_clouds(clay, factor=0.95, scale=4.0, offset=offset)
     decoration = _vase_paint(sampler, glaze, height, offset)
     paints = {
-        "outside": paint_or_random(sampler, height, decoration),
-        "inside": solid(shade(clay, 0.8)),
-        "base": solid("b79b7c"),
+        "outside": choose_paint_or_random(sampler, height, decoration),
+        "inside": paint_solid_color(scale_brightness(clay, 0.8)),
+        "base": paint_solid_color("b79b7c"),
         "handle": glaze,
     }
     return Instance(
@@ -693,8 +693,8 @@ def _vase_body(sampler: ParameterSampler, height: float) -> _VaseBody:
         (neck, neck_height),
         (lip, height),
     ]
-    profile = shapes.spline(knots, count=34)
-    patches = shapes.vessel(
+    profile = shapes.sample_spline(knots, count=34)
+    patches = shapes.make_vessel(
         profile, wall=sampler(0.4, low=0.35, high=0.6), floor=0.8, step=1.2
     )
     return _VaseBody(belly_height, neck_height, profile, patches)
@@ -707,7 +707,7 @@ def _vase_handles(sampler: ParameterSampler, body: _VaseBody) -> list[Patch]:
         sampler: chooses, and samples their shape.
         body: the vase.
     """
-    if not sampler.chance(0.25):
+    if not sampler.sample_bool(0.25):
         return []
     ear = make_handle(
         sampler,
@@ -719,8 +719,8 @@ def _vase_handles(sampler: ParameterSampler, body: _VaseBody) -> list[Patch]:
         inset=0.2,
     )
     return [
-        *shapes.transform_patches(ear, shapes.rotation("z", 130.0)),
-        *shapes.transform_patches(ear, shapes.rotation("z", -50.0)),
+        *shapes.transform_patches(ear, shapes.make_rotation_matrix("z", 130.0)),
+        *shapes.transform_patches(ear, shapes.make_rotation_matrix("z", -50.0)),
     ]
 
 
@@ -739,10 +739,10 @@ def _vase_paint(
     """
     ink = sampler.sample_color("23408f", "1f2a33", "b5442e", "d79b2b", "e9dfca")
     is_canonical = sampler.rng is None
-    if not is_canonical and sampler.chance(0.6):
-        accent = clouded(ink, factor=1.3, scale=3.0, offset=offset)
+    if not is_canonical and sampler.sample_bool(0.6):
+        accent = paint_shaded_clouds(ink, factor=1.3, scale=3.0, offset=offset)
         return _ceramic(sampler, height, glaze, accent)
-    paint = over(glaze, _scroll(height), solid(ink))
+    paint = paint_over(glaze, _scroll(height), paint_solid_color(ink))
     # rings of ink, as fractions of the height
     for low, high in (
         (0.05, 0.08),
@@ -752,8 +752,8 @@ def _vase_paint(
         (0.785, 0.805),
         (0.96, 2.0),
     ):
-        paint = over(paint, between(low * height, high * height, soft=0.12), solid(ink))
-    return over(paint, _frieze(height), solid(ink))
+        paint = paint_over(paint, make_range_mask(low * height, high * height, soft=0.12), paint_solid_color(ink))
+    return paint_over(paint, _frieze(height), paint_solid_color(ink))
 
 
 @painter
@@ -763,16 +763,16 @@ def _scroll(t: Texels, height: float) -> Array:
     z = t.xyz[:, 2] / height
     curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
     petal = curl * (0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle)))
-    on_belly = between(0.24 * height, 0.74 * height, soft=0.1)(t)
-    return step(petal, 0.55, soft=0.16) * on_belly
+    on_belly = make_range_mask(0.24 * height, 0.74 * height, soft=0.1)(t)
+    return compute_soft_step(petal, 0.55, soft=0.16) * on_belly
 
 
 @painter
 def _frieze(t: Texels, height: float) -> Array:
     """Return the mask of a band of 16 teeth above the foot of a vase of a height."""
     angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0])
-    teeth = step(np.sin(16 * angle), 0.0, soft=0.5)
-    return between(0.09 * height, 0.17 * height, soft=0.1)(t) * teeth
+    teeth = compute_soft_step(np.sin(16 * angle), 0.0, soft=0.5)
+    return make_range_mask(0.09 * height, 0.17 * height, soft=0.1)(t) * teeth
 
 
 class _GlassBowl(NamedTuple):
@@ -791,7 +791,7 @@ class _GlassBowl(NamedTuple):
     outer: Array
 
 
-@family(metres=0.01)
+@make_family(unit_in_metres=0.01)
 def wine_glass(sampler: ParameterSampler) -> Instance:
     """Make a wine glass, perhaps with wine."""
     foot_radius = sampler(3.5, low=2.9, high=4.2)
@@ -799,7 +799,7 @@ def wine_glass(sampler: ParameterSampler) -> Instance:
     stem_height = sampler(9.5, low=6.0, high=12.0)
     bowl_of_glass = _glass_bowl(sampler, stem_radius, stem_height)
     profile = _glass_profile(bowl_of_glass, foot_radius, stem_radius)
-    body = shapes.lathe(profile, columns=52)
+    body = shapes.revolve_profile(profile, columns=52)
     return Instance(
         shapes.transform_patches(body, SEAM_ROTATION),
         _glass_paints(sampler, stem_height, bowl_of_glass.depth),
@@ -823,7 +823,7 @@ def _glass_bowl(
     widest = sampler(0.42, low=0.3, high=0.55)  # its height, as a fraction of the depth
     wall = sampler(0.24, low=0.2, high=0.3)
     # some stems have a knob, 2.2 times as thick
-    knob_factor = 2.2 if sampler.chance(0.25) else 1.0
+    knob_factor = 2.2 if sampler.sample_bool(0.25) else 1.0
     stem = [
         (stem_radius, 0.6 * stem_height),
         (stem_radius * knob_factor, 0.78 * stem_height),
@@ -836,7 +836,7 @@ def _glass_bowl(
         (0.45 * radius + 0.55 * mouth, stem_height + 0.76 * depth),
         (mouth, stem_height + depth),
     ]
-    outer = shapes.spline([*stem, *cup], count=36)
+    outer = shapes.sample_spline([*stem, *cup], count=36)
     return _GlassBowl(stem_height, depth, wall, outer)
 
 
@@ -892,7 +892,7 @@ def _glass_profile(
         (stem_radius * 1.15, 2.4),
         (stem_radius, 0.6 * glass.bottom),
     ]
-    upper_side = [under[-1], (foot_radius, 0.08), *shapes.spline(rising, count=14)]
+    upper_side = [under[-1], (foot_radius, 0.08), *shapes.sample_spline(rising, count=14)]
     return [
         ("foot", shapes.subdivide(under, longest=1.5)),
         ("foot", np.array(upper_side)),
@@ -928,21 +928,21 @@ def _glass_paints(
     )
     drink = sampler.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", p_random=0.15)
     level = stem_height + depth * sampler(0.48, low=0.3, high=0.62)
-    glass = gradient(shade(tint, 0.86), shade(tint, 1.08), low=0.0, high=height)
+    glass = gradient(scale_brightness(tint, 0.86), scale_brightness(tint, 1.08), low=0.0, high=height)
     outside = glass
     inside = glass
-    if sampler.chance(0.5, canonical=True):  # filled
-        wine = clouded(drink, factor=0.8, scale=3.0, offset=sampler.offset())
-        is_wine = between(stem_height + 0.06 * depth, level, soft=0.1)
-        outside = over(glass, is_wine, wine)
-        inside = over(glass, between(0.0, level, soft=0.1), solid(drink))
-    outside = paint_or_random(sampler, height, outside, p_random=0.3)
-    if sampler.chance(0.2, canonical=True):  # a golden rim
-        is_rim = between(height - 0.35, 2 * height, soft=0.1)
-        outside = over(outside, is_rim, solid("c9a24b"))
-    if sampler.chance(0.7, canonical=True):
+    if sampler.sample_bool(0.5, canonical=True):  # filled
+        wine = paint_shaded_clouds(drink, factor=0.8, scale=3.0, offset=sampler.sample_noise_offset())
+        is_wine = make_range_mask(stem_height + 0.06 * depth, level, soft=0.1)
+        outside = paint_over(glass, is_wine, wine)
+        inside = paint_over(glass, make_range_mask(0.0, level, soft=0.1), paint_solid_color(drink))
+    outside = choose_paint_or_random(sampler, height, outside, p_random=0.3)
+    if sampler.sample_bool(0.2, canonical=True):  # a golden rim
+        is_rim = make_range_mask(height - 0.35, 2 * height, soft=0.1)
+        outside = paint_over(outside, is_rim, paint_solid_color("c9a24b"))
+    if sampler.sample_bool(0.7, canonical=True):
         # `glass` is named twice, to be sampled twice as often
-        foot_paint = sampler.pick(glass, outside, glass)
+        foot_paint = sampler.sample_choice(glass, outside, glass)
     else:
         foot_paint = sample_paint(sampler, height)
     return {"foot": foot_paint, "bowl": outside, "inside": inside}

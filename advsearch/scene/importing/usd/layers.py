@@ -157,7 +157,7 @@ def read_packaged(path: str) -> bytes:
     return content
 
 
-def check_layers(file: Path) -> list[str]:
+def list_layer_files(file: Path) -> list[str]:
     """Return the files of all layers and packages that a file needs, itself first.
 
     Raises:

@@ -22,13 +22,13 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
 from advsearch.extend import errors, reading, stored_files
 from advsearch.scene.importing.usd import PACKAGE_SUFFIX
-from advsearch.scene.importing.usd.layers import check_layers, unpack_package
+from advsearch.scene.importing.usd.layers import list_layer_files, unpack_package
 from advsearch.scene.importing.usd.surface import (
     FIRST_TIME,
     BoundMaterial,
     PrimvarUse,
     TextureLayout,
-    UsdSurfaces,
+    GltfMaterialWriter,
 )
 
 # Limit of the different colors, and of the different opacities, of a mesh's faces that
@@ -59,17 +59,17 @@ class MeshFaces(NamedTuple):
 
     Attributes:
         points: (P, 3) positions.
-        counts: (F,) the number of corners of each face.
-        corners: (C,) indices of the points of the corners of all faces.
-        triangles: (T, 3) triangles of the faces, as indices into `corners`.
-        face: (T,) the face of each triangle.
+        corner_counts: (F,) the number of corners of each face.
+        point_of_corner: (C,) indices of the points of the corners of all faces.
+        triangles: (T, 3) triangles of the faces, as indices into `point_of_corner`.
+        face_of_triangle: (T,) the face of each triangle.
     """
 
     points: Array
-    counts: Array
-    corners: Array
+    corner_counts: Array
+    point_of_corner: Array
     triangles: Array
-    face: Array
+    face_of_triangle: Array
 
 
 def main(source: str, target: str, folder: str) -> None:
@@ -86,7 +86,7 @@ def main(source: str, target: str, folder: str) -> None:
     file = Path(source)
     if file.suffix.lower() == PACKAGE_SUFFIX:
         file = unpack_package(file, Path(folder))
-    layers = check_layers(file)
+    layers = list_layer_files(file)
     stage = Usd.Stage.Open(str(file))
     conversion = Conversion(
         stage,
@@ -133,7 +133,7 @@ class Conversion:
             "asset": {"version": "2.0", "generator": reading.gltf_entries.GENERATOR},
         }
         self.lights: list[dict[str, Any]] = []
-        self._surfaces = UsdSurfaces(
+        self._surfaces = GltfMaterialWriter(
             self.folder, self.header, self.buffer, self.note_counts, self.files_read
         )
         self._skins = UsdSkel.Cache()
@@ -460,16 +460,16 @@ class Conversion:
         """
         primvars = UsdGeom.PrimvarsAPI(prim)
         normals = self._read_normals(
-            mesh, primvars, mesh_faces.points, mesh_faces.corners[mesh_faces.triangles]
+            mesh, primvars, mesh_faces.points, mesh_faces.point_of_corner[mesh_faces.triangles]
         )
         primitives = []
-        n_faces = len(mesh_faces.counts)
+        n_faces = len(mesh_faces.corner_counts)
         for bound, faces in self._iterate_materials(prim, mesh, n_faces):
             # The faces of a material are divided further by their tint.
             for material, colors, tinted_faces in self._split_by_tint(
                 bound, primvars, faces, mesh_faces
             ):
-                is_selected = np.isin(mesh_faces.face, tinted_faces)
+                is_selected = np.isin(mesh_faces.face_of_triangle, tinted_faces)
                 if not is_selected.any():
                     continue  # all are holes, or have fewer than 3 corners
                 uvs_by_name = self._read_layouts(primvars, bound.layouts)
@@ -625,12 +625,12 @@ class Conversion:
             FileFormatError: an attribute has fewer values than the mesh needs.
         """
         corner_rows = mesh_faces.triangles[is_selected].reshape(-1)
-        corner_points = mesh_faces.corners[corner_rows]
+        corner_points = mesh_faces.point_of_corner[corner_rows]
         index_by_interpolation = {
             "vertex": corner_points,
             "varying": corner_points,
             "faceVarying": corner_rows,
-            "uniform": mesh_faces.face[is_selected].repeat(3),
+            "uniform": mesh_faces.face_of_triangle[is_selected].repeat(3),
         }
         constant_index = np.zeros(len(corner_rows), np.int64)
         columns = [corner_points]
@@ -712,7 +712,7 @@ class Conversion:
             Index of a glTF material, vertex colors or None, and faces.
         """
         if bound.color is None and bound.opacity is None:
-            yield bound.index, None, faces
+            yield bound.material_index, None, faces
             return
         if bound.is_default:
             self._note_default_material(primvars)
@@ -945,15 +945,15 @@ def _compute_face_values(
         return np.asarray(values[np.zeros(len(faces), np.int64)])
     if primvar.interpolation == "uniform":
         return np.asarray(values[np.minimum(faces, last_index)])
-    corner_index = np.arange(len(mesh_faces.corners))
+    corner_index = np.arange(len(mesh_faces.point_of_corner))
     if primvar.interpolation in ("vertex", "varying"):
-        corner_index = mesh_faces.corners
+        corner_index = mesh_faces.point_of_corner
     corner_values = values[np.minimum(corner_index, last_index)]
     # `reduceat` sums the rows from the start of a face to that of the next one. A row of
     # zeros is appended, since faces without corners at the end begin after the last
     # row. Other faces without corners get a wrong value, but have no triangles.
     padded_values = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
-    counts = mesh_faces.counts
+    counts = mesh_faces.corner_counts
     starts = np.cumsum(counts) - counts
     sums = np.add.reduceat(padded_values, starts)
     means = sums / np.maximum(counts, 1)[:, None]

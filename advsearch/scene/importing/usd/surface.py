@@ -95,7 +95,7 @@ class PrimvarUse:
 class BoundMaterial:
     """The material of a mesh or a subset of its faces."""
 
-    index: int  # index of the glTF material
+    material_index: int  # index of the glTF material
     # Texture coordinates by their index in glTF.
     layouts: tuple[TextureLayout, ...] = (TextureLayout(),)
     color: PrimvarUse | None = None  # primvar that replaces the base color
@@ -218,7 +218,7 @@ class UsdTextureUse:
 
 
 @dataclass
-class UsdSurfaces:
+class GltfMaterialWriter:
     """Writes the materials of a stage to the header of a glTF file."""
 
     folder: Path
@@ -293,7 +293,7 @@ class UsdSurfaces:
             color: (3,) linear, clipped to [0, 1]; None for the color of the material.
             opacity: clipped to [0, 1]; None for the opacity of the material.
         """
-        entry = dict(self.header["materials"][bound.index])
+        entry = dict(self.header["materials"][bound.material_index])
         surface = dict(entry["pbrMetallicRoughness"])
         factor = list(surface["baseColorFactor"])
         if color is not None:
@@ -468,7 +468,7 @@ class PreviewSurface:
         nodes: shaders that are read, by path.
     """
 
-    surfaces: UsdSurfaces
+    surfaces: GltfMaterialWriter
     shader: Shader
     name: str
     layouts: list[TextureLayout] = field(default_factory=list)
