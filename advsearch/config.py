@@ -113,7 +113,11 @@ def has_model_url(model: str) -> bool:
 
 def get_name_without_options(name_with_options: str | Mapping[str, object]) -> str:
     """Return the name in a setting in the form that `parse_name_with_options` returns."""
-    return name_with_options if isinstance(name_with_options, str) else str(name_with_options["name"])
+    return (
+        name_with_options
+        if isinstance(name_with_options, str)
+        else str(name_with_options["name"])
+    )
 
 
 DEFAULT_ENVIRONMENT = "studio"

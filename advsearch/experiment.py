@@ -109,7 +109,9 @@ class RunContext(ExitStack, Generic[Settings]):
         The first access creates it. Check all settings before, so that a wrong one
         leaves no run behind.
         """
-        return self.enter_context(RunDirectory.open(self.config, self.resumed_directory))
+        return self.enter_context(
+            RunDirectory.open(self.config, self.resumed_directory)
+        )
 
     @cached_property
     def stages(self) -> Stages:
@@ -217,7 +219,10 @@ def run_and_save(
 
 
 def run_experiment(
-    config: Config, *, progress: Progress | None = None, resumed_directory: Path | None = None
+    config: Config,
+    *,
+    progress: Progress | None = None,
+    resumed_directory: Path | None = None,
 ) -> Result:
     """Run the experiment to which settings belong, and return its result.
 
@@ -239,7 +244,11 @@ def run_experiment(
     # The folder of a new run is created before slow imports, so that a run that is
     # stopped early can be listed. Then the experiment continues in it as in a resumed
     # run.
-    with create_before_work(config) if creates_run else nullcontext(resumed_directory) as folder:
+    with (
+        create_before_work(config)
+        if creates_run
+        else nullcontext(resumed_directory) as folder
+    ):
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed_directory=folder)
 
@@ -388,7 +397,8 @@ class Experiment(Generic[AnyResult]):
                 as a scene in memory, for the function of the experiment.
         """
         return run_and_save(
-            partial(self.function, **arguments), RunContext(config, progress, resumed_directory)
+            partial(self.function, **arguments),
+            RunContext(config, progress, resumed_directory),
         )
 
     def __call__(self, *args: Any, **settings: Any) -> AnyResult:
@@ -433,7 +443,10 @@ class Experiment(Generic[AnyResult]):
             config = make_config(self.settings, **config_values)
             resumed = find_stopped_run(config) if resume else None
             return self.run(
-                config, progress=as_progress(progress), resumed_directory=resumed, **arguments
+                config,
+                progress=as_progress(progress),
+                resumed_directory=resumed,
+                **arguments,
             )
 
         # `with_settings_signature` reads the signature, and adds the other settings.

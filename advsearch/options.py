@@ -270,7 +270,9 @@ def describe_value(value: object) -> str:
     return f"{value!r:.80}"
 
 
-def check_takes_arguments(function_title: str, function: Callable[..., object], *names: str) -> None:
+def check_takes_arguments(
+    function_title: str, function: Callable[..., object], *names: str
+) -> None:
     """Check that a user's function takes arguments of these names by position.
 
     Args:

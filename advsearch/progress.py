@@ -352,7 +352,9 @@ class BarProgress:
     The bars disappear at the end of the `with` block.
     """
 
-    def __init__(self, terminal: IO[str], format_names: Callable[[str], str] = str) -> None:
+    def __init__(
+        self, terminal: IO[str], format_names: Callable[[str], str] = str
+    ) -> None:
         """Display progress as bars in a terminal.
 
         Args:

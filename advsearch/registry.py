@@ -38,7 +38,9 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     # Description of an entry for messages: "a subclass of Policy whose name is that of
     # the entry point".
     expected_entry: str
-    is_valid_entry: Callable[[str, Any], bool]  # whether an object under a name is an entry
+    is_valid_entry: Callable[
+        [str, Any], bool
+    ]  # whether an object under a name is an entry
     # Whether a class of the user is an entry, too, by the name "package.module:Class".
     # It is imported from the Python path or the current directory, and its name begins
     # with a capital letter.

@@ -240,7 +240,9 @@ def split_in_halves(
     """
     table = merge_repeats(table)
     units, unit_index = np.unique(table["unit"], return_inverse=True)
-    order = np.random.default_rng(seeds.derive_seed(seed, "halves")).permutation(len(units))
+    order = np.random.default_rng(seeds.derive_seed(seed, "halves")).permutation(
+        len(units)
+    )
     is_in_first = np.isin(unit_index, order[: len(units) // 2])
     return table[is_in_first], table[~is_in_first]
 
@@ -461,7 +463,9 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
     """
     accepted: list[CountedRule] = []
     for number in range(MAX_RULES):
-        conditions = find_best_conditions(choosing, seeds.derive_seed(seed, "rules", number))
+        conditions = find_best_conditions(
+            choosing, seeds.derive_seed(seed, "rules", number)
+        )
         if not conditions:
             return FoundRules(accepted, None)
         inside = find_covered(conditions, counting)

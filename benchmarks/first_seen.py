@@ -38,7 +38,10 @@ from torch.nn.functional import max_pool2d
 
 import advsearch
 from advsearch.options import Outcome
-from advsearch.questions.sweep.display import describe_detection_distance, find_detection_distance
+from advsearch.questions.sweep.display import (
+    describe_detection_distance,
+    find_detection_distance,
+)
 from advsearch.questions.sweep.summary import AxisRow
 from advsearch.statistics.monotone import find_dips
 

@@ -58,7 +58,12 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.evaluation import Evaluate
-from advsearch.attacks.trials import LADDER, MarginsOf, TrialCounts, make_margin_function
+from advsearch.attacks.trials import (
+    LADDER,
+    MarginsOf,
+    TrialCounts,
+    make_margin_function,
+)
 from advsearch.attacks.verification import (
     OVER_CONDITIONS,
     OVER_CONFIDENCE,

@@ -12,7 +12,13 @@ import pytest
 import torch
 
 from advsearch.cli.output import InterruptCheckingProgress
-from advsearch.interrupts import DUPLICATE_SECONDS, INTERRUPTS, Interrupts, reraise_lost_interrupt, report_unraisable_error
+from advsearch.interrupts import (
+    DUPLICATE_SECONDS,
+    INTERRUPTS,
+    Interrupts,
+    report_unraisable_error,
+    reraise_lost_interrupt,
+)
 from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from conftest import ROOT

@@ -45,7 +45,7 @@ from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.formation import parse_aovs
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.tasks import AnyTask, make_task
-from advsearch.trust.code import allow_code_of_call, allow_code_in_settings
+from advsearch.trust.code import allow_code_in_settings, allow_code_of_call
 from advsearch.trust.stored_files import LARGEST_FILE, read_bytes
 
 if TYPE_CHECKING:

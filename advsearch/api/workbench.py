@@ -132,7 +132,7 @@ from advsearch.tasks.base import Truth as Truth
 from advsearch.tasks.together import EnsembleTask as EnsembleTask
 from advsearch.threads import all_for_torch as all_for_torch
 from advsearch.threads import count_cores as count_cores
-from advsearch.trust.code import allow_code_in_settings as allow_named
+from advsearch.trust.code import allow_code_in_settings as allow_code_in_settings
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import make_environment as make_environment
 from advsearch.trust.yaml_text import parse_yaml as parse_yaml

@@ -453,7 +453,11 @@ class Bracket:
     @property
     def is_closed(self) -> bool:
         """Whether high is within `RATIO` of low."""
-        return self.u is not None and self.smallest_passing_scale <= RATIO * (1.0 + 1e-9) * self.largest_failing_scale
+        return (
+            self.u is not None
+            and self.smallest_passing_scale
+            <= RATIO * (1.0 + 1e-9) * self.largest_failing_scale
+        )
 
 
 def scale_domain(domain: Domain, scale: float) -> Domain:
@@ -527,13 +531,20 @@ def find_smallest_change(
     """
     full_u = search(domain, 0)  # the best configuration in the full budgets
     # Nothing is known to pass yet, so `high` is infinite.
-    bracket = Bracket(largest_failing_scale=0.0, smallest_passing_scale=math.inf, u=None, searches=1, n_checks=1)
+    bracket = Bracket(
+        largest_failing_scale=0.0,
+        smallest_passing_scale=math.inf,
+        u=None,
+        searches=1,
+        n_checks=1,
+    )
     if not passes(full_u, 0):
         return replace(bracket, largest_failing_scale=1.0)
     bracket = _shorten(bracket, full_u, 1.0, passes, domain, likely)
     while (
         bracket.searches < MAX_SEARCHES
-        and bracket.smallest_passing_scale > RATIO * bracket.largest_failing_scale  # not closed
+        and bracket.smallest_passing_scale
+        > RATIO * bracket.largest_failing_scale  # not closed
         and bracket.smallest_passing_scale > SMALLEST_SCALE
     ):
         scale = _choose_next_scale(bracket)
@@ -564,7 +575,9 @@ def _choose_next_scale(bracket: Bracket) -> float:
         return bracket.smallest_passing_scale / 2.0
     scale = math.sqrt(bracket.largest_failing_scale * bracket.smallest_passing_scale)
     # high / `RATIO` is at or below the mean of the bounds only if they are this close
-    can_close = bracket.smallest_passing_scale <= RATIO**2 * bracket.largest_failing_scale
+    can_close = (
+        bracket.smallest_passing_scale <= RATIO**2 * bracket.largest_failing_scale
+    )
     if can_close:
         scale = max(scale, bracket.smallest_passing_scale / RATIO)
     return scale
@@ -603,7 +616,12 @@ def confirm_bracket(
         scale = min(1.0, shortest_scale * growth)
         change = shortest_u - domain.start
         grown_u = scale_domain(domain, scale).project(domain.start + growth * change)
-        bracket = replace(bracket, smallest_passing_scale=scale, u=grown_u, n_checks=bracket.n_checks + times)
+        bracket = replace(
+            bracket,
+            smallest_passing_scale=scale,
+            u=grown_u,
+            n_checks=bracket.n_checks + times,
+        )
     return bracket
 
 

@@ -116,7 +116,9 @@ class Block:
                 f"block{where}: a periodic block cannot have a norm "
                 "budget; use norm 'box'"
             )
-        if self.unit_step_length is not None and (not is_box or not self.unit_step_length > 0.0):
+        if self.unit_step_length is not None and (
+            not is_box or not self.unit_step_length > 0.0
+        ):
             raise InputError(
                 f"block{where}: expected a reach over 0 and norm 'box', got "
                 f"{self.unit_step_length} and {self.norm!r}"
@@ -132,7 +134,11 @@ class Block:
         width = self.high - self.low
         diagonal = width * math.sqrt(self.size)
         if self.norm == "box":
-            return 0.5 * diagonal if self.unit_step_length is None else self.unit_step_length
+            return (
+                0.5 * diagonal
+                if self.unit_step_length is None
+                else self.unit_step_length
+            )
         diameter = width if self.norm == "linf" else diagonal
         assert self.epsilon is not None  # every ball has one
         return min(float(self.epsilon), diameter)
@@ -275,7 +281,7 @@ class Domain:
         names = []
         for block in self.blocks:
             if block.size == 1:
-                element_names.append(block.name)
+                names.append(block.name)
             else:
                 names += [f"{block.name}.{number}" for number in range(block.size)]
         return names
@@ -343,7 +349,9 @@ class Domain:
         """
         # It is infinite for an infinite element. `torch.maximum` and `amax` return NaN
         # if an element is NaN; so does `max` below, if its first argument is NaN.
-        excess = float(torch.maximum(self.lower_bounds - u, u - self.upper_bounds).amax())
+        excess = float(
+            torch.maximum(self.lower_bounds - u, u - self.upper_bounds).amax()
+        )
         for block, part in self.list_block_slices():
             if block.norm == "l2" and block.epsilon is not None:
                 squares = (u[part] - self.start[part]).square_()
@@ -402,7 +410,9 @@ class Domain:
                 fraction = option_center(uniform, block.n_options)
             elif extreme and block.norm != "box":
                 fraction = uniform.round()  # 0 or 1: a corner
-            return torch.lerp(self.lower_bounds[part], self.upper_bounds[part], fraction)
+            return torch.lerp(
+                self.lower_bounds[part], self.upper_bounds[part], fraction
+            )
         assert block.epsilon is not None
         if extreme:
             # A point in a direction of random signs, outside of the ball: it is farther

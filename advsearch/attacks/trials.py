@@ -546,7 +546,9 @@ def choose_rate_spp(
     # Nothing settles at the rung with index 0, which has none below.
     highest_rung = 1
     have_settled = True
-    seeds = [derive_seed(seed, "sample count", number) for number in range(N_CONDITIONS)]
+    seeds = [
+        derive_seed(seed, "sample count", number) for number in range(N_CONDITIONS)
+    ]
     for name, render in margins.items():
         rungs = _climb_until_settled(name, render, seeds, ladder)
         table += rungs

@@ -225,7 +225,9 @@ class VerificationRule:
             return search
         if self.is_already_wrong(clean):
             return Ending.ALREADY_WRONG
-        is_verified = adversarial.n_successes >= self.count_needed_successes(adversarial.n_trials)
+        is_verified = adversarial.n_successes >= self.count_needed_successes(
+            adversarial.n_trials
+        )
         is_control_right = (
             not self.has_control
             or self.has_varying_conditions
@@ -498,7 +500,11 @@ def _choose_confidence(rule: VerificationRule, *, has_several_looks: bool) -> fl
     If conditions vary and there are several looks, it is larger than 95 %, so that the
     interval still covers the rate in 95 % of all cases.
     """
-    return OVER_CONFIDENCE if rule.has_varying_conditions and has_several_looks else CONFIDENCE
+    return (
+        OVER_CONFIDENCE
+        if rule.has_varying_conditions and has_several_looks
+        else CONFIDENCE
+    )
 
 
 def _extend_clean_trials(
@@ -568,7 +574,9 @@ def _is_found(
 
 
 def _list_outcomes(
-    rule: VerificationRule, trials: Sequence[Judgement], clean_trials: Sequence[Judgement]
+    rule: VerificationRule,
+    trials: Sequence[Judgement],
+    clean_trials: Sequence[Judgement],
 ) -> tuple[bool | None, ...]:
     """Return whether each trial is a success, or None if it does not count.
 

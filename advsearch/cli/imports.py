@@ -289,5 +289,7 @@ def threedb(args: argparse.Namespace) -> int:
     if args.json:
         output.print_json(read_result(path).to_dict())
     else:
-        print(f"{path}: {read_result(path).outcome_summary}; {path / 'report.html'} shows it")
+        print(
+            f"{path}: {read_result(path).outcome_summary}; {path / 'report.html'} shows it"
+        )
     return 0

@@ -224,7 +224,12 @@ class ExperimentCommand:
         return make_config(args, config_type)
 
     def run_config(
-        self, config: Config, *, as_json: bool, quiet: bool, resumed_directory: Path | None = None
+        self,
+        config: Config,
+        *,
+        as_json: bool,
+        quiet: bool,
+        resumed_directory: Path | None = None,
     ) -> int:
         """Run the experiment, print the result and return the exit status.
 

@@ -190,7 +190,10 @@ def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def print_answer(
-    as_json: bool, json_fields: Mapping[str, object], text: str, stream: IO[str] | None = None
+    as_json: bool,
+    json_fields: Mapping[str, object],
+    text: str,
+    stream: IO[str] | None = None,
 ) -> int:
     """Print the answer of a command, and return the exit status of success.
 
@@ -340,7 +343,9 @@ def _format_part(part: ResultPart) -> str:
     # late, so that --help answers at once
     from advsearch.cli.flags import format_as_flags
 
-    table = align_columns([part.column_heads, *part.rows] if part.column_heads else part.rows)
+    table = align_columns(
+        [part.column_heads, *part.rows] if part.column_heads else part.rows
+    )
     picture_rows = [
         [picture.file, picture.caption] for group in part.pictures for picture in group
     ]

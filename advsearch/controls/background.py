@@ -124,7 +124,9 @@ class BackgroundControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         scene = replace(scene, backdrop=True)
-        return scene.without_ground() if self.choice_values["ground"] == "hide" else scene
+        return (
+            scene.without_ground() if self.choice_values["ground"] == "hide" else scene
+        )
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

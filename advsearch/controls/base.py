@@ -46,7 +46,7 @@ from advsearch.controls.ranges import (
     parse_spec,
     to_plain_value,
 )
-from advsearch.copies import copy_value, copy_method_arguments, is_package_class
+from advsearch.copies import copy_method_arguments, copy_value, is_package_class
 from advsearch.distributions import distribution_to_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import Value as Value
@@ -120,8 +120,16 @@ def _describe_adjustment(value: AdjustedDefault) -> str:
     unit = f" {value.unit}"
     if value.unit in ("1", "name") or isinstance(value.used_value, str):
         unit = ""
-    used = value.used_value if isinstance(value.used_value, str) else format_rounded(value.used_value)
-    scene = value.scene_value if isinstance(value.scene_value, str) else format_rounded(value.scene_value)
+    used = (
+        value.used_value
+        if isinstance(value.used_value, str)
+        else format_rounded(value.used_value)
+    )
+    scene = (
+        value.scene_value
+        if isinstance(value.scene_value, str)
+        else format_rounded(value.scene_value)
+    )
     if used == scene:  # the values differ by less than the rounding: show more digits
         used = format_value(value.used_value)
         scene = format_value(value.scene_value)
@@ -637,16 +645,25 @@ class Control:
         self.parameter_slots = tuple(slots)
         self.adjusted_defaults = tuple(self._list_adjusted_defaults())
         self.start = torch.tensor(
-            [coordinate for slot in slots for coordinate in slot.get_start_coordinates()],
+            [
+                coordinate
+                for slot in slots
+                for coordinate in slot.get_start_coordinates()
+            ],
             dtype=torch.float32,
         )
-        self.groups = tuple(self._make_group(slot) for slot in slots if slot.n_coordinates)
+        self.groups = tuple(
+            self._make_group(slot) for slot in slots if slot.n_coordinates
+        )
         # For `values`: the lower bound and the width of the range of each coordinate,
         # (d,) each. All coordinates of a slot have the same range. A slot that is fixed
         # or has a list of values has no range; its placeholder is never read.
         placeholder = Range(0.0, 1.0)
         ranges = [
-            slot.parameter_spec if isinstance(slot.parameter_spec, Range) else placeholder for slot in slots
+            slot.parameter_spec
+            if isinstance(slot.parameter_spec, Range)
+            else placeholder
+            for slot in slots
         ]
         low_and_span_of_slot = torch.tensor(
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
@@ -882,7 +899,9 @@ class Control:
             parameter = slot.parameter
             spec = slot.parameter_spec
             if isinstance(spec, Range):
-                coordinates = slice(slot.coordinate_offset, slot.coordinate_offset + slot.n_values)
+                coordinates = slice(
+                    slot.coordinate_offset, slot.coordinate_offset + slot.n_values
+                )
                 is_distribution = type(spec) is not Range  # a subclass of it
                 if parameter.log or is_distribution:
                     value = spec.interpolate(u[coordinates], log=parameter.log)
@@ -997,7 +1016,9 @@ class Control:
                 described[name] = make_value_with_unit(value, parameter.unit)
             else:
                 for index, number in enumerate(value):
-                    described[f"{name}.{index}"] = make_value_with_unit(number, parameter.unit)
+                    described[f"{name}.{index}"] = make_value_with_unit(
+                        number, parameter.unit
+                    )
         for name, measurement in self.compute_measurements(
             values, earlier_inputs
         ).items():
@@ -1058,7 +1079,9 @@ class Control:
             Images (h, w, 3), display-referred sRGB in [0, 1], by file name without
             suffix.
         """
-        return self.make_artifact_images(self.compute_values(u.detach()), earlier_inputs)
+        return self.make_artifact_images(
+            self.compute_values(u.detach()), earlier_inputs
+        )
 
     def make_artifact_files(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

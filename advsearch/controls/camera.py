@@ -321,7 +321,9 @@ class CameraControl(Control):
 
     def get_setting_name(self, parameter: Parameter) -> str:
         equivalent_settings = {"focal_length": "camera.fov", "sizes": "camera.distance"}
-        return equivalent_settings.get(parameter.name, super().get_setting_name(parameter))
+        return equivalent_settings.get(
+            parameter.name, super().get_setting_name(parameter)
+        )
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

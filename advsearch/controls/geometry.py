@@ -645,7 +645,9 @@ class GeometryControl(Control):
         self._mesh = self.get_mesh(self.scene).mesh
         welded_mesh = get_welded_mesh(self._mesh)
         self._position_of_vertex = torch.from_numpy(welded_mesh.position_of_vertex)
-        self._limits = DisplacementLimits(welded_mesh, float(self.choice_values["epsilon"]))
+        self._limits = DisplacementLimits(
+            welded_mesh, float(self.choice_values["epsilon"])
+        )
         if self.form == "modes":
             # (P, 3, modes)
             modes = torch.from_numpy(

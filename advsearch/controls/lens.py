@@ -132,9 +132,13 @@ class LensControl(Control):
         for slot in self.parameter_slots:
             name = slot.parameter.name
             # A range has a coordinate for each dot, a list of values a single one.
-            is_range = slot.n_coordinates > 0 and not isinstance(slot.parameter_spec, OneOf)
+            is_range = slot.n_coordinates > 0 and not isinstance(
+                slot.parameter_spec, OneOf
+            )
             if name in POSITION_PARAMETERS and is_range:
-                coordinates = slice(slot.coordinate_offset, slot.coordinate_offset + slot.n_coordinates)
+                coordinates = slice(
+                    slot.coordinate_offset, slot.coordinate_offset + slot.n_coordinates
+                )
                 self.start[coordinates] = positions[POSITION_PARAMETERS.index(name)]
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:

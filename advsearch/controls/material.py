@@ -853,7 +853,9 @@ class MaterialControl(Control):
                 inputs[f"{self.mesh_name}.{name}"] = values[name].reshape(1)
             elif self._may_change_material:
                 number = float(getattr(material, name))
-                inputs[f"{self.mesh_name}.{name}"] = values["which"].new_tensor([number])
+                inputs[f"{self.mesh_name}.{name}"] = values["which"].new_tensor(
+                    [number]
+                )
         if self._changes_color():
             tint = color.combine_channels(values)
             base = self._compute_base_color(which, earlier_inputs)

@@ -171,7 +171,9 @@ class PatchControl(PictureControl):
         self._check_pixels()
         if self.is_image_searched:
             return
-        fixing_setting = "pixels" if self.choice_values["picture"] is None else "picture"
+        fixing_setting = (
+            "pixels" if self.choice_values["picture"] is None else "picture"
+        )
         for ball_setting in ("epsilon", "norm"):
             # None and the norm "box" mean that there is no ball.
             if self.choice_values[ball_setting] not in (None, "box"):
@@ -331,7 +333,9 @@ def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
     camera = np.append(geometry.camera_to_world(scene)[:3, 3], 1.0)
     # The offset from the center to the camera, in the coordinates of the object: the
     # solution is the camera's position there.
-    x, y, z = np.linalg.solve(geometry.compute_object_to_world(scene), camera)[:3] - center
+    x, y, z = (
+        np.linalg.solve(geometry.compute_object_to_world(scene), camera)[:3] - center
+    )
     # A limit above 0, so that the height of a camera straight above is 1.
     level_distance = max(math.hypot(x, y), 1e-12)
     # latitude of the direction after the ellipsoid around the object, with a level radius

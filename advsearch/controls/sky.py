@@ -355,7 +355,9 @@ class SkyControl(Control):
         """Return the scene with the sky at the control's start as its environment."""
         bound = self.bind(scene)
         radiance = (
-            bound.compute_radiance(bound.compute_values(bound.start)).numpy().astype(np.float32)
+            bound.compute_radiance(bound.compute_values(bound.start))
+            .numpy()
+            .astype(np.float32)
         )
         sky = assets.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(

@@ -368,7 +368,9 @@ class Space:
         for control, start in self.split_by_control(self.start):
             # A control without slots, such as a texture, does not move the camera. A
             # fixed control has no slots, but the control that it wraps may move it.
-            may_move_camera = bool(control.parameter_slots) or isinstance(control, _FixedControl)
+            may_move_camera = bool(control.parameter_slots) or isinstance(
+                control, _FixedControl
+            )
             if may_move_camera and "camera.to_world" in control.inputs(start):
                 # A single view if the control has no coordinates.
                 return [

@@ -386,7 +386,9 @@ class TextureControl(Control):
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how much the texels change, and which materials are painted."""
-        change = self._painter.paint_texels(u.detach()) - self._unchanged_texels.to(u.device)
+        change = self._painter.paint_texels(u.detach()) - self._unchanged_texels.to(
+            u.device
+        )
         described: dict[str, Value] = {}
         if self._materials:
             described[f"{self.name}.materials"] = {

@@ -172,7 +172,9 @@ class ThingsControl(Control):
             InputError: one overlaps with something else.
         """
         # With all parameters 0, things are present, and stand as in the scene.
-        unmoved = {slot.parameter.name: torch.zeros(()) for slot in self.parameter_slots}
+        unmoved = {
+            slot.parameter.name: torch.zeros(()) for slot in self.parameter_slots
+        }
         for name, stand in self._compute_stands(unmoved, {}).items():
             is_pushed = bool(stand.push_distance)
             if is_pushed:

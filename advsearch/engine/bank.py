@@ -344,7 +344,9 @@ class Bank(PredictedSearch):
             if was_added_later:
                 u = self._grown_at[growth_step]
         bank_seed = seeds.derive_seed(self.problem.seed, "bank")
-        condition = sample_condition(self.problem.conditions, condition_index, bank_seed)
+        condition = sample_condition(
+            self.problem.conditions, condition_index, bank_seed
+        )
         seed = seeds.derive_seed(self.problem.seed, "bank matrix", condition_index)
         return Query(torch.cat([u, condition]), seed, spp=SPP, requested_output="light")
 
@@ -371,7 +373,9 @@ class Bank(PredictedSearch):
                 self._request_light(first_missing, index)
             for number in range(first_missing, size):
                 # `_incoming` yields light in the order of the conditions
-                condition = self._make_condition(number, next(self._incoming).collected_light)
+                condition = self._make_condition(
+                    number, next(self._incoming).collected_light
+                )
                 self._conditions.append(condition)
                 self._bytes += condition.renderer.n_bytes
                 tick(SPP)

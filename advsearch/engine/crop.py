@@ -170,6 +170,8 @@ class CroppedSearch(PredictedSearch):
             if deviation.is_accepted or was_accepted:
                 assert self.n_renewals is not None  # None only for a `Bank`
                 self.n_renewals += 1
-                return self._renew_surroundings(self.selected_window, kind, number, new_image)
+                return self._renew_surroundings(
+                    self.selected_window, kind, number, new_image
+                )
         self.stop_predicting(kind, number, f" of the {kind}")
         return None

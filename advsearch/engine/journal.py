@@ -172,7 +172,9 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     """
     if query.requested_output != "judgement":
         product = (
-            "a picture" if query.requested_output == "picture" else "the light of a condition"
+            "a picture"
+            if query.requested_output == "picture"
+            else "the light of a condition"
         )
         raise ClusterError(
             f"{product}: {reason}; `advsearch resume RUN workers=null` makes it here"
@@ -640,7 +642,9 @@ class Journal:
             seconds=evaluation.seconds,
             phase=query.phase,
             # A cost of 1 is an image under each of the `n_draws` conditions.
-            renders=0 if is_predicted else evaluation.cost * problem.conditions_per_evaluation,
+            renders=0
+            if is_predicted
+            else evaluation.cost * problem.conditions_per_evaluation,
             machine=evaluation.machine,
         )
         if evaluation.judgement is not None:
@@ -724,7 +728,11 @@ class Journal:
 
     def get_note(self, key: str) -> Any:
         """Return the stored note of a key; None if there is none."""
-        return None if self.run_directory is None else self.run_directory.store.read_json_note(key)
+        return (
+            None
+            if self.run_directory is None
+            else self.run_directory.store.read_json_note(key)
+        )
 
     def set_note(self, key: str, value: Any) -> None:
         """Store a value that JSON can hold as the note of a key."""

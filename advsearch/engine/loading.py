@@ -669,7 +669,9 @@ def make_renderer(
     moments: tuple[Moment, ...] = ()
     if has_exposure_time:
         exposure_motion = motion or Motion(description, size, scene.input_assembler)
-        moments = choose_moments(space, exposure_motion, scene.input_assembler, height=size[0])
+        moments = choose_moments(
+            space, exposure_motion, scene.input_assembler, height=size[0]
+        )
     return Renderer(
         scene,
         space,

@@ -21,7 +21,12 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Domain, Evaluation, Objective
 from advsearch.attacks.evaluation import Query, WhichGradient
-from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, VerificationRule
+from advsearch.attacks.verification import (
+    EASIER,
+    OVER_CONDITIONS,
+    WORST_CASE,
+    VerificationRule,
+)
 from advsearch.controls import Space
 from advsearch.engine.acceptance import ComparedView, compare_with_traced
 from advsearch.engine.judging import (
@@ -223,7 +228,9 @@ class Problem:
 
     # ---- pictures
 
-    def make_full_configuration(self, u: Tensor, draw_seed: int | None = None) -> Tensor:
+    def make_full_configuration(
+        self, u: Tensor, draw_seed: int | None = None
+    ) -> Tensor:
         """Return the full configuration: u (d,), followed by conditions.
 
         Conditions are the coordinates of the controls that vary by chance, such as the
@@ -236,7 +243,9 @@ class Problem:
             return torch.cat([u, self.conditions.start])
         # The noise has the same seed. Another stream makes the conditions independent
         # of it.
-        generator = torch.Generator().manual_seed(seeds.derive_seed(draw_seed, "conditions"))
+        generator = torch.Generator().manual_seed(
+            seeds.derive_seed(draw_seed, "conditions")
+        )
         # `sample` returns a batch (1, d) of one configuration
         return torch.cat([u, self.conditions.sample(generator)[0]])
 
@@ -497,7 +506,8 @@ class Problem:
             return self.find_truth(start)
         # functions, since a task may need neither
         facts = self.make_facts(
-            lambda: self.space.describe(start), lambda: self.renderer.find_surfaces(start)
+            lambda: self.space.describe(start),
+            lambda: self.renderer.find_surfaces(start),
         )
         return self.task.truth(facts)
 
@@ -534,7 +544,8 @@ class Problem:
                 the conditions leave the scene unchanged.
         """
         return self.space.describe(
-            self.make_full_configuration(u, draw_seed), self.space.controls[: self.n_searched]
+            self.make_full_configuration(u, draw_seed),
+            self.space.controls[: self.n_searched],
         )
 
     def summarize_plan(self, plan: GradientPlan) -> PlannedGradient:
@@ -582,7 +593,8 @@ class Problem:
         if self.conditions is None:
             return {}
         return self.space.describe(
-            self.make_full_configuration(u, draw_seed), self.space.controls[self.n_searched :]
+            self.make_full_configuration(u, draw_seed),
+            self.space.controls[self.n_searched :],
         )
 
     # ---- evaluations
@@ -664,7 +676,8 @@ class Problem:
         all of them.
         """
         condition_seeds = [
-            seeds.derive_seed(query.seed, "draw", index) for index in range(self.conditions_per_evaluation)
+            seeds.derive_seed(query.seed, "draw", index)
+            for index in range(self.conditions_per_evaluation)
         ]
         query_without_image = replace(query, includes_image=False)
         evaluated = [
@@ -676,7 +689,9 @@ class Problem:
         evaluation = self.average_evaluations(evaluated, query.u)
         if not query.includes_image:
             return evaluation
-        image = self.picture(query.u, query.seed, self.search_spp, with_conditions=False)
+        image = self.picture(
+            query.u, query.seed, self.search_spp, with_conditions=False
+        )
         return replace(evaluation, picture=image)
 
     def _compute_objective(
@@ -722,7 +737,9 @@ class Problem:
         searched_inputs: frozenset[str] = frozenset()
         for group in self.gradient_plan.groups:
             if group.control in searched_names:
-                searched_inputs |= self.renderer.inputs_by_group.get(group.name, frozenset())
+                searched_inputs |= self.renderer.inputs_by_group.get(
+                    group.name, frozenset()
+                )
         # images are only linear in some of them
         input_names = searched_inputs & find_linear_inputs(self.renderer)
         # Light paths are no longer than those of a search.
@@ -1012,7 +1029,9 @@ class Problem:
 
     def compute_loss(self, image: Tensor) -> Tensor:
         """Return the objective of an image (H, W, 3) near the start, with a graph."""
-        inputs = self.make_objective_inputs(self.make_full_configuration(self.domain.start))
+        inputs = self.make_objective_inputs(
+            self.make_full_configuration(self.domain.start)
+        )
         output = self.model(image)
         values = self._compute_objective(output, image[None], self.find_truth(), inputs)
         return values[0]

@@ -467,7 +467,9 @@ def _render_view(
         radiance = renderer.radiance(
             u, seeds.derive_seed(settings.seed, "pictures"), settings.spp
         )
-        image = round_to_8_bit(space.apply_to_image(u, formation.map_to_display(radiance)))
+        image = round_to_8_bit(
+            space.apply_to_image(u, formation.map_to_display(radiance))
+        )
         output = model(image)
         truth = None
         truth_error = ""

@@ -273,12 +273,16 @@ class SurfaceLight(PredictedSearch):
             # Without a seed, the conditions leave the scene unchanged.
             full_u = problem.make_full_configuration(u)
             self._renderer = SurfaceRenderer(
-                problem.renderer, full_u, seeds.derive_seed(problem.seed, "surface light")
+                problem.renderer,
+                full_u,
+                seeds.derive_seed(problem.seed, "surface light"),
             )
             self._bank_conditions = self._sample_bank_conditions()
             for condition in self._bank_conditions:
                 inputs = self._compute_inputs(torch.cat([u, condition]))
-                self._renderer.get_light_and_factor(inputs)  # computes it, and stores it
+                self._renderer.get_light_and_factor(
+                    inputs
+                )  # computes it, and stores it
                 # `N_LIGHTS` is the length of the progress bar (`n_samples`), also if
                 # there is a single condition
                 tick(N_LIGHTS // len(self._bank_conditions))
@@ -417,7 +421,9 @@ class SurfaceLight(PredictedSearch):
         reuses_conditions = self._reuses_conditions(query.kind)
         if reuses_conditions:
             set_index = query.row_index % N_CONDITION_SETS
-        conditions = self._choose_conditions(query.kind, set_index, problem.conditions_per_evaluation)
+        conditions = self._choose_conditions(
+            query.kind, set_index, problem.conditions_per_evaluation
+        )
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
         ]
@@ -562,7 +568,9 @@ class SurfaceLight(PredictedSearch):
             self.stop_predicting("search", query.row_index)
         elif self._searches_colors:
             with self.measure_seconds():
-                self.renderer.update_base_color(self.problem.make_full_configuration(query.u))
+                self.renderer.update_base_color(
+                    self.problem.make_full_configuration(query.u)
+                )
             assert self.n_renewals is not None  # None only for a `Bank`
             self.n_renewals += 1
 

@@ -166,7 +166,7 @@ class Verifier:
         has_conditions = self.problem.conditions is not None
         # sample counts to choose from, ascending
         ladder = self.spp_ladder
-        is_set_by_user = len(spp_ladder) == 1
+        is_set_by_user = len(ladder) == 1
         n_trials_of_first_look = self.look_sizes[0]
         # `max_samples` is for the progress bar: samples per pixel of all renders, if
         # every sample count of the ladder is tried.
@@ -194,7 +194,9 @@ class Verifier:
             )
             for name, u in candidates.items()
         }
-        self.run_state.sample_count = choose(margins, seed=self.problem.seed, ladder=ladder)
+        self.run_state.sample_count = choose(
+            margins, seed=self.problem.seed, ladder=ladder
+        )
 
     def _begin_sample_count_stage(self, max_samples: int) -> None:
         """Begin the stage of the progress in which the sample count is chosen.
@@ -258,7 +260,9 @@ class Verifier:
     @property
     def has_clean_trials(self) -> bool:
         """Whether the control group was tried at the current sample count."""
-        return bool(self.run_state.clean_trials) and self._clean_spp == self.run_state.spp
+        return (
+            bool(self.run_state.clean_trials) and self._clean_spp == self.run_state.spp
+        )
 
     def verify(
         self,

@@ -276,7 +276,9 @@ def _measure_square(
     slope = _compute_slope(problem, before)
     # for each of the two seeds, differences summed over the squares: (1, 3, h, w)
     difference_sums = []
-    for old, new in zip(before.independent_renders, after.independent_renders, strict=True):
+    for old, new in zip(
+        before.independent_renders, after.independent_renders, strict=True
+    ):
         difference = (new - old)[..., :3]  # without coverage
         levels = 255.0 * slope * difference * outside
         difference_sums.append(_sum_over_squares(levels))

@@ -390,7 +390,11 @@ class AddressModel(models.RemoteNetwork):
         highest score.
         """
         # turn: the number of the request about the same image
-        requests = [(image, turn) for image in images for turn in range(self.n_answers_per_image)]
+        requests = [
+            (image, turn)
+            for image in images
+            for turn in range(self.n_answers_per_image)
+        ]
         texts = []
         for answer in self._get_answers(requests):
             scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}

@@ -69,7 +69,10 @@ class Features:
         images = check_images(images)
         batches = images.split(self.model.batch_limits[1])
         features: Tensor = join_outputs(
-            [self.compute_batch(self.model.prepare(b))[: len(b)].float() for b in batches]
+            [
+                self.compute_batch(self.model.prepare(b))[: len(b)].float()
+                for b in batches
+            ]
         )
         return features.to(images.device)
 

@@ -41,9 +41,9 @@ from advsearch.models.source import (
 )
 from advsearch.registry import Registry, load_attribute
 from advsearch.trust.foreign_code import (
-    use_torch_state_in_calls,
     find_expected_torch_state,
     use_default_torch_state,
+    use_torch_state_in_calls,
 )
 
 DEFAULT_INPUT_SIZE = (224, 224)  # if neither the model nor the caller states one

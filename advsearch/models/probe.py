@@ -29,7 +29,11 @@ from advsearch.models.model import (
     read_output,
     warn,
 )
-from advsearch.trust.foreign_code import ForeignCodeTimeoutError, get_first_line, run_within_limits
+from advsearch.trust.foreign_code import (
+    ForeignCodeTimeoutError,
+    get_first_line,
+    run_within_limits,
+)
 from advsearch.trust.stored_files import FACTOR, scale_limit
 
 # Non-negative rows that sum to 1 within this tolerance are probabilities.
@@ -112,7 +116,9 @@ def probe_model(
     gray = torch.full((1, height, width, 3), 0.5)
     noise = torch.rand(gray.shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        rows = torch.cat([_compute_output_rows(model, gray), _compute_output_rows(model, noise)])
+        rows = torch.cat(
+            [_compute_output_rows(model, gray), _compute_output_rows(model, noise)]
+        )
         repeated_rows = _compute_output_rows(model, gray)
     _check_finite(model, rows)
     returns_logits = model.read is None

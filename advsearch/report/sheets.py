@@ -85,9 +85,11 @@ class Piece:
     @property
     def frame_size_mm(self) -> tuple[float, float]:
         """Width of bleed and marks on each side, in millimetres: (x, y)."""
-        return self.bleed[0] * self.pixel_size_mm[0] + MARK_GAP + MARK_LENGTH, self.bleed[
+        return self.bleed[0] * self.pixel_size_mm[
+            0
+        ] + MARK_GAP + MARK_LENGTH, self.bleed[1] * self.pixel_size_mm[
             1
-        ] * self.pixel_size_mm[1] + MARK_GAP + MARK_LENGTH
+        ] + MARK_GAP + MARK_LENGTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,9 +282,12 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
     # The first argument is a length in pixels without bleed. The second one is the page
     # in pixels, without the frame of a part, which is its bleed and its marks.
     columns = _cut_evenly(
-        n_columns - 2 * left, (width - 2 * piece.frame_size_mm[0]) / piece.pixel_size_mm[0]
+        n_columns - 2 * left,
+        (width - 2 * piece.frame_size_mm[0]) / piece.pixel_size_mm[0],
     )
-    rows = _cut_evenly(n_rows - 2 * top, (height - 2 * piece.frame_size_mm[1]) / piece.pixel_size_mm[1])
+    rows = _cut_evenly(
+        n_rows - 2 * top, (height - 2 * piece.frame_size_mm[1]) / piece.pixel_size_mm[1]
+    )
     n_parts = len(columns) * len(rows)
     if n_parts > MAX_SHEETS:
         raise InputError(

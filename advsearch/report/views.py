@@ -284,7 +284,9 @@ def make_default_view(result: Result) -> ShownResult:
     Lists of rows become tables, and other fields become facts. A last table explains
     the names of both.
     """
-    values = {name: getattr(result, name) for name in type(result).get_described_fields()}
+    values = {
+        name: getattr(result, name) for name in type(result).get_described_fields()
+    }
     tables = {name: value for name, value in values.items() if _is_table(value)}
     facts = _find_plain_facts(result, values, tables)
     # pairs of an object with fields, and the names of its fields that are on the page
@@ -373,7 +375,9 @@ def _explain_words(
             if about.description and word in words:
                 meanings.setdefault(word, about.description.replace("`", ""))
     rows = [[word, meaning] for word, meaning in meanings.items()]
-    return ResultPart("What these words mean", rows=rows, folded=True, only_medium="page")
+    return ResultPart(
+        "What these words mean", rows=rows, folded=True, only_medium="page"
+    )
 
 
 def _format_value(value: object) -> str:
@@ -692,7 +696,9 @@ def _make_section_html(part: ResultPart) -> Html:
     texts = part.text if part.draw is None else ()
     children = [make_element("p", text) for text in texts if text]
     if part.rows:
-        heads = make_element("tr", *(make_element("th", cell) for cell in part.column_heads))
+        heads = make_element(
+            "tr", *(make_element("th", cell) for cell in part.column_heads)
+        )
         head = make_element("thead", heads) if part.column_heads else None
         rows = [
             make_element("tr", *(make_element("td", cell) for cell in row))

@@ -20,8 +20,8 @@ from advsearch.pictures import encode_levels
 from advsearch.trust.databases import (
     LARGEST,
     check_before_writing,
-    set_defensive_options,
     read_version,
+    set_defensive_options,
 )
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import replace_file, storage_errors, write_bytes

@@ -82,7 +82,9 @@ class Measurements:
         Raises:
             OutOfTime: they would have to be measured, and the time is up.
         """
-        return row_type.from_values(self.get_or_measure(key, lambda: measure().to_dict()))
+        return row_type.from_values(
+            self.get_or_measure(key, lambda: measure().to_dict())
+        )
 
     def get_or_measure_rows(
         self,
@@ -102,7 +104,9 @@ class Measurements:
         """
         return [
             row_type.from_values(row)
-            for row in self.get_or_measure(key, lambda: [row.to_dict() for row in measure()])
+            for row in self.get_or_measure(
+                key, lambda: [row.to_dict() for row in measure()]
+            )
         ]
 
     def put(self, key: str, value: Any) -> None:
@@ -145,7 +149,9 @@ class Measurements:
         result = make_result(collected_rows)
         # Stored rows come first. If the user interrupted before any new row, some
         # stored rows may not have been read, and the earlier result may have more rows.
-        may_lack_stored_rows = context.ending == INTERRUPTED and not self.n_new_measurements
+        may_lack_stored_rows = (
+            context.ending == INTERRUPTED and not self.n_new_measurements
+        )
         if may_lack_stored_rows and (context.run.path / NAME).is_file():
             earlier = read_stored_result(context.run.path)
             return earlier if isinstance(earlier, type(result)) else result

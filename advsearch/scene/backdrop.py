@@ -57,7 +57,11 @@ from advsearch.scene.camera_model import (
 from advsearch.scene.color import CHANNELS, linear_to_srgb, srgb_to_linear
 from advsearch.scene.depth_pictures import check_no_depth, is_depth, read_depth
 from advsearch.scene.formation import Surfaces
-from advsearch.scene.geometry import camera_to_world, compute_object_to_world, project_points
+from advsearch.scene.geometry import (
+    camera_to_world,
+    compute_object_to_world,
+    project_points,
+)
 from advsearch.scene.image_quality import measure_blur
 from advsearch.scene.scene_data import AnyScene, SceneData
 from advsearch.trust.stored_files import (
@@ -260,7 +264,9 @@ def make_image_inputs(
     return {name: value for name, value in inputs.items() if value is not None}
 
 
-def compose_over_photograph(rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]) -> Tensor:
+def compose_over_photograph(
+    rendered: Tensor, behind: Tensor, inputs: Mapping[str, Tensor]
+) -> Tensor:
     """Lay rendered radiance over a photograph.
 
     The photograph is visible where the object does not cover the pixel, and where

@@ -467,7 +467,11 @@ def _read_projection(path: str, entries: CameraEntries) -> str:
 
 
 def _read_focal_lengths(
-    path: str, data: Mapping[str, Any], entries: CameraEntries, width: float, height: float
+    path: str,
+    data: Mapping[str, Any],
+    entries: CameraEntries,
+    width: float,
+    height: float,
 ) -> dict[str, float]:
     """Return fx and fy in pixels, from lengths or from angles of view.
 
@@ -725,7 +729,9 @@ def _read_opencv_distortion(entries: CameraEntries, kind: str) -> dict[str, floa
     return coefficients
 
 
-def _read_optional_numbers(entries: CameraEntries, names: Sequence[str]) -> dict[str, float]:
+def _read_optional_numbers(
+    entries: CameraEntries, names: Sequence[str]
+) -> dict[str, float]:
     """Return entries that are numbers, by name; 0 for those that are missing."""
     return {name: entries.get_number(name, 0.0) for name in names}
 

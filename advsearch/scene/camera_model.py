@@ -76,7 +76,9 @@ class CameraModel:
     name: str = ""
     # (height, width) in pixels for which it was calibrated; None for any size.
     calibrated_shape: tuple[int, int] | None = None
-    max_angle_degrees: float = 180.0  # largest visible angle to the optical axis, degrees
+    max_angle_degrees: float = (
+        180.0  # largest visible angle to the optical axis, degrees
+    )
     reading_notes: tuple[str, ...] = ()  # sentences about entries that were not read
 
     @property
@@ -380,7 +382,9 @@ class CameraModel:
     def _max_visible(self) -> float:
         """The largest visible angle of a fisheye, or tangent of another lens."""
         if self.kind == FISHEYE:
-            return min(self.fold_angle_radians, math.radians(self.max_angle_degrees), math.pi)
+            return min(
+                self.fold_angle_radians, math.radians(self.max_angle_degrees), math.pi
+            )
         if self.fold_angle_radians < math.pi / 2.0:
             # just before the fold, where the slope is not zero yet
             return math.tan(self.fold_angle_radians) * (1.0 - 1e-9)

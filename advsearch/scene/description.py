@@ -292,7 +292,10 @@ class SceneDescription(SceneData):
         model.check_no_fov(self.requested)
         # Focal lengths are in widths and heights of the image, so that half a side's
         # angle has the tangent 0.5 / focal. The field of view is along the larger side.
-        tangents = (0.5 / model.intrinsic_by_name["fx"], 0.5 / model.intrinsic_by_name["fy"])
+        tangents = (
+            0.5 / model.intrinsic_by_name["fx"],
+            0.5 / model.intrinsic_by_name["fy"],
+        )
         fov = 2.0 * math.degrees(math.atan(max(tangents)))
         # The pose becomes a camera of the scene, and is selected; `with_camera` also
         # checks the settings. Then it gets its lens, which `with_camera` has removed.

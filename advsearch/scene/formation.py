@@ -33,9 +33,9 @@ from advsearch.scene.geometry import (
     Frame,
     camera_to_world,
     compute_base_vertices,
+    compute_object_to_world,
     list_lamps,
     make_rotation,
-    compute_object_to_world,
 )
 from advsearch.scene.grounds import is_paved
 from advsearch.scene.parts import MeshPart

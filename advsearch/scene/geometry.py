@@ -40,7 +40,9 @@ from advsearch.scene.rigged import TIME as TIME
 from advsearch.scene.rigged import find_rig_parameter as find_rig_parameter
 from advsearch.scene.scene_data import SceneData
 from advsearch.scene.scene_data import cache_per_scene as cache_per_scene
-from advsearch.scene.scene_data import compute_object_to_world as object_to_world
+from advsearch.scene.scene_data import (
+    compute_object_to_world as compute_object_to_world,
+)
 from advsearch.scene.settings import ORBIT_CAMERA, SETTINGS
 from advsearch.scene.skeleton import (
     compute_rotation_entries as compute_rotation_entries,

@@ -271,7 +271,9 @@ class Charts:
     # to 1
     weights: Float64Array
     is_covered: BoolArray  # (h, w) whether the texel's center is in a chart
-    texels_to_covered: Float64Array  # (h, w) texels to the nearest covered texel, which have 0
+    texels_to_covered: (
+        Float64Array  # (h, w) texels to the nearest covered texel, which have 0
+    )
 
     @property
     def is_readable(self) -> BoolArray:

@@ -601,7 +601,9 @@ class Renderer:
         renders_before = self.n_renders
         images = list[Tensor]()
         # without a rig there is one camera, with no mount
-        for index, mount in enumerate(self.scene.description_and_filter[0].rig or (None,)):
+        for index, mount in enumerate(
+            self.scene.description_and_filter[0].rig or (None,)
+        ):
             # the first camera has the noise of a scene without a rig
             camera_seed = seed
             if index > 0:
@@ -687,7 +689,9 @@ class Renderer:
             )
             if is_denoised:
                 with torch.no_grad():
-                    guide_seed = seeds.derive_seed(self.root_seed, "guides", moment_seed)
+                    guide_seed = seeds.derive_seed(
+                        self.root_seed, "guides", moment_seed
+                    )
                     albedo, normal = self.scene.render_guides(
                         inputs, guide_seed, samples
                     )
@@ -766,7 +770,9 @@ class Renderer:
         return self.space.apply_to_image(u, image)
 
     @torch.no_grad()
-    def replace_photograph_depth(self, inputs: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def replace_photograph_depth(
+        self, inputs: Mapping[str, Tensor]
+    ) -> Mapping[str, Tensor]:
         """Return inputs in which a photograph's depth is replaced by what it hides.
 
         ``backdrop.front`` (H, W, 2), the hidden fractions of object and ground, takes
@@ -1016,7 +1022,9 @@ class _Radiance(torch.autograd.Function):
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.derive_seed(renderer.root_seed, "primal", seed)
         guides: Tensor | None = None
-        if renderer._external_render is not None:  # another program, which also denoises
+        if (
+            renderer._external_render is not None
+        ):  # another program, which also denoises
             rendered = renderer._external_render(inputs, noise_seed, spp)
         else:
             image_seeds = {"hidden" if hide else "path": noise_seed}

@@ -161,7 +161,9 @@ class SkeletonRig:
         self._points = torch.from_numpy(points[vertices])
         self._joints = torch.from_numpy(joints[vertices])
         self._weights = torch.from_numpy(weights[vertices])
-        self._nodes = torch.from_numpy(np.concatenate([part.joint_nodes for part in parts]))
+        self._nodes = torch.from_numpy(
+            np.concatenate([part.joint_nodes for part in parts])
+        )
         self._inverse_binds = torch.from_numpy(
             np.concatenate([part.inverse_binds for part in parts])
         )

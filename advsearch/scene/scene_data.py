@@ -35,7 +35,10 @@ from advsearch.scene.parts import (
     ScenePart,
     make_mesh_part,
 )
-from advsearch.scene.photographed_ground import PhotographedGround, get_photographed_ground
+from advsearch.scene.photographed_ground import (
+    PhotographedGround,
+    get_photographed_ground,
+)
 from advsearch.scene.poses import apply_settings, compute_base_vertices, compute_pose
 from advsearch.scene.rig import RigCamera
 from advsearch.scene.settings import ORBIT_CAMERA, POSE

@@ -446,7 +446,9 @@ class Config(BaseModel):
         try:
             # This first configuration only serves to find its powers.
             left_out = [
-                power for power in cls(**data).settings_with_effects if power.name not in overrides
+                power
+                for power in cls(**data).settings_with_effects
+                if power.name not in overrides
             ]
             for power in left_out:
                 # The file may use the name of the setting or of its field.

@@ -155,7 +155,9 @@ def compute_iou_with_truth(detections: Detections, truth: DetectionTruth) -> Ten
     return compute_iou(boxes, truth.box_fractions.to(boxes))
 
 
-def suppress_overlapping_boxes(detections: Detections, min_score: float, iou: float) -> Detections:
+def suppress_overlapping_boxes(
+    detections: Detections, min_score: float, iou: float
+) -> Detections:
     """Set the scores of suppressed boxes to 0, class by class.
 
     The choice of boxes is not differentiable, but the scores that remain are. Boxes
@@ -329,7 +331,9 @@ class BoxFormat:
         differentiable.
         """
         height, width = self.input_size if self.unit == "pixels" else (1, 1)
-        return to_corners(boxes, self.box_layout) / boxes.new_tensor([width, height] * 2)
+        return to_corners(boxes, self.box_layout) / boxes.new_tensor(
+            [width, height] * 2
+        )
 
     def find_faults(self, boxes: Tensor) -> dict[str, Tensor]:
         """Find which of boxes (D, 4) are implausible in this format.

@@ -76,7 +76,11 @@ class ClassTask(Task):
             except InputError as error:
                 raise InputError(f"target: {error}") from None
         return replace(
-            self, labels=labels, has_class_names=named, target=target_classes, minimise=minimise
+            self,
+            labels=labels,
+            has_class_names=named,
+            target=target_classes,
+            minimise=minimise,
         )
 
     def _check_output_kind(self, model: Model) -> None:
@@ -145,7 +149,9 @@ class ClassTask(Task):
                 f"label: expected the right labels for {facts.object}, got none"
             )
         try:
-            right_classes = find_label_set(text, self.labels, named=self.has_class_names).indices
+            right_classes = find_label_set(
+                text, self.labels, named=self.has_class_names
+            ).indices
         except InputError as error:
             if facts.label is not None:  # from the user
                 raise InputError(f"label: {error}") from None

@@ -267,11 +267,11 @@ class Detection(ClassTask):
             right_boxes = task._find_boxes_of_classes(output, truth.labels)
             if len(right_boxes):
                 doubts = task._compare_with_truth(right_boxes, truth.box_fractions)
-                return replace(task, format_doubts=format_doubts)
+                return replace(task, format_doubts=doubts)
         boxes = select_best_boxes(output)
         box_format = task._box_format
         doubts = box_format.describe_fault(boxes)
-        if format_doubts:
+        if doubts:
             doubts += box_format.suggest_plausible_formats(boxes)
         return replace(task, format_doubts=doubts)
 
@@ -449,7 +449,9 @@ class Detection(ClassTask):
                 f"values: they are read as {order_option}."
             )
         if self.format_doubts:
-            remarks.append(f"The detector's boxes may be read wrongly: {self.format_doubts}.")
+            remarks.append(
+                f"The detector's boxes may be read wrongly: {self.format_doubts}."
+            )
         return tuple(remarks)
 
     @property
@@ -675,7 +677,9 @@ class Detection(ClassTask):
             scores = self._clear_nothing_classes(detections)
             resolved = {**detections, "boxes": boxes, "scores": scores}
             is_finite = boxes.detach().isfinite().all(dim=1)
-            has_low_scores = (get_possible_scores(resolved) < self._min_score).all(dim=1)
+            has_low_scores = (get_possible_scores(resolved) < self._min_score).all(
+                dim=1
+            )
             is_used = is_finite | ~has_low_scores
             if not bool(is_used.all()):
                 resolved = {

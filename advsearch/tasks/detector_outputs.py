@@ -32,7 +32,12 @@ from torch import Tensor
 
 from advsearch.models.labels import list_sets_of_size
 from advsearch.models.model import list_tensors
-from advsearch.tasks.boxes import Detections, are_counted_boxes, are_invalid, format_detection_option
+from advsearch.tasks.boxes import (
+    Detections,
+    are_counted_boxes,
+    are_invalid,
+    format_detection_option,
+)
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, "
@@ -736,7 +741,9 @@ def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
         return
     advice = ""
     if not has_labels:
-        options = " or ".join(format_detection_option(f"order: {order}") for order in QUERIES)
+        options = " or ".join(
+            format_detection_option(f"order: {order}") for order in QUERIES
+        )
         advice = f", or set {options}"
     raise ValueError(
         "expected scores that are probabilities in [0, 1]; apply a sigmoid or a "

@@ -71,7 +71,9 @@ class Rig(tasks.JointTask):
 
     @property
     def title(self) -> str:
-        return f"{self.name} of {self.image_task.title if self.image_task else self.task}"
+        return (
+            f"{self.name} of {self.image_task.title if self.image_task else self.task}"
+        )
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
@@ -92,7 +94,9 @@ class Rig(tasks.JointTask):
                 "task rig: expected a rig, got one camera; set `camera=rig.yaml`"
             )
         # The task of an image does not depend on the number of cameras.
-        part = self.image_task.on(replace(model, cameras=1), target=target, minimise=minimise)
+        part = self.image_task.on(
+            replace(model, cameras=1), target=target, minimise=minimise
+        )
         if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
             raise InputError(
                 f"task rig: task {part.name} judges one output for all pictures; use a "

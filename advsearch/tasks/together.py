@@ -390,7 +390,9 @@ class EachThingTask(JointTask):
     ) -> EachThingTask:
         """Calibrate the task with the truth of the first thing, which is the object."""
         first_truth = None if truth is None else next(iter(truth.values()))
-        return replace(self, thing_task=self.thing_task.after_calibration(output, first_truth))
+        return replace(
+            self, thing_task=self.thing_task.after_calibration(output, first_truth)
+        )
 
     def check(self, facts: Facts) -> None:
         for thing in facts.facts_of_thing.values():
@@ -398,7 +400,8 @@ class EachThingTask(JointTask):
 
     def truth(self, facts: Facts) -> TruthByThing:
         return {
-            name: self.thing_task.truth(thing) for name, thing in facts.facts_of_thing.items()
+            name: self.thing_task.truth(thing)
+            for name, thing in facts.facts_of_thing.items()
         }
 
     def loss(self, output: Output, truth: TruthByThing) -> Tensor:

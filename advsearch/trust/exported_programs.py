@@ -378,7 +378,9 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
             pickle_name = names[f"{folder}model.pt"]
             if pickle_name in archive:
                 _check_pickle(archive, pickle_name)
-                writer.write_bytes(f"{folder}model.pt", archive.read_member(pickle_name))
+                writer.write_bytes(
+                    f"{folder}model.pt", archive.read_member(pickle_name)
+                )
             else:
                 config = f"{folder}model_{kind}_config.json"
                 _copy_tensors(archive, writer, folder, config)
@@ -666,7 +668,9 @@ _TEXT_CHECKS: dict[str, Callable[[str], str]] = {
     "out_spec": _find_tree_problem,
     "as_string": _find_argument_problem,
     "as_strings": _find_argument_problem,
-    "range_constraints": lambda text: "" if is_symbol(text) else find_expression_problem(text),
+    "range_constraints": lambda text: (
+        "" if is_symbol(text) else find_expression_problem(text)
+    ),
 }
 
 

@@ -214,7 +214,10 @@ def use_torch_state_in_calls(module: nn.Module, torch_state: TorchState) -> None
     Hooks set the two before each call of the module, and restore those of the caller
     after it. No hooks are added if both are the defaults.
     """
-    if (torch_state.dtype, torch_state.device) == (DEFAULT_TORCH_STATE.dtype, DEFAULT_TORCH_STATE.device):
+    if (torch_state.dtype, torch_state.device) == (
+        DEFAULT_TORCH_STATE.dtype,
+        DEFAULT_TORCH_STATE.device,
+    ):
         return
     # A stack of the callers' switches, since a module may call itself.
     before: list[TorchState] = []

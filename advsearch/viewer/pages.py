@@ -118,7 +118,9 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
     if part.rows and part.column_heads:
         links = document.link_parts(run, part.parts)
         content.append(
-            document.make_table(part.column_heads, part.rows, links, part.cell_fractions, part.bars)
+            document.make_table(
+                part.column_heads, part.rows, links, part.cell_fractions, part.bars
+            )
         )
     elif part.rows:  # names and values
         content.append(document.facts_table({row[0]: row[1] for row in part.rows}))

@@ -68,8 +68,8 @@ from advsearch.viewer.document import (
     make_data_url,
     make_document,
     make_scrollable,
-    quote_name,
     make_security_policy,
+    quote_name,
 )
 from advsearch.viewer.thumbnails import (
     find_thumbnails,

@@ -28,7 +28,15 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.trials import MarginsOf, count_max_samples, derive_trial_seed
-from advsearch.attacks.verification import EASIER, MIN_RATE, OVER_CONDITIONS, OVER_LOOKS, TRIAL_LOOKS, WORST_CASE, VerificationRule
+from advsearch.attacks.verification import (
+    EASIER,
+    MIN_RATE,
+    OVER_CONDITIONS,
+    OVER_LOOKS,
+    TRIAL_LOOKS,
+    WORST_CASE,
+    VerificationRule,
+)
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import MIN_TRIALS
 from advsearch.questions.region.boxes import GrownBox

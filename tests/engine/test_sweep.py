@@ -32,7 +32,13 @@ from advsearch.engine.judging import make_domain
 from advsearch.errors import InputError, RunExistsError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.axes import SceneConfigurations, add_grid_axes, choose_n_parts, parse_axes, parse_axis_values
+from advsearch.questions.sweep.axes import (
+    SceneConfigurations,
+    add_grid_axes,
+    choose_n_parts,
+    parse_axes,
+    parse_axis_values,
+)
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory

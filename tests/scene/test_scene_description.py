@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from advsearch.scene.description import SceneDescription, load_description
-from advsearch.scene.geometry import FRAME_FILL, camera_to_world, make_rotation, compute_object_to_world
+from advsearch.scene.geometry import FRAME_FILL, camera_to_world, compute_object_to_world, make_rotation
 
 
 def projected(description: SceneDescription) -> np.ndarray:

@@ -388,7 +388,9 @@ class Auto(Policy[AutoState]):
             u = state.domain.project(
                 state.box.to_configuration(ascent.u, state.box_before_trial)
             )
-            ascent = replace(ascent, u=u, counts=ascent.counts + CorrectionCounts(rejected=1))
+            ascent = replace(
+                ascent, u=u, counts=ascent.counts + CorrectionCounts(rejected=1)
+            )
         return replace(state, ascent=ascent, latest_objective=evaluation.objective)
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:

@@ -346,7 +346,9 @@ class RacingPolicy(Policy[Racing]):
                 state=runner_state,
                 best_objective=max(runner.best_objective, best),
             )
-        spent = state.renders_spent + sum(evaluation.cost for _, evaluation in evaluated)
+        spent = state.renders_spent + sum(
+            evaluation.cost for _, evaluation in evaluated
+        )
         return replace(
             state, runners=tuple(runners), renders_spent=spent, runner_of_proposal=()
         )
@@ -553,7 +555,9 @@ def _drop_choices(domain: Domain, numbers: Tensor) -> Domain:
     )
 
 
-def _count_affordable_combinations(domain: Domain, policy: Policy[Any], steps: int) -> int:
+def _count_affordable_combinations(
+    domain: Domain, policy: Policy[Any], steps: int
+) -> int:
     """Return how many combinations of options can be searched in `steps` renders."""
     n_combinations = math.prod(domain.option_counts[domain.option_counts > 0].tolist())
     # two may take part, however large a configuration is

@@ -283,7 +283,9 @@ class AscentPolicy(Policy[Ascent]):
         if has_no_gradient or has_no_gain:
             return (), state
         # The search logs the step size; it does not move u.
-        proposal = Proposal(state.u, gradient=True, step_size=self.compute_step_size(state))
+        proposal = Proposal(
+            state.u, gradient=True, step_size=self.compute_step_size(state)
+        )
         return (proposal,), state
 
     def update(self, state: Ascent, evaluated: Evaluated) -> Ascent:
@@ -569,8 +571,14 @@ class PGD(AscentPolicy):
         """Move from u along the accumulated gradient, or at random if that is zero."""
         uphill = state.direction
         if not bool(uphill.any()):
-            uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.n_evaluations))
-        moved_u = torch.add(u, state.domain.compute_steepest_step(u, uphill), alpha=self.compute_step_size(state))
+            uphill = torch.randn(
+                u.numel(), generator=seeded(state.seed, state.n_evaluations)
+            )
+        moved_u = torch.add(
+            u,
+            state.domain.compute_steepest_step(u, uphill),
+            alpha=self.compute_step_size(state),
+        )
         return replace(state, u=state.domain.project(moved_u))
 
 
@@ -680,7 +688,9 @@ class Adam(AscentPolicy):
             mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
             direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
         else:  # random signs
-            noise = torch.randn(u.numel(), generator=seeded(state.seed, state.n_evaluations))
+            noise = torch.randn(
+                u.numel(), generator=seeded(state.seed, state.n_evaluations)
+            )
             direction = noise.sign_()
         # the index of the latest evaluation, which `count` includes already
         rate = state.decay_step_size(state.n_evaluations - 1)

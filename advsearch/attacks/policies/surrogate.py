@@ -303,7 +303,9 @@ class Observations:
             )
             n_fitted = n_points
         used = _select_best_and_latest(values, self.memory)
-        surrogate = fit_gaussian_process(self.box, self.points[used], values[used], scales)
+        surrogate = fit_gaussian_process(
+            self.box, self.points[used], values[used], scales
+        )
         return surrogate, replace(self, scales=scales, n_fitted=n_fitted)
 
 

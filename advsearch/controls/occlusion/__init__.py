@@ -265,7 +265,9 @@ class OcclusionControl(Control):
     ) -> dict[str, Value]:
         """Return how much is hidden, and the true size and distance of the occluder."""
         placement = self.find_placement(values, earlier_inputs)
-        measurements = {"hidden": Value(value=float(placement.hidden_fraction), unit="1")}
+        measurements = {
+            "hidden": Value(value=float(placement.hidden_fraction), unit="1")
+        }
         if not placement.is_out_of_sight:
             lengths = {"true_size": placement.size, "true_distance": placement.distance}
             for name, length in lengths.items():
@@ -419,7 +421,9 @@ class _ObjectView:
         model = scene.camera_model
         if model is not None:
             if "camera.lens" in earlier_inputs:
-                model = model.with_intrinsics(earlier_inputs["camera.lens"].detach().cpu())
+                model = model.with_intrinsics(
+                    earlier_inputs["camera.lens"].detach().cpu()
+                )
             directions_of_image = _spread_directions(
                 model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
             )

@@ -195,7 +195,9 @@ class Passage:
             new_forward = outwards * math.sin(angle) + forward * math.cos(angle)
             new_right = math.cos(side) * new_outwards - math.sin(side) * sideways
             new_up = math.sin(side) * new_outwards + math.cos(side) * sideways
-            is_hidden = self.occluder_silhouette.contains(new_right, new_up, new_forward)
+            is_hidden = self.occluder_silhouette.contains(
+                new_right, new_up, new_forward
+            )
             fractions.append(float(is_hidden.mean()))
         return np.array(fractions)
 

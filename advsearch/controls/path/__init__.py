@@ -915,7 +915,9 @@ def get_start_poses(scene: SceneDescription, device: torch.device) -> StartPoses
     return StartPoses(
         camera=torch.from_numpy(geometry.camera_to_world(scene)).float().to(device),
         center=torch.from_numpy(geometry.compute_center(scene)).float().to(device),
-        object=torch.from_numpy(geometry.compute_object_to_world(scene)).float().to(device),
+        object=torch.from_numpy(geometry.compute_object_to_world(scene))
+        .float()
+        .to(device),
     )
 
 

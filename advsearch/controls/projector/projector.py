@@ -396,7 +396,9 @@ class ProjectorControl(PictureControl):
         self._picture = self.read_picture()
         super().bind_parameters()
         flicker = next(
-            slot.parameter_spec for slot in self.parameter_slots if slot.parameter.name == "flicker"
+            slot.parameter_spec
+            for slot in self.parameter_slots
+            if slot.parameter.name == "flicker"
         )
         if isinstance(flicker, Range):
             self.flashes = flicker.high
@@ -421,8 +423,14 @@ class ProjectorControl(PictureControl):
 
     @property
     def ambient_lux(self) -> float | None:
-        slot = next(slot for slot in self.parameter_slots if slot.parameter.name == "ambient")
-        return float(slot.parameter_spec.value) if isinstance(slot.parameter_spec, Fixed) else None
+        slot = next(
+            slot for slot in self.parameter_slots if slot.parameter.name == "ambient"
+        )
+        return (
+            float(slot.parameter_spec.value)
+            if isinstance(slot.parameter_spec, Fixed)
+            else None
+        )
 
     def scale_ambient(self, factor: float) -> Self:
         if self.ambient_lux is None:
@@ -499,7 +507,9 @@ class ProjectorControl(PictureControl):
 
     def _compute_white_lux(self, values: Values) -> Tensor:
         """Return the illuminance () of a white image at the object's center, lux."""
-        return values["lumens"] / (self.projector_part.area * values["distance"].detach() ** 2)
+        return values["lumens"] / (
+            self.projector_part.area * values["distance"].detach() ** 2
+        )
 
     def _compute_ambient_ratio(self, values: Values) -> Tensor:
         """Return the illuminance () of a white image at the object's center, as a

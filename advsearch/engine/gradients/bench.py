@@ -162,7 +162,9 @@ class Bench:
         group.
         """
         started = time.perf_counter()
-        gradient = self.compute_gradient(plan, seeds.derive_seed(self.seed, stream, index))
+        gradient = self.compute_gradient(
+            plan, seeds.derive_seed(self.seed, stream, index)
+        )
         derivatives = torch.cat(
             [
                 gradient[group.coordinates]

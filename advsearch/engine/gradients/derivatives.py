@@ -314,7 +314,9 @@ def _make_mixed_direction(bench: Bench, group: Group) -> Tensor:
     plan = restrict_plan(bench.renderer.plan, [group.name])
     full_gradient = bench.compute_gradient(plan, seeds.derive_seed(bench.seed, "probe"))
     gradient = full_gradient[group.coordinates]
-    generator = torch.Generator().manual_seed(seeds.derive_seed(bench.seed, "probe signs"))
+    generator = torch.Generator().manual_seed(
+        seeds.derive_seed(bench.seed, "probe signs")
+    )
     random_bits = torch.randint(0, 2, gradient.shape, generator=generator)
     random_signs = random_bits.to(gradient.dtype) * 2.0 - 1.0
     # where the gradient is 0, the random sign is left

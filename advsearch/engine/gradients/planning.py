@@ -667,7 +667,9 @@ def measure_problem_bounces(
     """
     full_configurations = [problem.make_full_configuration(problem.domain.start)]
     for index in range(N_RANDOM_CONFIGURATIONS):
-        generator = torch.Generator().manual_seed(seeds.derive_seed(seed, "bounces", index))
+        generator = torch.Generator().manual_seed(
+            seeds.derive_seed(seed, "bounces", index)
+        )
         u = problem.domain.sample(generator)[0]
         condition_seed = seeds.derive_seed(seed, "conditions of bounces", index)
         full_configurations.append(problem.make_full_configuration(u, condition_seed))

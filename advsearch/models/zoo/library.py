@@ -367,7 +367,11 @@ class AdaptedNetwork(nn.Module):
     """
 
     def __init__(
-        self, network: nn.Module, run_network: RunNetwork, *, returns_pixel_boxes: bool = False
+        self,
+        network: nn.Module,
+        run_network: RunNetwork,
+        *,
+        returns_pixel_boxes: bool = False,
     ) -> None:
         super().__init__()
         self.network = network
@@ -443,7 +447,11 @@ class LoadedNetwork:
         return Processing(**{**default, **self.preprocessing})
 
     def make_source(
-        self, run_network: RunNetwork, *, returns_pixel_boxes: bool = False, **fields: Any
+        self,
+        run_network: RunNetwork,
+        *,
+        returns_pixel_boxes: bool = False,
+        **fields: Any,
     ) -> models.Source:
         """Return the source of the network, with the measured preprocessing.
 
@@ -454,7 +462,9 @@ class LoadedNetwork:
                 preprocessing.
         """
         return models.make_source(
-            AdaptedNetwork(self.network, run_network, returns_pixel_boxes=returns_pixel_boxes),
+            AdaptedNetwork(
+                self.network, run_network, returns_pixel_boxes=returns_pixel_boxes
+            ),
             self.name,
             **{**self.preprocessing, **fields},
         )

@@ -397,7 +397,9 @@ def _make_named_source(
         returns_pixel_boxes: whether the output has boxes as corners in pixels.
     """
     return lambda loaded: loaded.make_source(
-        run_network, returns_pixel_boxes=returns_pixel_boxes, labels=loaded.class_names or None
+        run_network,
+        returns_pixel_boxes=returns_pixel_boxes,
+        labels=loaded.class_names or None,
     )
 
 

@@ -337,7 +337,9 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
         run_network = build_detector(loaded, network, tokenizer, words)
     warn_of_equal_texts(tokenizer, words, names, loaded.name)
     return loaded.make_text_source(
-        AdaptedNetwork(network, run_network, returns_pixel_boxes=True), names, network.dtype
+        AdaptedNetwork(network, run_network, returns_pixel_boxes=True),
+        names,
+        network.dtype,
     )
 
 

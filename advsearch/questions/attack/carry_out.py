@@ -39,7 +39,7 @@ from advsearch.engine.judging import (
     RenderSurfaces,
 )
 from advsearch.engine.loading import Controls, Scene, fit_camera
-from advsearch.engine.naming import AnyModel, to_model_list, load_models
+from advsearch.engine.naming import AnyModel, load_models, to_model_list
 from advsearch.engine.problem import Problem
 from advsearch.engine.rendering import make_facts
 from advsearch.engine.shared_paths import find_shared_paths
@@ -479,7 +479,9 @@ def make_problem(parts: AttackParts, *, differentiated: bool = True) -> Problem:
     if config.specialise:
         problem.shared_paths = find_shared_paths(problem)
     _check_objective_inputs(parts, problem)
-    problem.steps, problem.conditions_per_evaluation = choose_search_size(config, problem)
+    problem.steps, problem.conditions_per_evaluation = choose_search_size(
+        config, problem
+    )
     return problem
 
 
@@ -603,7 +605,9 @@ def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int
     return config.steps or default_steps, config.draws or default_draws
 
 
-def is_describable_by_setting(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
+def is_describable_by_setting(
+    entry: Task | Policy[Any], make: Callable[[Any], object]
+) -> bool:
     """Return whether a setting can describe a task or a policy.
 
     It can if the setting makes an equal task or policy again. That fails, for example,
@@ -700,4 +704,6 @@ def open_executor(
             f"{setting}: a model behind an address is called by a single process, which "
             "counts the calls; leave it out"
         )
-    return open_workers(work, workers=workers, cluster=cluster, report_message=progress.message)
+    return open_workers(
+        work, workers=workers, cluster=cluster, report_message=progress.message
+    )

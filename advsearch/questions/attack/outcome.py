@@ -295,7 +295,9 @@ def _summarize(
         smallest=_summarize_bracket(problem, findings),
         failures=describe_failures(problem, findings),
         transport=findings.transport_summary,
-        shared=SharedWork.from_worker_stats(journal.evaluator.worker_stats, journal.machines),
+        shared=SharedWork.from_worker_stats(
+            journal.evaluator.worker_stats, journal.machines
+        ),
         renders=_count_renders(findings, problem),
         seed=problem.seed,
     )
@@ -439,7 +441,8 @@ def _summarize_baseline(problem: Problem, findings: RunState) -> BaselineSearch 
         return None
     return BaselineSearch(
         policy="random",
-        renders=findings.random_search_result.renders * problem.conditions_per_evaluation,
+        renders=findings.random_search_result.renders
+        * problem.conditions_per_evaluation,
         verified=_make_rate(findings.baseline_verification),
     )
 
@@ -521,7 +524,9 @@ def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon 
     has_failed = bracket.largest_failing_scale > 0.0  # 0 until a search fails
     return SmallestEpsilon(
         epsilon=scale_budgets(bracket.smallest_passing_scale) if has_found else None,
-        not_found_at=scale_budgets(bracket.largest_failing_scale) if has_failed else None,
+        not_found_at=scale_budgets(bracket.largest_failing_scale)
+        if has_failed
+        else None,
         closed=bracket.is_closed,
         confirmed=bracket.confirmed,
         searches=bracket.searches,
@@ -800,7 +805,9 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
-    counts["verification"] = findings.verification_renders + len(findings.first_look_trials)
+    counts["verification"] = findings.verification_renders + len(
+        findings.first_look_trials
+    )
     # Searches by the kind of their queries. The kind `UNPRINTED` is a sentence; its
     # count has the shorter key "unprinted".
     searches = {
@@ -906,7 +913,10 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     # A policy may divide the space of some parameters into cells, and count in cells.
     # `over` has the columns of u that span the cells.
     return DifferentFailures(
-        over=[problem.domain.element_names[column] for column in known.cell_parameter_indices],
+        over=[
+            problem.domain.element_names[column]
+            for column in known.cell_parameter_indices
+        ],
         found=known.n_failures,
         examined=known.n_visited,
         cells=known.n_cells,

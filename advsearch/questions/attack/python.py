@@ -19,7 +19,7 @@ from advsearch.engine.judging import Metric
 from advsearch.engine.loading import Controls, Scene
 from advsearch.engine.naming import AnyModel, get_model_name, to_model_list
 from advsearch.errors import InputError
-from advsearch.options import describe_value, convert_to_setting
+from advsearch.options import convert_to_setting, describe_value
 from advsearch.progress import ProgressOption, as_progress
 from advsearch.questions.attack.carry_out import (
     AttackParts,
@@ -307,7 +307,9 @@ def _find_python_only(
         parts.append(PythonOnly("task", task.name))
     if callable(objective):
         parts.append(PythonOnly("objective", _name_objective(objective)))
-    if isinstance(policy, Policy) and not is_describable_by_setting(policy, _make_policy):
+    if isinstance(policy, Policy) and not is_describable_by_setting(
+        policy, _make_policy
+    ):
         parts.append(PythonOnly("policy", policy.name))
     parts += [PythonOnly("control", name) for name in session_controls]
     parts += [

@@ -513,7 +513,10 @@ def save_trial(
         image = problem.picture(u, seed, findings.spp)
     run.save_image(name, image)
     save_with_marks(
-        run, name, image, problem.find_marks(image, problem.make_full_configuration(u, seed))
+        run,
+        name,
+        image,
+        problem.find_marks(image, problem.make_full_configuration(u, seed)),
     )
 
 

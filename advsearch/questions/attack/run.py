@@ -282,7 +282,9 @@ def search_and_verify(
             search.
     """
     problem = journal.problem
-    first_spp = problem.search_spp  # `plan_renders` may choose another one for the search
+    first_spp = (
+        problem.search_spp
+    )  # `plan_renders` may choose another one for the search
     findings = RunState()
     looks = _choose_looks(problem, trials)
     verifier = Verifier(journal, ladder, stages, findings, looks)
@@ -303,7 +305,9 @@ def search_and_verify(
                 deterministic=deterministic,
                 chooses_spp=chooses_spp,
             )
-            findings.first_look_trials = evaluate_clean_scene(journal, stages, first_spp)
+            findings.first_look_trials = evaluate_clean_scene(
+                journal, stages, first_spp
+            )
             if not is_already_wrong(verifier, in_any_case=smallest):
                 findings.predictor = choose_predictor(
                     policy,
@@ -368,7 +372,12 @@ def search_with_baselines(
         "`steps` or `seconds` shorten it",
     )
     findings.search_result = searches.run_search(
-        "search", policy, steps, problem.seed, frames=findings.search_frames, seconds=seconds
+        "search",
+        policy,
+        steps,
+        problem.seed,
+        frames=findings.search_frames,
+        seconds=seconds,
     )
     if seconds is not None:
         # The other searches get as many steps as the first one had renders for its steps
@@ -380,7 +389,9 @@ def search_with_baselines(
         searches.begin_stage(
             "without print terms", title, steps, "`printable=false` leaves both out"
         )
-        findings.result_without_print_terms = searches.run_search(UNPRINTED, policy, steps, problem.seed)
+        findings.result_without_print_terms = searches.run_search(
+            UNPRINTED, policy, steps, problem.seed
+        )
     if baseline and policy.name != "random":
         searches.begin_stage(
             "baseline",

@@ -369,7 +369,9 @@ class AttackConfig(DerivativeConfig):
         among them: ``{name: pgd, steps: 80, momentum: 0.9}`` sets `steps`, too.
         """
         # Options without a name are those of "auto".
-        read_policy = partial(parse_name_with_options, setting="policy", default_name="auto")
+        read_policy = partial(
+            parse_name_with_options, setting="policy", default_name="auto"
+        )
         policy = read_policy(data.get("policy"))
         if policy is None:  # the setting is missing
             return data

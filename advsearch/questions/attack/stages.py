@@ -277,7 +277,9 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    min_trials = verifier.look_sizes[0]  # trials after which a verdict is first possible
+    min_trials = verifier.look_sizes[
+        0
+    ]  # trials after which a verdict is first possible
     verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.run_clean_trials()
     return problem.verification_rule.is_already_wrong(
@@ -468,7 +470,9 @@ class Searches:
             steps: steps of the search.
             shorter: sentence about the settings that shorten it.
         """
-        n_renders = count_planned_renders(steps, max_extra_repeats=self.max_extra_repeats)
+        n_renders = count_planned_renders(
+            steps, max_extra_repeats=self.max_extra_repeats
+        )
         samples = format_count(self.problem.search_spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
         predictor = self.run_state.predictor
@@ -646,7 +650,8 @@ def _choose_verification_samples(
     """
     problem = verifier.problem
     n_images = sum(
-        (result.renders + result.gradients) * problem.conditions_per_evaluation for result in results
+        (result.renders + result.gradients) * problem.conditions_per_evaluation
+        for result in results
     )
     configurations = {"adversarial": adversarial, "clean": problem.domain.start}
     verifier.choose_spp(configurations, search_samples=n_images * problem.search_spp)
@@ -823,7 +828,9 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
 
     def passes_short_check(u: Tensor, check_index: int) -> bool:
         """Return whether a configuration (d,) passes a check that may end early."""
-        return passes_check(u, check_index, min_trials=problem.verification_rule.min_trials)
+        return passes_check(
+            u, check_index, min_trials=problem.verification_rule.min_trials
+        )
 
     bracket = find_smallest_change(
         search_inside, passes_short_check, problem.domain, likely=is_likely

@@ -252,7 +252,9 @@ def _check_not_lost(chains: Sequence[Chain], result: BatchResult) -> None:
         title = first_attack.config.object
         if first_attack.subject != title:
             title += f" with {first_attack.subject}"
-        raise ClusterError(f"{title}: {result.failure_reason}; leave it out, or go on without it")
+        raise ClusterError(
+            f"{title}: {result.failure_reason}; leave it out, or go on without it"
+        )
 
 
 def _write_part(

@@ -137,7 +137,9 @@ class GradientCheck:
 
     def run(self) -> CheckResult:
         """Measure all parts, as far as the time allows, and return the result."""
-        return self.measurements.make_result_of_rows(self._measure_parts(), self._make_result)
+        return self.measurements.make_result_of_rows(
+            self._measure_parts(), self._make_result
+        )
 
     def _make_result(self, findings: list[Finding]) -> CheckResult:
         """Return the result of what is measured so far."""
@@ -248,7 +250,9 @@ class GradientCheck:
         config = part.config
         problem, _ = workbench.problem_from_config(config)
         renderer = problem.renderer
-        bench = self._make_bench(part, renderer, problem.compute_loss, problem.search_spp)
+        bench = self._make_bench(
+            part, renderer, problem.compute_loss, problem.search_spp
+        )
 
         renderer.plan = self._choose_plan(title, bench, config)
 

@@ -193,7 +193,9 @@ def find_pair_rules(
     if len(table) < rules.MIN_ROWS or not parameters:
         return None
     choosing, counting = rules.split_in_halves(table, seed)
-    found_rules = rules.find_rules(choosing, counting, seeds.derive_seed(seed, "compare"))
+    found_rules = rules.find_rules(
+        choosing, counting, seeds.derive_seed(seed, "compare")
+    )
     pair_rules = []
     for rule in found_rules.accepted:
         inside = count_exceptions(rule.inside)

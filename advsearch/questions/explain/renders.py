@@ -143,7 +143,9 @@ class SweepRunner:
             return None
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
-        covered_rows = self.factor_table[rules.find_covered(rule.conditions, self.factor_table)]
+        covered_rows = self.factor_table[
+            rules.find_covered(rule.conditions, self.factor_table)
+        ]
         # Fresh rows that earlier rules cover are left out afterwards. The smaller the
         # fraction of the others, the more configurations are rendered.
         is_uncovered = find_uncovered(earlier_conditions, covered_rows)
@@ -200,9 +202,7 @@ class SweepRunner:
                     sweep.config, self.factor_table, rule.conditions, samples, seed, arc
                 )
                 suffix = f"-{arc}" if arc else ""
-                rows = self.run_sweep(
-                    f"rule-{index + 1}-{sweep_index}{suffix}", config
-                )
+                rows = self.run_sweep(f"rule-{index + 1}-{sweep_index}{suffix}", config)
                 if rows is None:
                     continue
                 inside = select_inside(rows, rule.conditions, earlier_conditions)
@@ -228,7 +228,9 @@ class SweepRunner:
         Args:
             counted_rules: all rules, in their order.
         """
-        failures = find_typical_failures(self.factor_table, counted_rules, self.config.pairs)
+        failures = find_typical_failures(
+            self.factor_table, counted_rules, self.config.pairs
+        )
         for number, (index, conditions) in enumerate(failures, start=1):
             rule_factors = [condition.factor for condition in conditions]
             other_factors = [
@@ -463,7 +465,9 @@ class SweepRunner:
 
     def _sample_failures(self, failing: pd.DataFrame) -> pd.DataFrame:
         """Sample at most `clusters` failures at random, in their order."""
-        generator = np.random.default_rng(seeds.derive_seed(self.config.seed, "clusters"))
+        generator = np.random.default_rng(
+            seeds.derive_seed(self.config.seed, "clusters")
+        )
         sampled = generator.permutation(len(failing))[: self.config.clusters]
         return failing.iloc[np.sort(sampled)]
 

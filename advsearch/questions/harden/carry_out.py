@@ -352,7 +352,9 @@ class Hardening:
             for control, number in to_attack
         ]
         hint = "`measured` and `steps` shorten it"
-        for index, status in self.scene_jobs.run_jobs(measurement.title, jobs, hint=hint):
+        for index, status in self.scene_jobs.run_jobs(
+            measurement.title, jobs, hint=hint
+        ):
             control, number = to_attack[index]
             self._record(name, control, number, is_wrong=status != ROBUST)
 
@@ -430,7 +432,9 @@ class Hardening:
         """
         config = self.config
         is_done = context.ending == "done"
-        is_unchanged = self.rounds.best_round_number == 0  # round 0 is the original network
+        is_unchanged = (
+            self.rounds.best_round_number == 0
+        )  # round 0 is the original network
         if is_done and is_unchanged:
             text = (
                 "No round kept the clean accuracy, so the weights are the model's own."
@@ -464,7 +468,9 @@ class Hardening:
         """Return the rounds so far; once all are done, the best is marked."""
         return [
             training_round.model_copy(
-                update={"is_selected": is_done and number == self.rounds.best_round_number}
+                update={
+                    "is_selected": is_done and number == self.rounds.best_round_number
+                }
             )
             for number, training_round in enumerate(self.rounds.finished_rounds)
         ]

@@ -95,7 +95,9 @@ class Example(NamedTuple):
             u: (d,) the configuration that a search has found; None for the plain scene.
         """
         configuration = problem.domain.start if u is None else u
-        truth: Any = problem.find_truth(problem.make_full_configuration(configuration, seed))
+        truth: Any = problem.find_truth(
+            problem.make_full_configuration(configuration, seed)
+        )
         # A region of segmentation has no box, nor has an object out of view.
         box = getattr(truth, "box", None)
         boxes = torch.zeros(0, 4, dtype=torch.float32)
@@ -419,7 +421,9 @@ class DetectorTrainer(Trainer):
         return WORST_USES_PER_EPOCH if item.is_adversarial else 1
 
     @contextmanager
-    def open_gradient_context(self, new: Sequence[Example]) -> Iterator[ComputeGradient]:
+    def open_gradient_context(
+        self, new: Sequence[Example]
+    ) -> Iterator[ComputeGradient]:
         """Put the network into training mode while gradients are computed.
 
         Many detectors return losses only in training mode. Batch normalization and

@@ -113,7 +113,9 @@ class TextureLesson(Lesson):
         # Some controls change the finished image, for which the full configuration is
         # needed, too.
         configuration = torch.cat([u, self.conditions])
-        image: Tensor = self.image_predictor.predict_image(texture_inputs, configuration)
+        image: Tensor = self.image_predictor.predict_image(
+            texture_inputs, configuration
+        )
         return image
 
     @property
@@ -354,7 +356,9 @@ def sample_configurations(
             is_at_bound[:, columns] = False
     is_unchanged = _alternate_controls(domain, count)
     is_lower_nearer = samples - domain.lower_bounds < domain.upper_bounds - samples
-    nearer_bound = torch.where(is_lower_nearer, domain.lower_bounds, domain.upper_bounds)
+    nearer_bound = torch.where(
+        is_lower_nearer, domain.lower_bounds, domain.upper_bounds
+    )
     samples = torch.where(is_at_bound, nearer_bound, samples)
     samples = torch.where(is_unchanged, domain.start, samples)
     return torch.stack([domain.project(u) for u in samples])

@@ -201,7 +201,12 @@ class Augmentation:
         shift_x, shift_y = relative_shift.view(2, count) * max_shift
         is_mirrored = _choose(self.flip, count, generator)
         mirror = 1.0 - 2.0 * is_mirrored.float()  # -1 or 1
-        degrees = _uniform(-self.max_rotation_degrees, self.max_rotation_degrees, count, generator=generator)
+        degrees = _uniform(
+            -self.max_rotation_degrees,
+            self.max_rotation_degrees,
+            count,
+            generator=generator,
+        )
         angle = degrees * (math.pi / 180.0)
         cosine = scale * angle.cos()
         sine = scale * angle.sin()
@@ -221,7 +226,13 @@ class Augmentation:
         """Change contrast, brightness and color of images (N, 3, H, W)."""
         count = len(x)
         contrast = _uniform(-self.contrast, self.contrast, count, generator=generator)
-        color = _uniform(-self.max_channel_change, self.max_channel_change, count, 3, generator=generator)
+        color = _uniform(
+            -self.max_channel_change,
+            self.max_channel_change,
+            count,
+            3,
+            generator=generator,
+        )
         brightness = _uniform(
             -self.brightness, self.brightness, count, generator=generator
         )

@@ -163,13 +163,19 @@ class Trainer(ABC):
             tick: function that is called after each step, for the progress.
         """
         parameters = self.student.parameters()
-        optimizer, schedule = self._make_optimizer(parameters, self.count_steps(training_items))
+        optimizer, schedule = self._make_optimizer(
+            parameters, self.count_steps(training_items)
+        )
         average = [parameter.detach().clone() for parameter in parameters]
         # Gradients draw from the same generator, so an epoch is shuffled when it
         # begins, and not before.
-        rng = np.random.default_rng([seeds.derive_seed(self.config.seed, "order"), number])
+        rng = np.random.default_rng(
+            [seeds.derive_seed(self.config.seed, "order"), number]
+        )
         with self.open_gradient_context(new) as compute_gradient:
-            for n_steps, batch in enumerate(self._iterate_batches(training_items, rng), start=1):
+            for n_steps, batch in enumerate(
+                self._iterate_batches(training_items, rng), start=1
+            ):
                 compute_gradient(batch, rng)
                 # Without a limit, a few very wrong images could make a step so large
                 # that it undoes others.
@@ -320,7 +326,9 @@ class Rounds:
             if self.is_allowed(training_round.clean)
         ]
         return max(
-            allowed, key=lambda number: (self.finished_rounds[number].robust, number), default=0
+            allowed,
+            key=lambda number: (self.finished_rounds[number].robust, number),
+            default=0,
         )
 
     def is_allowed(self, clean: float) -> bool:
@@ -333,7 +341,9 @@ class Rounds:
 
         Afterwards the student has the best weights.
         """
-        n_trained_rounds = len(self.finished_rounds) - 1  # round 0 is the original model
+        n_trained_rounds = (
+            len(self.finished_rounds) - 1
+        )  # round 0 is the original model
         is_done = n_trained_rounds >= self.config.rounds
         if not is_done:
             self._run_rounds()

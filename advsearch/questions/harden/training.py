@@ -49,7 +49,10 @@ N_FIRST_STEPS = 4
 N_VALIDATION_STEPS = 8
 """Steps of the search for textures of the validation; it begins anew for all weights."""
 AUGMENTATION = Augmentation(
-    smallest_crop=0.75, largest_crop=1.15, max_rotation_degrees=15.0, cutout_probability=0.0
+    smallest_crop=0.75,
+    largest_crop=1.15,
+    max_rotation_degrees=15.0,
+    cutout_probability=0.0,
 )
 """Augmentation of training images. The search for worse images has the same."""
 ORIGINAL_MODEL_WEIGHT = 1.0

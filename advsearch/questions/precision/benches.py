@@ -100,7 +100,9 @@ class MeasuredRounds:
             for line, known in most_expensive.items()
         }
         highest = max(seconds_per_cost.values(), default=0.0)
-        return setting.relative_cost * seconds_per_cost.get(setting.estimator_key, highest)
+        return setting.relative_cost * seconds_per_cost.get(
+            setting.estimator_key, highest
+        )
 
     def fits_in_time(self, setting: SampleSetting, seconds_left: float) -> bool:
         """Return whether a new setting fits into the remaining time."""
@@ -342,7 +344,9 @@ class PictureBench:
             for line in {*self._estimators, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
         }
         self.settings = [
-            setting for line in self._estimators for setting in list_image_settings(line)
+            setting
+            for line in self._estimators
+            for setting in list_image_settings(line)
         ]
 
     def compute_references(

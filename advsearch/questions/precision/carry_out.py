@@ -87,7 +87,9 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     result = measurements.make_result_of_rows(
         measurer.measure_sittings(
             # a stored sitting is read; a new one is measured
-            lambda name, measure: measurements.get_or_measure_row(name, Sitting, measure)
+            lambda name, measure: measurements.get_or_measure_row(
+                name, Sitting, measure
+            )
         ),
         # makes the result from the sittings so far, after each of them
         lambda sittings: _make_result(context, measurer, sittings, setup_seconds),
@@ -408,7 +410,9 @@ class QuantityMeasurer:
             seed=seeds.derive_seed(self._seed, "confirm"),
             on_done=lambda _: advance(),
         )
-        samples = [numbers["gradient"] for numbers in measured.results_by_setting[setting]]
+        samples = [
+            numbers["gradient"] for numbers in measured.results_by_setting[setting]
+        ]
         if len(samples) < MIN_CONFIRMATIONS:
             return []
         reference_error = bench.get_reference_error(setting, "gradient")

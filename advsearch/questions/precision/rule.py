@@ -392,7 +392,8 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
     the steepest slope before.
     """
     known = sorted(
-        (point for point in points if point.has_known_error), key=lambda point: point.spp
+        (point for point in points if point.has_known_error),
+        key=lambda point: point.spp,
     )
     slopes = [
         math.log(b.rms_error / a.rms_error) / math.log(b.spp / a.spp)
@@ -600,7 +601,9 @@ def _interpolate_count(
         The number of samples, or None if it cannot be extrapolated; and whether it is
         "measured", "interpolated" or "extrapolated".
     """
-    indices_above = [index for index, point in enumerate(ordered) if point.rms_error > goal]
+    indices_above = [
+        index for index, point in enumerate(ordered) if point.rms_error > goal
+    ]
     if not indices_above:
         return float(ordered[0].spp), "measured"
     last_above = indices_above[-1]
@@ -609,7 +612,9 @@ def _interpolate_count(
     above = ordered[last_above]
     below = ordered[last_above + 1]
     # position of the goal between `above` (0) and `below` (1), on a logarithmic scale
-    fraction = math.log(above.rms_error / goal) / math.log(above.rms_error / below.rms_error)
+    fraction = math.log(above.rms_error / goal) / math.log(
+        above.rms_error / below.rms_error
+    )
     return above.spp * (below.spp / above.spp) ** fraction, "interpolated"
 
 

@@ -199,7 +199,10 @@ def _make_result(
         warnings=list(dict.fromkeys(warnings)),
     )
     # A run that was killed has no summary, and its seconds are unknown.
-    if context.resumed_directory is not None and (context.resumed_directory / "summary.json").is_file():
+    if (
+        context.resumed_directory is not None
+        and (context.resumed_directory / "summary.json").is_file()
+    ):
         previous = read_result(context.resumed_directory)
         previous_seconds = getattr(previous, "seconds", {"total": 0.0})
         result.seconds["total"] += previous_seconds["total"]

@@ -259,7 +259,11 @@ def _list_figures(result: RecipeResult) -> list[ResultPart]:
         rows = [list(map(_format_cell, figure.columns, row)) for row in figure.rows]
         sections.append(
             ResultPart(
-                "The numbers", column_heads=figure.columns, rows=rows, folded=True, only_medium="page"
+                "The numbers",
+                column_heads=figure.columns,
+                rows=rows,
+                folded=True,
+                only_medium="page",
             )
         )
     return sections

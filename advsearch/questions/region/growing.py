@@ -308,7 +308,9 @@ class RegionSearch:
             "exception; `samples` shortens it"
         )
         title = "checking the box with fresh samples"
-        self._verifier.progress_stages.begin("search", title, limit, hint=hint, at_most=True)
+        self._verifier.progress_stages.begin(
+            "search", title, limit, hint=hint, at_most=True
+        )
 
     def _is_same(self, values: Tensor, number: int) -> bool:
         """Return whether the verdict at a point is that of the center.
@@ -341,7 +343,9 @@ def find_verdict(verifier: workbench.Verifier, center: Tensor) -> bool:
         InputError: the prediction depends on the noise, or is not a number, or the
             object is not in the image.
     """
-    verifier.progress_stages.begin("verification", "looking at the centre", CENTER_TRIALS)
+    verifier.progress_stages.begin(
+        "verification", "looking at the centre", CENTER_TRIALS
+    )
     same_configurations = dict.fromkeys(range(CENTER_TRIALS), center)
     trials = list(
         verifier.try_configurations("centre", same_configurations, has_success=False)

@@ -189,7 +189,9 @@ def sampling_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]
     """Yield conditions with a quarter and with four times the samples."""
     for other_spp in (max(1, spp // 4), min(workbench.MAX_SPP, 4 * spp)):
         if other_spp != spp:
-            yield make_image_condition(problem, "samples", f"{other_spp} a pixel", other_spp)
+            yield make_image_condition(
+                problem, "samples", f"{other_spp} a pixel", other_spp
+            )
 
 
 def resolution_conditions(

@@ -113,7 +113,10 @@ class Check(results.Fields):
 
 
 def check_range(
-    description: str, value: float, min_value: float | None = None, max_value: float | None = None
+    description: str,
+    value: float,
+    min_value: float | None = None,
+    max_value: float | None = None,
 ) -> Check:
     """Check that a number is in a range; NaN is in no range.
 
@@ -127,7 +130,9 @@ def check_range(
         ok = ok and min_value <= value
     if max_value is not None:
         ok = ok and value <= max_value
-    return Check(what=description, value=value, min_value=min_value, max_value=max_value, ok=ok)
+    return Check(
+        what=description, value=value, min_value=min_value, max_value=max_value, ok=ok
+    )
 
 
 def check_condition(description: str, is_met: bool) -> Check:

@@ -44,6 +44,7 @@ from advsearch.questions.stability.scene import (
     ControlSettings,
     check_scene,
     compare_gradient,
+    compute_mean_difference,
     describe_mug,
     evaluate,
     make_checkered_mug,
@@ -53,7 +54,6 @@ from advsearch.questions.stability.scene import (
     make_gray_environment,
     make_mesh,
     make_renderer,
-    compute_mean_difference,
     measure_inward_slope,
     render_image,
     run_search,
@@ -136,7 +136,11 @@ register_cases(
                 "mean": (0.01, None),
             },
         ),
-        ("camera-exposure-up", FINITE_AND_RIGHT, make_exposure_arguments("camera", 9.0, 10.0)),
+        (
+            "camera-exposure-up",
+            FINITE_AND_RIGHT,
+            make_exposure_arguments("camera", 9.0, 10.0),
+        ),
         (
             "camera-exposure-down",
             FINITE_AND_RIGHT,
@@ -323,7 +327,9 @@ register_cases(
         (
             "perfect-mirror",
             "A metal of roughness 0 is finite, and both gradients are right.",
-            make_material_arguments(("roughness", "metallic"), roughness=0.0, metallic=1.0),
+            make_material_arguments(
+                ("roughness", "metallic"), roughness=0.0, metallic=1.0
+            ),
         ),
     ],
 )
@@ -448,7 +454,11 @@ register_cases(
         ("projector-full", FINITE, make_projector_arguments()),
         ("projector-one-texel", FINITE, make_projector_arguments(CENTER_TEXEL)),
         ("projector-grazing", FINITE, make_projector_arguments(elevation=0.5)),
-        ("projector-behind-the-object", FINITE, make_projector_arguments(azimuth=220.0)),
+        (
+            "projector-behind-the-object",
+            FINITE,
+            make_projector_arguments(azimuth=220.0),
+        ),
         (
             "projector-inside-the-object",
             FINITE,
@@ -493,7 +503,9 @@ register_cases(
 @register_case("light", "projector-through-glass")
 def project_through_glass() -> CaseOutcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
-    arguments = make_projector_arguments(azimuth=describe_mug().get_number("camera.azimuth"))
+    arguments = make_projector_arguments(
+        azimuth=describe_mug().get_number("camera.azimuth")
+    )
     return check_scene(**arguments, plugins=make_glass_ball())  # type: ignore[arg-type]
 
 
@@ -637,7 +649,11 @@ register_cases(
             "Two faces in one place look like one.",
             make_mesh_arguments(COINCIDENT_SQUARES, SQUARE),
         ),
-        ("one-triangle", "Finite, and both gradients are right.", make_mesh_arguments(TRIANGLE)),
+        (
+            "one-triangle",
+            "Finite, and both gradients are right.",
+            make_mesh_arguments(TRIANGLE),
+        ),
         (
             "scale-0.01",
             FINITE,
@@ -815,7 +831,9 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
     past_end = make_domain(renderer).project(full + 0.01)
     return check_scene(controls, u=[0.0], compare=False).with_checks(
         check_range(
-            "mean difference of the pictures", difference, max_value=MAX_PICTURE_DIFFERENCE
+            "mean difference of the pictures",
+            difference,
+            max_value=MAX_PICTURE_DIFFERENCE,
         ),
         check_range(
             "difference of the gradients",
@@ -1024,9 +1042,13 @@ def light_rotation_texel() -> CaseOutcome:
     return scene.with_checks(
         check_range("how far the power moved", float(distances[0]), min_value=0.05),
         check_range("how far the rotation moved", float(distances[1]), min_value=0.05),
-        check_range("how far the texels moved", float(distances[2:].max()), min_value=0.05),
         check_range(
-            "distance from the path of the objective x 1e6", path_difference, max_value=1e-3
+            "how far the texels moved", float(distances[2:].max()), min_value=0.05
+        ),
+        check_range(
+            "distance from the path of the objective x 1e6",
+            path_difference,
+            max_value=1e-3,
         ),
         ending=ending,
         measurements={

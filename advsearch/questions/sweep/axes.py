@@ -548,11 +548,16 @@ class SampledNumber:
     def varied_value(self) -> VariedValue:
         """The range or the options that the value was sampled from."""
         bounds = [
-            bound for part in self.range_parts if isinstance(part, list) for bound in part
+            bound
+            for part in self.range_parts
+            if isinstance(part, list)
+            for bound in part
         ]
         if bounds:
             return VariedValue(unit=self.unit, low=min(bounds), high=max(bounds))
-        return VariedValue(unit=self.unit, names=[str(part) for part in self.range_parts])
+        return VariedValue(
+            unit=self.unit, names=[str(part) for part in self.range_parts]
+        )
 
     @property
     def part_bounds(self) -> list[float] | None:
@@ -682,7 +687,8 @@ class SceneConfigurations:
         # of each sampled number: its column among the draws, and its number of bins
         self._columns = [number.draw_column for number in self.sampled_numbers]
         n_bins = [
-            len(number.part_of_bin or number.range_parts) for number in self.sampled_numbers
+            len(number.part_of_bin or number.range_parts)
+            for number in self.sampled_numbers
         ]
         self._n_bins = np.array(n_bins, dtype=np.int64)
         self._description_cache: dict[tuple[object, ...], Mapping[str, Value]] = {}
@@ -942,7 +948,9 @@ class SceneConfigurations:
         block = sampled.block
         if block.n_options:
             # a uniform number of exactly 1 belongs to the last option
-            option = np.minimum(np.floor(uniform * block.n_options), block.n_options - 1)
+            option = np.minimum(
+                np.floor(uniform * block.n_options), block.n_options - 1
+            )
             return np.asarray((option + 0.5) / block.n_options)
         # Only a ball has an epsilon; the type checker needs the second condition.
         if block.norm != "l2" or block.epsilon is None:

@@ -29,7 +29,11 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import convert_to_setting
 from advsearch.progress import NullProgress, Progress, ProgressOption, as_progress
-from advsearch.questions.attack.carry_out import LOADING, is_describable_by_setting, open_executor
+from advsearch.questions.attack.carry_out import (
+    LOADING,
+    is_describable_by_setting,
+    open_executor,
+)
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import load_attack_summary
@@ -558,7 +562,10 @@ def _add_adversarial_arm(
         replace(named_scene, fixed_controls=fixed_controls, arm=CLEAN)
         for named_scene in named_scenes
     ]
-    adversarial = [replace(named_scene, adversarial_configuration=u, arm=arm) for named_scene in clean]
+    adversarial = [
+        replace(named_scene, adversarial_configuration=u, arm=arm)
+        for named_scene in clean
+    ]
     return (*clean, *adversarial)
 
 
@@ -773,7 +780,9 @@ def _load_models_and_tasks(
         for network in networks
     )
     # A task of each thing has no remarks itself, so they are collected before.
-    warnings += [remark for network_task in tasks for remark in network_task.output_remarks]
+    warnings += [
+        remark for network_task in tasks for remark in network_task.output_remarks
+    ]
     if config.judge == ALL_THINGS:
         tasks = tuple(map(make_each_thing_task, tasks))
     labels = {

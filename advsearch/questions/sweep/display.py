@@ -49,8 +49,8 @@ from advsearch.report.views import (
     Extent,
     ResultPart,
     ShownResult,
-    make_claim,
     format_extent,
+    make_claim,
     make_rate_extent,
 )
 from advsearch.report.wording import (
@@ -309,7 +309,9 @@ def make_sweep_view(summary: SweepSummary) -> ShownResult:
                 only_medium="notebook",
             )
         )
-    sections += (replace(part, only_medium="page") for part in _make_page_parts(summary, axes))
+    sections += (
+        replace(part, only_medium="page") for part in _make_page_parts(summary, axes)
+    )
     run_images = f"{summary.run}/images"
     has_drive_file = bool(summary.drives and summary.run)
     # Facts with an empty text are left out.
@@ -353,7 +355,9 @@ def _make_text_sections(
     if distance:
         yield ResultPart(text=[describe_detection_distance(distance)])
     for rates in summary.drives or ():
-        yield ResultPart(drive_title(rates), column_heads=DRIVE_HEADS, rows=make_drive_rows(rates))
+        yield ResultPart(
+            drive_title(rates), column_heads=DRIVE_HEADS, rows=make_drive_rows(rates)
+        )
     yield ResultPart.make_table(
         summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
     )

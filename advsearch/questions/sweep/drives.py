@@ -273,7 +273,9 @@ class Drives:
         for scene, named_scene in enumerate(job.scenes):
             for model, task in enumerate(job.tasks):
                 if isinstance(task, Detection):
-                    classes = task.find_right_classes(job.make_ground_truth_facts(named_scene, {}))
+                    classes = task.find_right_classes(
+                        job.make_ground_truth_facts(named_scene, {})
+                    )
                     right_names[scene, model] = task.get_class_names(classes)
         return right_names
 

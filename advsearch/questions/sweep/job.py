@@ -28,7 +28,12 @@ from advsearch.models import Model
 from advsearch.models.features import Features, features_of
 from advsearch.options import Value
 from advsearch.progress import Stages
-from advsearch.questions.sweep.axes import Axis, SceneConfigurations, SampledNumber, add_grid_axes
+from advsearch.questions.sweep.axes import (
+    Axis,
+    SampledNumber,
+    SceneConfigurations,
+    add_grid_axes,
+)
 from advsearch.questions.sweep.predicting import SweepPredictor, SweptImage
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified
@@ -156,7 +161,9 @@ class Job:
         """The seeds of the noise, by the number of the image."""
         return SeedSequence(self.config.seed, KIND)
 
-    def load_configurations_by_size(self, scene: int) -> dict[ImageSize, SceneConfigurations]:
+    def load_configurations_by_size(
+        self, scene: int
+    ) -> dict[ImageSize, SceneConfigurations]:
         """Return the configurations of a scene, by the size of the images.
 
         Those of the last scene are cached.
@@ -166,7 +173,9 @@ class Job:
             named_scene = self.scenes[scene]
             sizes = dict.fromkeys(self.image_sizes)
             self._points_by_scene[scene] = {
-                size: self.make_scene_configurations(self.bind_controls(named_scene, size))
+                size: self.make_scene_configurations(
+                    self.bind_controls(named_scene, size)
+                )
                 for size in sizes
             }
         return self._points_by_scene[scene]
@@ -331,7 +340,9 @@ class Job:
             n_photographs=len({scene.photograph_name for scene in self.scenes}),
         )
 
-    def make_ground_truth_facts(self, named_scene: NamedScene, values: Mapping[str, Value]) -> Facts:
+    def make_ground_truth_facts(
+        self, named_scene: NamedScene, values: Mapping[str, Value]
+    ) -> Facts:
         """Return what a task needs to know about a scene.
 
         Args:
@@ -453,7 +464,8 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
     scenes_and_points = list[tuple[NamedScene, SceneConfigurations]]()
     for scene, named_scene in enumerate(job.scenes):
         scenes_and_points += [
-            (named_scene, points) for points in job.load_configurations_by_size(scene).values()
+            (named_scene, points)
+            for points in job.load_configurations_by_size(scene).values()
         ]
         facts = job.make_ground_truth_facts(named_scene, {})
         for task, model in zip(job.tasks, job.models, strict=True):
@@ -594,7 +606,8 @@ class SweptScene:
         not_finite_before = self.n_non_finite
         n_models = len(self.job.models)
         images = {
-            size: self._make_images(size, queries) for size in self.configurations_by_size
+            size: self._make_images(size, queries)
+            for size in self.configurations_by_size
         }
         judgements = self._make_judgements(queries, images)
         # queries are numbered by image, then by model
@@ -684,7 +697,10 @@ class SweptScene:
             if not model_queries:
                 continue
             batch = torch.stack(
-                [images[size][query.row_index // n_models].image for query in model_queries]
+                [
+                    images[size][query.row_index // n_models].image
+                    for query in model_queries
+                ]
             )
             judgements = problem.judge_images(
                 batch,

@@ -132,7 +132,9 @@ class Sweep:
         self.first_scene_configurations, self._sampled_numbers = check_job(job)
         self.images_per_scene = self.first_scene_configurations.n_images
         self.n_models = len(job.models)
-        self.independent_units = replace(self.first_scene_configurations.independent_units, models=self.n_models)
+        self.independent_units = replace(
+            self.first_scene_configurations.independent_units, models=self.n_models
+        )
         self.n_rows = len(job.scenes) * self.images_per_scene * self.n_models
         if run is not None:
             self._write_notes(run)
@@ -450,7 +452,8 @@ class Sweep:
         """
         for name in ("object", "environment", "backdrop", "answer"):
             scene_values = [
-                named_scene.value_of_scene_axis.get(name, "") for named_scene in self.job.scenes
+                named_scene.value_of_scene_axis.get(name, "")
+                for named_scene in self.job.scenes
             ]
             values = list(dict.fromkeys(scene_values))
             index_of_scene = np.array([values.index(value) for value in scene_values])
@@ -466,7 +469,9 @@ class Sweep:
             return []
         # The samples of a grid point are consecutive images.
         grid_point = image // self.job.samples_per_grid_point
-        indices = np.unravel_index(grid_point, self.first_scene_configurations.grid.sizes)
+        indices = np.unravel_index(
+            grid_point, self.first_scene_configurations.grid.sizes
+        )
         return [
             TableAxis(
                 name=axis.name,
@@ -493,7 +498,11 @@ class Sweep:
             scene_end = scene_begin + self.images_per_scene
             for batch in split_into_batches(scene_begin, scene_end, SAMPLING_BATCH):
                 if batch.start <= last_image:
-                    parts.append(self.first_scene_configurations.find_parts(batch.start, len(batch)))
+                    parts.append(
+                        self.first_scene_configurations.find_parts(
+                            batch.start, len(batch)
+                        )
+                    )
         return np.asarray(np.concatenate(parts)[images])
 
     def _find_worst(
@@ -624,7 +633,9 @@ class Sweep:
             surface=self._surface,
             drives=self._drives,
             changes=changes or None,
-            shared=SharedWork.from_worker_stats(self._executor.stats, self.journal.machines),
+            shared=SharedWork.from_worker_stats(
+                self._executor.stats, self.journal.machines
+            ),
             renders_per_second=self._compute_speed(
                 self.stages.seconds.get("sweep", 0.0)
             ),
@@ -654,7 +665,9 @@ class Sweep:
             "planned": self.n_rows,
             "grid": {axis.name: len(axis.values) for axis in job.axes},
             "samples": job.samples_per_grid_point,
-            "sampler": config.sampler if self.first_scene_configurations.is_sampled else None,
+            "sampler": config.sampler
+            if self.first_scene_configurations.is_sampled
+            else None,
             "spp": job.spp,
             "seed": config.seed,
         }
@@ -685,7 +698,10 @@ class Sweep:
     @property
     def _environment(self) -> str:
         """Names of the environments: those a control chooses, or those of settings."""
-        return self.first_scene_configurations.environment or self.job.config.environment_name
+        return (
+            self.first_scene_configurations.environment
+            or self.job.config.environment_name
+        )
 
     def _find_twins(self) -> TwinEvidence | None:
         """Return how far results on renders hold for photographs.
@@ -839,7 +855,9 @@ class Sweep:
         # `noise` is the number of images of a draw, which differ only in noise.
         if self.independent_units.noise > 1 and self.independent_units.photographs == 1:
             n_units = self.n_rows // self.independent_units.size
-            yield explain_repeats(self.independent_units.name, self.independent_units.noise, n_units)
+            yield explain_repeats(
+                self.independent_units.name, self.independent_units.noise, n_units
+            )
         yield from self._list_drive_remarks()
         yield from self._list_prediction_remarks(predictions)
         if self._has_non_finite:
@@ -925,7 +943,9 @@ def _pair_evaluations(batch: BatchResult) -> list[tuple[Query, Evaluation]]:
     queries = [query for _, _, query in batch.items]
     evaluations = batch.value
     if batch.failure_reason:  # the reason, as a text
-        evaluations = [make_lost_evaluation(query, batch.failure_reason) for query in queries]
+        evaluations = [
+            make_lost_evaluation(query, batch.failure_reason) for query in queries
+        ]
     return [
         (query, replace(evaluation, machine=batch.machine))
         for query, evaluation in zip(queries, evaluations, strict=True)

@@ -18,7 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.questions.sweep.display import format_grid_caution, describe_wrong_outcomes, format_accuracy
+from advsearch.questions.sweep.display import (
+    describe_wrong_outcomes,
+    format_accuracy,
+    format_grid_caution,
+)
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
 from advsearch.report.views import Html, join_html, make_element
@@ -38,8 +42,8 @@ from advsearch.viewer.document import (
     make_data_script,
     make_data_url,
     make_document,
-    remarks_html,
     make_subject_html,
+    remarks_html,
 )
 from advsearch.viewer.pages import make_page_end, make_part, make_run_page
 from advsearch.viewer.thumbnails import (
@@ -246,7 +250,9 @@ def _page_parts_html(path: Path, summary: SweepSummary) -> list[Html | None]:
     """Return the parts that only a page shows, and its end: how to repeat the run."""
     view = make_view(summary)
     page_parts = [
-        part for part in view.sections if part.only_medium == "page" and not part.is_empty
+        part
+        for part in view.sections
+        if part.only_medium == "page" and not part.is_empty
     ]
     return [
         *(make_part(path, part, view.statement) for part in page_parts),

@@ -57,7 +57,11 @@ from advsearch.scene.surface.renderer import (
     find_changed_inputs,
     find_scene_refusal,
 )
-from advsearch.scene.transport.lights import BasisRenderer, LightBasis, find_light_groups
+from advsearch.scene.transport.lights import (
+    BasisRenderer,
+    LightBasis,
+    find_light_groups,
+)
 from advsearch.scene.transport.matrix import COLLECTED_SPP
 from advsearch.trust.stored_files import scale_limit
 
@@ -393,7 +397,9 @@ class LightOnSurfaces:
             seed: not used; all arrangements have the same rays.
         """
         with torch.no_grad():
-            inputs = self._renderer.scene.input_assembler(self._renderer.space.inputs(u))
+            inputs = self._renderer.scene.input_assembler(
+                self._renderer.space.inputs(u)
+            )
             for arrangement in self._arrangements:
                 if arrangement.is_applicable(inputs):
                     return arrangement.with_fixed_light(inputs)
@@ -537,7 +543,9 @@ class SweepPredictor:
                 group = self._groups.find_group_of_image(number)
                 predictor = self._load_predictor(group, number)
             if predictor is None:
-                image = self.renderer(query.u, seed=query.seed, spp=self.problem.search_spp)
+                image = self.renderer(
+                    query.u, seed=query.seed, spp=self.problem.search_spp
+                )
                 # A predictor of its group may have been traced, and then rejected.
                 n_traced = self._count_traced(number) + 1
                 images[number] = SweptImage(image, prediction_spp=0, n_traced=n_traced)

@@ -325,7 +325,9 @@ class TableAxis:
         predictions = pd.DataFrame({"right": right, "unit": units, "outcome": outcome})
         axis_rows = list[AxisRow]()
         for index, group in predictions.groupby(self.value_index):
-            counts = count_predictions(group.right, group.unit, group.outcome.to_numpy())
+            counts = count_predictions(
+                group.right, group.unit, group.outcome.to_numpy()
+            )
             axis_rows.append(
                 AxisRow(
                     axis=self.name,

@@ -16,8 +16,8 @@ from advsearch.runs.results import (
     Payload,
     RunResult,
     VerifiedRate,
-    make_fact_schema,
     key_validator,
+    make_fact_schema,
     optional_field,
 )
 

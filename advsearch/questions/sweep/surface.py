@@ -506,7 +506,9 @@ def _make_counts(
         # Each pair of an object and a model has a seed of its own, and so permutations
         # of its own.
         model_seeds = [
-            seeds.derive_seed(job.config.seed, "surface", object_index * n_models + model)
+            seeds.derive_seed(
+                job.config.seed, "surface", object_index * n_models + model
+            )
             for model in range(n_models)
         ]
         part_counts = [
@@ -523,7 +525,11 @@ def _find_draws(
     scenes: SceneLoader, wrong: npt.NDArray[np.int8], job: Job
 ) -> npt.NDArray[Any]:
     """Return the draw of each image, (scenes, images of a scene)."""
-    units = scenes.load_scene(0).configurations_by_size[job.image_sizes[0]].independent_units
+    units = (
+        scenes.load_scene(0)
+        .configurations_by_size[job.image_sizes[0]]
+        .independent_units
+    )
     image_numbers = np.arange(wrong[..., 0].size)
     return np.asarray(units.find_cluster(image_numbers)).reshape(wrong.shape[:2])
 
@@ -573,15 +579,17 @@ def _count_scene(
                 model for model in range(n_models) if job.image_sizes[model] == size
             ]
             # The scenes before this one have the same number of images each.
-            configurations = swept_scene.configurations_by_size[size].make_configurations(
-                batch.start, len(batch), before=scene * n_images
-            )
+            configurations = swept_scene.configurations_by_size[
+                size
+            ].make_configurations(batch.start, len(batch), before=scene * n_images)
             # at least `MIN_RAYS` rays along the shorter side of the image
             rays_per_pixel = ceil(MIN_RAYS / min(size))
             renderer = swept_scene.renderer_of_size[size]
             for number_in_scene, u in zip(batch, configurations, strict=True):
                 surfaces = renderer.find_surfaces(u, rays_per_pixel)
-                counts.add_image(surfaces, _select_known(wrong[number_in_scene], models))
+                counts.add_image(
+                    surfaces, _select_known(wrong[number_in_scene], models)
+                )
         progress.advance(len(batch) * n_models)
 
 

@@ -94,7 +94,9 @@ def try_suite(
         workbench.read_twins(config.twins)
     # A resumed run tests the suite with which it has started, even if the file has
     # changed since.
-    loaded_suite = _read_noted_suite(context.resumed_directory) or suite or _read_suite(config)
+    loaded_suite = (
+        _read_noted_suite(context.resumed_directory) or suite or _read_suite(config)
+    )
     added = None
     if config.add is not None:
         added = counterexamples.add_counterexample(config.suite, config.add)
@@ -256,7 +258,9 @@ class _SuiteRun:
             )
         else:
             assert isinstance(claim.config, AttackConfig)
-            tested = tester.test_counterexample(pending, claim.counterexample, claim.config)
+            tested = tester.test_counterexample(
+                pending, claim.counterexample, claim.config
+            )
         if tested.cause is Cause.INTERRUPTED:
             raise KeyboardInterrupt  # Ctrl-C in a part of the run ends all of it
         tested = tested.model_copy(update={"seconds": time.perf_counter() - start})

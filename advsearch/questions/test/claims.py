@@ -339,7 +339,9 @@ class ClaimTester:
         sequence = statistics.sequential.ConfidenceSequence(
             self.suite.confidence, sides=1
         )
-        with self._open_evaluations(untested_result.name, claim, config, problem) as evaluated:
+        with self._open_evaluations(
+            untested_result.name, claim, config, problem
+        ) as evaluated:
             sample = self._sample_pictures(evaluated, claim, sequence)
 
         example = ""
@@ -561,7 +563,10 @@ class ClaimTester:
                 return
 
     def test_counterexample(
-        self, untested_result: ClaimResult, example: Counterexample, config: AttackConfig
+        self,
+        untested_result: ClaimResult,
+        example: Counterexample,
+        config: AttackConfig,
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
 

@@ -471,7 +471,8 @@ class Comparison:
         """
         item = selection.objects[numbers[0]]
         film = rendering.choose_film(
-            [selection.window_by_row_number[number] for number in numbers], item.camera.pixel_aspect
+            [selection.window_by_row_number[number] for number in numbers],
+            item.camera.pixel_aspect,
         )
         return renderer_type(
             self._load_asset(item),

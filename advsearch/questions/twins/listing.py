@@ -486,7 +486,9 @@ def _read_row_camera(
     model = workbench.read_camera(str(file))
     # These are fractions of the width and the height.
     lens = {key: model.intrinsic_by_name[key] for key in ("fx", "fy", "cx", "cy")}
-    distortion = [value for key, value in model.intrinsic_by_name.items() if key not in lens]
+    distortion = [
+        value for key, value in model.intrinsic_by_name.items() if key not in lens
+    ]
     if any(distortion) or model.kind != PINHOLE_KIND:
         raise InputError(
             f"{where}: camera: expected a pinhole, got a lens with distortion; "

@@ -258,7 +258,9 @@ class LayerRenderer:
         return Layer(
             composed=composed,
             alpha=rendered[..., 3].clamp(0.0, 1.0),
-            visible_surface=_make_sight(surfaces, self._asset.size_in_metres, model_size),
+            visible_surface=_make_sight(
+                surfaces, self._asset.size_in_metres, model_size
+            ),
         )
 
     def _make_image_inputs(
@@ -387,7 +389,9 @@ def make_twin(
         silhouette_size_pixels=math.sqrt(float(layer.alpha.sum())),
         brightness=float(difference.mean()) if len(difference) else 0.0,
         contrast=float(around.std()) if len(around) > 1 else 0.0,
-        texture_correlation=correlate_luminance(layer.composed[is_covered], crop[is_covered]),
+        texture_correlation=correlate_luminance(
+            layer.composed[is_covered], crop[is_covered]
+        ),
     )
 
 

@@ -366,7 +366,9 @@ def make_agreement_part(table: Sequence[results.TwinAgreement]) -> ResultPart:
         rows.append(
             _make_agreement_cells(total, f"{prefix}{_name_surroundings(total)}")
         )
-    return ResultPart("How far twins hold", column_heads=HEADS, rows=rows, note=TABLE_NOTE)
+    return ResultPart(
+        "How far twins hold", column_heads=HEADS, rows=rows, note=TABLE_NOTE
+    )
 
 
 def _list_totals(
@@ -397,7 +399,9 @@ def _make_group_parts(table: Sequence[results.TwinAgreement]) -> Iterator[Result
                     rows.append(_make_agreement_cells(row, group))
             title = f"By {kind}: {name}"
             heads = (kind, *HEADS[1:])
-            yield ResultPart(title, column_heads=heads, rows=rows, folded=True, only_medium="page")
+            yield ResultPart(
+                title, column_heads=heads, rows=rows, folded=True, only_medium="page"
+            )
 
 
 def _make_factor_part(result: TwinsResult) -> ResultPart:

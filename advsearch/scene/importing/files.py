@@ -239,7 +239,9 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     # The advice is about programs that export meshes.
     advice = None if what == "environment" else find_advice(Path(file))
     if advice is not None:
-        raise FileFormatError(f"{path}: {advice} (supported are {join_alternatives(suffixes)})")
+        raise FileFormatError(
+            f"{path}: {advice} (supported are {join_alternatives(suffixes)})"
+        )
     got = f"got {path.suffix!r}" if path.suffix else "got a name without a suffix"
     raise FileFormatError(
         f"{path}: expected an {what} file ending in {join_alternatives(suffixes)}, {got}; "

@@ -394,7 +394,9 @@ class MaterialEntry(Entry):
         of the emission.
         """
         return (
-            self.metallic_roughness.baseColorTexture or self.normalTexture or self.emissiveTexture
+            self.metallic_roughness.baseColorTexture
+            or self.normalTexture
+            or self.emissiveTexture
         )
 
     @property

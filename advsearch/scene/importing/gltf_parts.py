@@ -156,7 +156,8 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
         ),
         "emission texture{s} with other coordinates than the base colour: left out, "
         "with the emission": (
-            any(material.emission) and not material.shares_layout(material.emissiveTexture)
+            any(material.emission)
+            and not material.shares_layout(material.emissiveTexture)
             for material in materials
         ),
         "material{s} with an alphaMode that glTF does not have: opaque": (

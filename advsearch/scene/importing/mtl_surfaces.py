@@ -254,7 +254,9 @@ class MtlReader:
         )
         return MtlSurface(surface, first_use.scale, first_use.offset, is_clamped)
 
-    def _parse_uses(self, material: MtlMaterial, square: int) -> dict[str, MapStatement]:
+    def _parse_uses(
+        self, material: MtlMaterial, square: int
+    ) -> dict[str, MapStatement]:
         """Return the maps of a material by keyword, with the images of a UDIM square.
 
         The maps are marked as read, so that they are not noted. Normal maps are not:
@@ -265,7 +267,9 @@ class MtlReader:
             use = self._parse_use(material, key)
             if use is not None:
                 uses[key] = use
-        material.tracked_statements.mark_read(*(key for key in uses if key not in NORMAL_MAPS))
+        material.tracked_statements.mark_read(
+            *(key for key in uses if key not in NORMAL_MAPS)
+        )
         # `_note_unread` notes some values of illum, but not the statement itself.
         material.tracked_statements.mark_read("illum")
         if square:
@@ -276,7 +280,10 @@ class MtlReader:
         return uses
 
     def _drop_other_layouts(
-        self, material: MtlMaterial, uses: dict[str, MapStatement], first_use: MapStatement
+        self,
+        material: MtlMaterial,
+        uses: dict[str, MapStatement],
+        first_use: MapStatement,
     ) -> None:
         """Remove maps whose texture coordinates differ from those of the first.
 
@@ -324,7 +331,10 @@ class MtlReader:
         )
         texture = self._load_image(use, "colours and alpha", note_template)
         if use is not None and texture is not None:
-            if texture[:, :, 3].min() < 1.0 and "map_d" not in material.argument_by_keyword:
+            if (
+                texture[:, :, 3].min() < 1.0
+                and "map_d" not in material.argument_by_keyword
+            ):
                 self.notes.warn(
                     f"the alpha of {format_name(use.name)} is left out: no map_d "
                     "makes it an opacity"
@@ -359,9 +369,13 @@ class MtlReader:
         illumination models above 2, such as ray-traced glass.
         """
         zero_keys = {
-            key for key in material.argument_by_keyword if _is_zero(material.peek_argument(key))
+            key
+            for key in material.argument_by_keyword
+            if _is_zero(material.peek_argument(key))
         }
-        base_map = parse_map(without_comment(material.argument_by_keyword.get("map_kd", "")))
+        base_map = parse_map(
+            without_comment(material.argument_by_keyword.get("map_kd", ""))
+        )
 
         def is_without_effect(key: str, statement: str) -> bool:
             """Return whether a statement changes nothing."""
@@ -386,7 +400,8 @@ class MtlReader:
             self.notes.record("fourth number of", material.spelling["kd"])
         if material.peek_argument("illum") not in ("", "0", "1", "2"):
             self.notes.record(
-                "illumination model", without_comment(material.argument_by_keyword["illum"])
+                "illumination model",
+                without_comment(material.argument_by_keyword["illum"]),
             )
         for name in material.tracked_statements.find_unread(is_without_effect):
             self.notes.record("material statement", name)
@@ -404,7 +419,9 @@ class MtlReader:
         use = parse_map(without_comment(statement))
         use_with_comment = parse_map(statement)
         if use_with_comment is not None and use_with_comment != use:
-            if isinstance(self.references.read_or_explain(use_with_comment.name), bytes):
+            if isinstance(
+                self.references.read_or_explain(use_with_comment.name), bytes
+            ):
                 use = use_with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
         if use is not None:
@@ -639,7 +656,7 @@ class MtlReader:
         return np.concatenate([colors, image[:, :, 3:]], axis=2)
 
 
-def _select_channel(picture: Float32Array, use: MapUse) -> Float32Array:
+def _select_channel(picture: Float32Array, use: MapStatement) -> Float32Array:
     """Return the values (H, W) of an image for a map of numbers.
 
     They are those of the channel that ``-imfchan`` names, such as "r". Without this
@@ -718,7 +735,9 @@ def _split_libraries(line: str) -> list[str]:
 
 FIRST_SQUARE = 1001
 SQUARES_PER_ROW = 10
-PLACEHOLDER_SQUARE = 0  # result of `parse_udim_square` for a name that stands for all squares
+PLACEHOLDER_SQUARE = (
+    0  # result of `parse_udim_square` for a name that stands for all squares
+)
 _SQUARE_NUMBER = re.compile(r"(?<!\d)1\d{3}(?=\.\w+$)")
 _PLACEHOLDER = re.compile(r"<UDIM>", re.IGNORECASE)
 
@@ -873,7 +892,9 @@ def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
         elif materials:
             material = materials[-1]
             value = argument.strip()
-            if material.argument_by_keyword.get(key, value) != value:  # an earlier one differs
+            if (
+                material.argument_by_keyword.get(key, value) != value
+            ):  # an earlier one differs
                 material.overridden.append(keyword)
             material.argument_by_keyword[key] = value
             material.spelling[key] = keyword

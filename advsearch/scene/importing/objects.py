@@ -39,12 +39,12 @@ from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.files import Notes, format_name, make_safe_name
 from advsearch.scene.importing.geometry import (
     TriangleSoup,
-    make_mesh_from_soup,
     compute_extent,
     compute_rotation,
     find_used,
     join_parts,
     list_used_vertices,
+    make_mesh_from_soup,
     repair_soup,
 )
 from advsearch.scene.importing.gltf_entries import Header
@@ -178,7 +178,9 @@ VRM_0 = "VRM"  # extensions of glTF
 VRM_1 = "VRMC_vrm"
 
 
-def find_front_axis(path: Path, header: Header | None, up: str | None = None) -> FileAxis:
+def find_front_axis(
+    path: Path, header: Header | None, up: str | None = None
+) -> FileAxis:
     """Return the axis along which the front of an object faces, as its format defines.
 
     The front of a glTF asset faces +Z (Khronos, glTF 2.0, section 3.4), which is -Y in

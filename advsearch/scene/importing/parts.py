@@ -403,6 +403,8 @@ def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntA
             _, corner_number = np.unique(corner_number, return_inverse=True)
             corner_number = corner_number.reshape(-1)
             bound = len(corner_number)
-        corner_number = corner_number * base + indexed.row_of_corner[triangles].reshape(-1) + 1
+        corner_number = (
+            corner_number * base + indexed.row_of_corner[triangles].reshape(-1) + 1
+        )
         bound *= base
     return corner_number

@@ -311,7 +311,9 @@ class FileImages:
         self, name: str, kind: ImageKind, message: str
     ) -> Float32Array | None:
         """Return the values of an image that the file names; see `load`."""
-        return self.load_image(name, lambda: self.references.read_file(name), kind, name, message)
+        return self.load_image(
+            name, lambda: self.references.read_file(name), kind, name, message
+        )
 
     def load_image(
         self,

@@ -221,7 +221,8 @@ class _RowReader:
         """Make the views of the bytes, and find the sizes of scalars and counts."""
         element = self.element
         self.values = {
-            name: self._view_from_any_byte(kind) for name, kind in element.type_by_property.items()
+            name: self._view_from_any_byte(kind)
+            for name, kind in element.type_by_property.items()
         }
         self.counts = {
             name: self._view_from_any_byte(kind)
@@ -487,7 +488,9 @@ def _make_parts(
     for group in group_faces(texture, has_uvs):
         surface = surfaces[texture[group[0]]]
         surface, tint = _combine_colors(surface, colors, group, notes)
-        parts.append(make_part_from_corners(group, position, normal, uvs, tint, surface))
+        parts.append(
+            make_part_from_corners(group, position, normal, uvs, tint, surface)
+        )
     return parts
 
 

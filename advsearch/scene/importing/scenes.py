@@ -243,7 +243,9 @@ def _find_node(
         UnknownNameError: no candidate has the name.
         InputError: several candidates have the name.
     """
-    candidates = sorted(with_ancestors(header.parent_of_node, {part.node for part in parts}))
+    candidates = sorted(
+        with_ancestors(header.parent_of_node, {part.node for part in parts})
+    )
     labels = {index: header.get_node_label(index) for index in candidates}
     matches = [
         index for index, label in labels.items() if name in (label, f"node {index}")
@@ -394,13 +396,17 @@ def read_file_contents(path: Path) -> FileContents:
     parts_of_node = _group_by_node(parts)
     mesh_names = _make_mesh_names(header, parts, UniqueNames(RESERVED_NAMES))
     nodes = [
-        _measure_node(header.get_node_label(index), mesh_names[index], parts_of_node[index])
+        _measure_node(
+            header.get_node_label(index), mesh_names[index], parts_of_node[index]
+        )
         for index in sorted(parts_of_node)
     ]
     lights = tuple(
         light.name or f"light {index}" for index, light in enumerate(header.lights)
     )
-    cameras = tuple(_make_camera_names(header, dict(iterate_node_poses(header))).values())
+    cameras = tuple(
+        _make_camera_names(header, dict(iterate_node_poses(header))).values()
+    )
     return FileContents(asset, tuple(nodes), lights, cameras)
 
 

@@ -204,7 +204,10 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     return [
         _make_part(triangles, group, reader, names_libraries)
         for group in group_faces(
-            triangles.material_index, triangles.has_uvs, triangles.is_flat, triangles.udim_square
+            triangles.material_index,
+            triangles.has_uvs,
+            triangles.is_flat,
+            triangles.udim_square,
         )
     ]
 
@@ -819,7 +822,8 @@ class ObjLines:
         `read_faces`.
         """
         counts_before_line = np.stack(
-            [np.cumsum(self.kind_of_line == KINDS.index(kind)) for kind in TABLES], axis=1
+            [np.cumsum(self.kind_of_line == KINDS.index(kind)) for kind in TABLES],
+            axis=1,
         )
         for line_number, words in self._iterate_words(rows):
             row = line_number - 1

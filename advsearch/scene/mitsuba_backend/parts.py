@@ -213,7 +213,9 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
     if meshes.has_textured_emission(part):
         inputs.append(
             SceneInput(
-                f"{name}.radiance", f"{name}.emitter.radiance.data", has_interior_adjoint=True
+                f"{name}.radiance",
+                f"{name}.emitter.radiance.data",
+                has_interior_adjoint=True,
             )
         )
     elif part.emission is not None:
@@ -776,12 +778,22 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 
     camera_inputs = [
-        SceneInput(f"camera.{name}", f"camera.{key}", convert_to_mitsuba=to_flat_array, shape=(1,))
+        SceneInput(
+            f"camera.{name}",
+            f"camera.{key}",
+            convert_to_mitsuba=to_flat_array,
+            shape=(1,),
+        )
         for name, key in CAMERA_KEYS.items()
     ]
     return (
         _make_pose_input("camera", "to_world"),
-        SceneInput("camera.fov", "camera.x_fov", convert_to_mitsuba=to_horizontal_fov, shape=(1,)),
+        SceneInput(
+            "camera.fov",
+            "camera.x_fov",
+            convert_to_mitsuba=to_horizontal_fov,
+            shape=(1,),
+        ),
         SceneInput("camera.lens", "camera.lens", shape=(len(NUMBER_NAMES),)),
         *camera_inputs,
         # (H, W + 2, 3): a copy of the last column before the first, and of the first
@@ -791,6 +803,8 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         _make_pose_input(GROUND_NAME, "to_world"),
         # (h, w, 3): colors of a ground that the map of the environment shows
         SceneInput(
-            "ground.reflectance", f"{GROUND_NAME}.*.reflectance.data", has_interior_adjoint=True
+            "ground.reflectance",
+            f"{GROUND_NAME}.*.reflectance.data",
+            has_interior_adjoint=True,
         ),
     )

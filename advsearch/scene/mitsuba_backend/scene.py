@@ -509,7 +509,9 @@ class MitsubaScene:
         # In both, buffers without an entry have their base values.
         requested = {name: inputs[name] for name in inputs if name in self._buffers}
         applied = {
-            name: self._applied_values[name] for name in self._applied_values if name in self._buffers
+            name: self._applied_values[name]
+            for name in self._applied_values
+            if name in self._buffers
         }
         is_set = requested.keys() == applied.keys() and all(
             torch.equal(requested[name].float(), applied[name]) for name in requested
@@ -665,7 +667,9 @@ class MitsubaScene:
                 tracked[name] = tensor
                 # Mitsuba's parameter may have another type than a tensor.
                 self.parameters[key] = (
-                    scene_input.convert_to_mitsuba(tensor) if scene_input.convert_to_mitsuba else tensor
+                    scene_input.convert_to_mitsuba(tensor)
+                    if scene_input.convert_to_mitsuba
+                    else tensor
                 )
             self.parameters.update()
             # Mitsuba warns at every call if a film samples beyond its border.
@@ -938,8 +942,12 @@ class MitsubaScene:
             if self.plane_radiance is not None:
                 hidden["type"] = "advsearch_photograph"
                 # `PhotographPath` names them as the properties of the plane's coat.
-                hidden["reflectance"] = self.description_and_filter[0].get_number("ground.gloss")
-                hidden["roughness"] = self.description_and_filter[0].get_number("ground.roughness")
+                hidden["reflectance"] = self.description_and_filter[0].get_number(
+                    "ground.gloss"
+                )
+                hidden["roughness"] = self.description_and_filter[0].get_number(
+                    "ground.roughness"
+                )
             recipes: dict[str, Plugin] = {
                 "path": path,
                 "adjoint": adjoint,

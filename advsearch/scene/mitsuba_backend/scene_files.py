@@ -30,7 +30,7 @@ from advsearch.scene.importing.files import (
     make_safe_name,
     sanitize_name,
 )
-from advsearch.scene.importing.geometry import make_mesh_from_soup, join_parts
+from advsearch.scene.importing.geometry import join_parts, make_mesh_from_soup
 from advsearch.scene.importing.parts import MAX_RADIANCE, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import RESERVED_NAMES, ImportedScene
 from advsearch.scene.importing.texture import apply_textures

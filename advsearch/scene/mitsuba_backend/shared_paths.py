@@ -45,7 +45,10 @@ class StoredPaths:
     @property
     def n_bytes(self) -> int:
         """Memory, bytes: 4 for the index of each sample."""
-        return int(self.channel_sums.nbytes + 4 * sum(map(dr.width, self.changed_sample_indices)))
+        return int(
+            self.channel_sums.nbytes
+            + 4 * sum(map(dr.width, self.changed_sample_indices))
+        )
 
 
 class SharedPaths:

@@ -98,7 +98,9 @@ class ViewSamples:
     # goes through cut-outs may have several samples
     ray_index: Tensor
     uv: Tensor  # (k, 2) texture coordinates, with v as in Mitsuba
-    diffuse_weight: Tensor  # (k,) diffuse fraction over pi, and over the rays of a pixel
+    diffuse_weight: (
+        Tensor  # (k,) diffuse fraction over pi, and over the rays of a pixel
+    )
     is_back: Tensor  # (k,) bool, whether the ray meets the surface from behind
 
 

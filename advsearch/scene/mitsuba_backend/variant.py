@@ -171,7 +171,9 @@ class SceneRegistry:
         self._held: dict[int, tuple[tuple[Any, ...], tuple[Any, ...]]] = {}
         self.unused_keys: list[int] = []
 
-    def hold_objects(self, owner: object, *objects: Any, media: tuple[Any, ...] = ()) -> None:
+    def hold_objects(
+        self, owner: object, *objects: Any, media: tuple[Any, ...] = ()
+    ) -> None:
         """Hold Mitsuba's objects until `free_unused` after their owner is freed.
 
         Args:

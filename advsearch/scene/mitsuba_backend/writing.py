@@ -84,7 +84,9 @@ def write_scene(
         )
     xml_scene: Plugin = {
         "integrator": _make_integrator(scene, hide_environment),
-        **make_scene_dict(description, scene.resolution, filter_name, scene.sampler_name),
+        **make_scene_dict(
+            description, scene.resolution, filter_name, scene.sampler_name
+        ),
     }
     # inputs that are not in the dictionary yet: `_put_part` takes some of them out
     remaining_inputs = {

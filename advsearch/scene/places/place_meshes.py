@@ -272,7 +272,9 @@ def _select_material(
 def _list_posed_meshes(header: Header) -> list[tuple[int, Float64Array]]:
     """Return mesh and pose of each node that has a mesh, in the order of nodes."""
     posed_meshes = []
-    posed_nodes = sorted(gltf_skeleton.iterate_node_poses(header), key=lambda item: item[0])
+    posed_nodes = sorted(
+        gltf_skeleton.iterate_node_poses(header), key=lambda item: item[0]
+    )
     for node, pose in posed_nodes:
         mesh = header.nodes[node].mesh
         if mesh is not None:

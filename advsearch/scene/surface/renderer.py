@@ -135,7 +135,9 @@ class SurfaceRenderer(Predictor):
     def compute_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a configuration (d,), without a graph."""
         with torch.no_grad():
-            return self.path_renderer.scene.input_assembler(self.path_renderer.space.inputs(u))
+            return self.path_renderer.scene.input_assembler(
+                self.path_renderer.space.inputs(u)
+            )
 
     def get_color(self, inputs: Mapping[str, Tensor]) -> Tensor:
         """Return the base color (h, w, 3) of scene inputs."""
@@ -414,7 +416,9 @@ def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozens
     """
     changed: set[str] = set()
     with torch.no_grad():
-        start_inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
+        start_inputs = renderer.scene.input_assembler(
+            renderer.space.inputs(renderer.start)
+        )
         for fraction in PROBE_FRACTIONS:
             u = renderer.start.clone()
             for group in renderer.space.groups:

@@ -59,7 +59,9 @@ class LitTexels:
     grids: tuple[TexelGrid, ...]  # grid of each surface, the searched one first
     positions: Float32Array  # (n, 3) positions in world space
     normals: Float32Array  # (n, 3)
-    cell_of_texel: IntArray  # (n,) index of each texel's cell, among the cells of all grids
+    cell_of_texel: (
+        IntArray  # (n,) index of each texel's cell, among the cells of all grids
+    )
     texel_of_cell: IntArray  # (cells of all grids,) index of each cell's nearest texel
     # index of the first texel of each grid, followed by the number of all texels
     first_texels: tuple[int, ...]

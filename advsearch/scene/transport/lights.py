@@ -373,7 +373,9 @@ class LightBasis:
             scene without light has one dark light.
     """
 
-    def __init__(self, renderer: Renderer, lighting: LightGroups, inputs: Inputs) -> None:
+    def __init__(
+        self, renderer: Renderer, lighting: LightGroups, inputs: Inputs
+    ) -> None:
         """Split the light of scene inputs into lights of which each has its own image.
 
         Radiance is the sum over lights, so that an image under any mixture of them is
@@ -448,7 +450,9 @@ def _get_values(
     return values
 
 
-def _make_basis_maps(renderer: Renderer, lighting: LightGroups, first: Tensor) -> Tensor:
+def _make_basis_maps(
+    renderer: Renderer, lighting: LightGroups, first: Tensor
+) -> Tensor:
     """Return the environment's basis maps (k, H, W, 3).
 
     The first is `first`. If a group adds spherical harmonics to the environment, the

@@ -37,7 +37,11 @@ from advsearch import seeds
 from advsearch.scene.assembly import IMAGE_INPUTS
 from advsearch.scene.assets import Float32Array, IntArray
 from advsearch.scene.mitsuba_backend.denoise import denoise
-from advsearch.scene.mitsuba_backend.transport import TracedPaths, PathVertices, average_passes
+from advsearch.scene.mitsuba_backend.transport import (
+    PathVertices,
+    TracedPaths,
+    average_passes,
+)
 from advsearch.scene.parts import PATTERN_SUFFIX
 from advsearch.scene.predictor import MAX_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
@@ -707,7 +711,9 @@ def _collect(
     # The renderer counts the values of all calls; those of this call are the increase.
     non_finite_before = renderer.n_non_finite
     # `find_front` adds which part of a photograph is in front of the object.
-    inputs = renderer.replace_photograph_depth(renderer.scene.input_assembler(renderer.space.inputs(u)))
+    inputs = renderer.replace_photograph_depth(
+        renderer.scene.input_assembler(renderer.space.inputs(u))
+    )
     # inputs of the finished image, and inputs of the scene
     image_inputs = {
         name: value for name, value in inputs.items() if name in IMAGE_INPUTS

@@ -23,10 +23,10 @@ from advsearch.questions.harden.objects.textures import (
     ParameterSampler,
     Texels,
     blend_colors,
+    compute_soft_step,
+    paint_solid_color,
     painter,
     parse_hex_color,
-    paint_solid_color,
-    compute_soft_step,
 )
 
 AXLES = (1.29, -1.33)  # x of the front and the rear axle
@@ -581,7 +581,10 @@ def _well(axle: float, side: float) -> list[Patch]:
         down=np.array([0.0, 1.0]),
         across=np.linspace(0.0, 1.0, len(angle)),
     )
-    return [curved_wall, shapes.make_cap_face("well", inner_edge, np.array([0.0, side, 0.0]))]
+    return [
+        curved_wall,
+        shapes.make_cap_face("well", inner_edge, np.array([0.0, side, 0.0])),
+    ]
 
 
 def _fittings() -> list[Patch]:
@@ -607,7 +610,9 @@ def _mirrors() -> list[Patch]:
             "paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), bevel=0.055, steps=3
         )
         patches += shapes.transform_patches(
-            shell, shapes.make_rotation_matrix("z", -14.0 * side), (0.57, side * 0.93, 1.005)
+            shell,
+            shapes.make_rotation_matrix("z", -14.0 * side),
+            (0.57, side * 0.93, 1.005),
         )
         patches += shapes.make_rounded_box(
             "trim",
@@ -621,7 +626,9 @@ def _mirrors() -> list[Patch]:
 
 def _plates_and_badges() -> list[Patch]:
     """Create a licence plate and a badge at the front, and the same at the rear."""
-    plate = shapes.make_rounded_box("plate", (0, 0, 0), (0.014, 0.52, 0.112), bevel=0.004, steps=1)
+    plate = shapes.make_rounded_box(
+        "plate", (0, 0, 0), (0.014, 0.52, 0.112), bevel=0.004, steps=1
+    )
     badge = shapes.revolve_profile(
         [("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])],
         columns=24,
@@ -708,7 +715,9 @@ def _panes(t: Texels) -> Array:
     x, y, z = t.xyz.T
     abs_y = np.abs(y)
     height_fraction = np.clip((z - 0.95) / 0.5, 0.0, 1.0)  # lighter towards the roof
-    glass = blend_colors(parse_hex_color("20272b"), parse_hex_color("414d55"), height_fraction)
+    glass = blend_colors(
+        parse_hex_color("20272b"), parse_hex_color("414d55"), height_fraction
+    )
     backrest = np.hypot((abs_y - 0.36) / 0.24, (z - 1.0) / 0.2)
     headrest = np.hypot((abs_y - 0.36) / 0.11, (z - 1.23) / 0.055)
     seat = compute_soft_step(1.0 - np.minimum(backrest, headrest), 0.0, soft=0.15)
@@ -742,7 +751,9 @@ def _slats(t: Texels) -> Array:
     x, _, z = t.xyz.T
     is_upper_grille = (x > 1.9) & (z > 0.48)
     from_middle = np.abs((z % 0.034) - 0.017)  # slats are 3.4 cm apart
-    slat = np.where(is_upper_grille, compute_soft_step(0.006 - from_middle, 0.0, soft=0.006), 0.0)
+    slat = np.where(
+        is_upper_grille, compute_soft_step(0.006 - from_middle, 0.0, soft=0.006), 0.0
+    )
     return blend_colors(parse_hex_color("17181a"), parse_hex_color("8b9095"), slat)
 
 

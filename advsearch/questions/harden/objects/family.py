@@ -172,7 +172,9 @@ def paint_atlas(
     is_used = np.zeros((side, side), dtype=bool)
     for patch, rectangle in zip(patches, rectangles, strict=True):
         u, v = _chart_coordinates(rectangle)
-        color = paints[patch.tag](Texels(patch.compute_rest_points(u, v), u, v, patch.size))
+        color = paints[patch.tag](
+            Texels(patch.compute_rest_points(u, v), u, v, patch.size)
+        )
         area = np.s_[
             rectangle.y : rectangle.y + rectangle.height,
             rectangle.x : rectangle.x + rectangle.width,
@@ -345,7 +347,9 @@ class ObjectFamily:
         return assets.ObjectAsset(
             name=self.name,
             mesh=mesh,
-            base_color=paint_atlas(patches, rectangles, instance.paints, self.atlas_size),
+            base_color=paint_atlas(
+                patches, rectangles, instance.paints, self.atlas_size
+            ),
             material=instance.material,
             label=self.label,
             source=workbench.library.BUNDLED_OBJECT,

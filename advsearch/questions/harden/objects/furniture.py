@@ -8,23 +8,27 @@ from typing import NamedTuple
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
+from advsearch.questions.harden.objects.family import (
+    Instance,
+    make_family,
+    sample_material,
+)
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Color,
     Paint,
     ParameterSampler,
-    make_range_mask,
     checks,
-    paint_shaded_clouds,
+    choose_paint_or_random,
     dots,
     gradient,
+    make_range_mask,
     paint_over,
-    choose_paint_or_random,
+    paint_shaded_clouds,
+    paint_solid_color,
     parse_hex_color,
     rings,
     scale_brightness,
-    paint_solid_color,
     stripes,
     wood,
 )
@@ -71,7 +75,9 @@ def _post(
     # `sweep_section` needs a first axis of the section that is not along the post
     is_lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
     first_axis = (0.0, 0.0, 1.0) if is_lying else (1.0, 0.0, 0.0)
-    return shapes.sweep_section(tag, path, section, scale, start_axis=first_axis, has_caps=True)
+    return shapes.sweep_section(
+        tag, path, section, scale, start_axis=first_axis, has_caps=True
+    )
 
 
 @make_family(unit_in_metres=0.01)  # built in centimeters
@@ -563,13 +569,19 @@ def _shade_paint(
         bottom, top: heights of the shade's edges.
     """
     cloth = paint_shaded_clouds(linen, factor=0.93, scale=1.2, offset=offset)
-    pattern = sampler.sample_choice("plain", "band", "stripes", "dots", "rings", "gradient")
+    pattern = sampler.sample_choice(
+        "plain", "band", "stripes", "dots", "rings", "gradient"
+    )
     accent = sampler.sample_color("b08d3c", "7a1f2b", "23395d", "efe6cf")
 
     def with_edges(color: Color, width: float) -> Paint:
         """Return the cloth with both edges of a color, `width` wide."""
-        lower_edge = paint_over(cloth, make_range_mask(0.0, bottom + width), paint_solid_color(color))
-        return paint_over(lower_edge, make_range_mask(top - width, 2 * top), paint_solid_color(color))
+        lower_edge = paint_over(
+            cloth, make_range_mask(0.0, bottom + width), paint_solid_color(color)
+        )
+        return paint_over(
+            lower_edge, make_range_mask(top - width, 2 * top), paint_solid_color(color)
+        )
 
     if pattern == "plain":
         paint = with_edges(scale_brightness(linen, 0.75), 0.5)  # hems
@@ -649,7 +661,9 @@ def _lamp_frame(size: _ShadeSize) -> list[Patch]:
             [(0.0, 0.0, spoke_z), (spoke_length, 0.0, spoke_z)],
             shapes.ellipse(0.22, 0.22, count=8),
         )
-        patches += shapes.transform_patches(spoke, shapes.make_rotation_matrix("z", angle))
+        patches += shapes.transform_patches(
+            spoke, shapes.make_rotation_matrix("z", angle)
+        )
     # from the bulb up to a small knob above the spokes
     rod_heights = (
         size.bottom + 0.2 * size.height,

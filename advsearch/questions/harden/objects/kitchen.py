@@ -6,24 +6,28 @@ import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.extend import assets
-from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
+from advsearch.questions.harden.objects.family import (
+    Instance,
+    make_family,
+    sample_material,
+)
 from advsearch.questions.harden.objects.shapes import Array, Patch, Points
 from advsearch.questions.harden.objects.textures import (
     Color,
     Paint,
     ParameterSampler,
     Texels,
-    make_range_mask,
-    paint_shaded_clouds,
-    dots,
-    paint_over,
+    add_specks,
     choose_paint_or_random,
+    compute_soft_step,
+    dots,
+    make_range_mask,
+    paint_over,
+    paint_shaded_clouds,
+    paint_solid_color,
     painter,
     rings,
     scale_brightness,
-    paint_solid_color,
-    add_specks,
-    compute_soft_step,
     stripes,
     wood,
 )
@@ -120,14 +124,18 @@ def teapot(sampler: ParameterSampler) -> Instance:
     height = sampler(10.2, low=8.0, high=12.5)
     side, body = _teapot_body(sampler, radius, height)
     handle = _teapot_handle(sampler, side, radius, height)
-    opposite = shapes.make_rotation_matrix("z", 180.0)  # both are made at +x; the handle turns
+    opposite = shapes.make_rotation_matrix(
+        "z", 180.0
+    )  # both are made at +x; the handle turns
     patches = [
         *body,
         *_spout(sampler, radius, height),
         *shapes.transform_patches(handle, opposite),
     ]
     return Instance(
-        shapes.transform_patches(patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)),
+        shapes.transform_patches(
+            patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)
+        ),
         _teapot_paints(sampler, height),
         sample_material(sampler, roughness=0.25, clearcoat=0.7),
         texel_density={"base": 0.6},
@@ -239,7 +247,9 @@ def _teapot_handle(
     )
     root_flare = 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3  # thicker at both ends
     curve = shapes.sample_spline(knots, count=26)
-    return shapes.sweep_section("handle", shapes.to_xz_plane(curve), section, root_flare)
+    return shapes.sweep_section(
+        "handle", shapes.to_xz_plane(curve), section, root_flare
+    )
 
 
 def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]:
@@ -248,7 +258,9 @@ def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]
     clay = sampler.sample_color(
         "7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0"
     )
-    glaze = paint_shaded_clouds(clay, factor=1.25, scale=3.5, offset=offset, contrast=1.6)
+    glaze = paint_shaded_clouds(
+        clay, factor=1.25, scale=3.5, offset=offset, contrast=1.6
+    )
     accent = sampler.sample_color("e8cfa0", "23408f", "c9a24b", "f4efe4", "b5442e")
     decoration = _teapot_decoration(sampler, clay, glaze, accent, height, offset)
     paint = choose_paint_or_random(sampler, height + 4.0, decoration)
@@ -259,7 +271,9 @@ def _teapot_paints(sampler: ParameterSampler, height: float) -> dict[str, Paint]
         "lid": sampler.sample_choice(paint, trim),
         "spout": sampler.sample_choice(glaze, paint),
         "handle": sampler.sample_choice(glaze, trim),
-        "knob": paint_solid_color(accent) if sampler.sample_bool(0.5, canonical=True) else trim,
+        "knob": paint_solid_color(accent)
+        if sampler.sample_bool(0.5, canonical=True)
+        else trim,
     }
 
 
@@ -281,11 +295,17 @@ def _teapot_decoration(
         height: height of the teapot.
         offset: (3,) into the noise.
     """
-    kind = sampler.sample_choice("bands", "plain", "dots", "stripes", "rings", "speckle")
+    kind = sampler.sample_choice(
+        "bands", "plain", "dots", "stripes", "rings", "speckle"
+    )
     if kind == "bands":
         lower_band = make_range_mask(0.7 * height, 0.74 * height, soft=0.1)
         upper_band = make_range_mask(0.77 * height, 0.785 * height, soft=0.1)
-        return paint_over(paint_over(glaze, lower_band, paint_solid_color(accent)), upper_band, paint_solid_color(accent))
+        return paint_over(
+            paint_over(glaze, lower_band, paint_solid_color(accent)),
+            upper_band,
+            paint_solid_color(accent),
+        )
     if kind == "dots":
         return dots(
             glaze,
@@ -335,7 +355,9 @@ def frying_pan(sampler: ParameterSampler) -> Instance:
     rivets = _pan_rivets(shapes.radius_at_height(side, rivet_z) - wall, rivet_z)
     patches = [*body, *handle, *rivets, *bracket]
     return Instance(
-        shapes.transform_patches(patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)),
+        shapes.transform_patches(
+            patches, shapes.make_rotation_matrix("z", VIEW_DEGREES)
+        ),
         _pan_paints(sampler, rim_radius, depth),
         sample_material(sampler, roughness=0.38, clearcoat=0.3),
         texel_density={"base": 0.5},
@@ -439,7 +461,9 @@ def _pan_paints(
     handle_kind = sampler.sample_choice("black", "wood", "colored")
     # All three are sampled, whichever is used.
     handle_paints = {
-        "black": paint_solid_color(sampler.sample_color("1b1b1d", "2a2a2c", p_random=0.1)),
+        "black": paint_solid_color(
+            sampler.sample_color("1b1b1d", "2a2a2c", p_random=0.1)
+        ),
         "wood": wood(
             sampler.sample_color("8a5a32", "b98550", p_random=0.0),
             scale=1.4,
@@ -477,7 +501,9 @@ def _pan_coating(sampler: ParameterSampler, offset: Array) -> Paint:
         amount=0.06,
     )
     if sampler.sample_bool(0.4, canonical=True):
-        return paint_over(coating, _turning_rings(), paint_solid_color(scale_brightness(coat, 1.6)))
+        return paint_over(
+            coating, _turning_rings(), paint_solid_color(scale_brightness(coat, 1.6))
+        )
     return coating
 
 
@@ -501,5 +527,11 @@ def _pan_enamel(sampler: ParameterSampler, depth: float, offset: Array) -> Paint
     )
     enamel = paint_shaded_clouds(color, factor=0.85, scale=5.0, offset=offset)
     is_bottom = make_range_mask(-1.0, 0.25 * depth, soft=0.6 * depth)
-    enamel = paint_over(enamel, is_bottom, paint_solid_color(scale_brightness(color, 0.6)))
-    return paint_over(enamel, make_range_mask(depth - 0.1, 2 * depth, soft=0.15), paint_solid_color("2b2c2e"))
+    enamel = paint_over(
+        enamel, is_bottom, paint_solid_color(scale_brightness(color, 0.6))
+    )
+    return paint_over(
+        enamel,
+        make_range_mask(depth - 0.1, 2 * depth, soft=0.15),
+        paint_solid_color("2b2c2e"),
+    )

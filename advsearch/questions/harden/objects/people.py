@@ -18,10 +18,10 @@ from advsearch.questions.harden.objects.textures import (
     ParameterSampler,
     Texels,
     blend_colors,
+    compute_soft_step,
     compute_value_noise,
     painter,
     parse_hex_color,
-    compute_soft_step,
 )
 
 FINISHES = {
@@ -88,7 +88,9 @@ def _patches(person: Any) -> list[Patch]:
                 faces=faces[first_face[number] : first_face[number + 1]],
                 size=(float(data["sizes"][number][0]), float(data["sizes"][number][1])),
                 # The paint of a texel depends on its point of the reference body.
-                compute_rest_points=_interpolate_chart(charts[in_chart], reference[in_chart]),
+                compute_rest_points=_interpolate_chart(
+                    charts[in_chart], reference[in_chart]
+                ),
             )
         )
     return patches
@@ -176,7 +178,9 @@ def _jeans(t: Texels, color: Array) -> Array:
     far = 9.0  # a distance in metres that stands for no seam
     seam_distance = np.where(has_seam, np.abs(x - 0.005), far)
     hem_distance = np.abs(z - 0.085)
-    line = compute_soft_step(0.004 - np.minimum(seam_distance, hem_distance), 0.0, soft=0.003)
+    line = compute_soft_step(
+        0.004 - np.minimum(seam_distance, hem_distance), 0.0, soft=0.003
+    )
     return blend_colors(_woven(color, depth=0.25)(t), 0.6 * color, 0.8 * line)
 
 
@@ -202,13 +206,17 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
     # how far inside an ellipse; -1 at the back of the head
     in_lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
     lip_color = color * np.array([0.86, 0.62, 0.6])
-    skin = blend_colors(skin, lip_color, 0.75 * compute_soft_step(in_lips, 0.0, soft=0.25))
+    skin = blend_colors(
+        skin, lip_color, 0.75 * compute_soft_step(in_lips, 0.0, soft=0.25)
+    )
 
     in_cheeks = np.where(
         is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
     )
     cheek_color = color * np.array([1.0, 0.84, 0.8])
-    skin = blend_colors(skin, cheek_color, 0.5 * compute_soft_step(in_cheeks, 0.0, soft=0.6))
+    skin = blend_colors(
+        skin, cheek_color, 0.5 * compute_soft_step(in_cheeks, 0.0, soft=0.6)
+    )
 
     brow_height = 1.659 - 14.0 * (abs_y - 0.034) ** 2  # an arch over each eye
     has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # above an eye
@@ -275,7 +283,9 @@ def person(sampler: ParameterSampler) -> Instance:
 def _person_paints(sampler: ParameterSampler) -> dict[str, Paint]:
     """Sample the paints of a person's skin, hair, eyes and clothes, by their tags."""
     skin = parse_hex_color(
-        sampler.sample_choice("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4")
+        sampler.sample_choice(
+            "d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"
+        )
     )
     hair = parse_hex_color(
         sampler.sample_choice("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c")

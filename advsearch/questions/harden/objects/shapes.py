@@ -545,11 +545,15 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
     patches = []
     for start in range(0, piece_columns * n_pieces, piece_columns):
         piece = np.s_[:, start : start + piece_columns + 1]
-        patches.append(make_grid_patch(tag, points[piece], normal[piece], size, down, across))
+        patches.append(
+            make_grid_patch(tag, points[piece], normal[piece], size, down, across)
+        )
     return patches
 
 
-def revolve_profile(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patch]:
+def revolve_profile(
+    profile: Sequence[tuple[str, Points]], columns: int = 56
+) -> list[Patch]:
     """Rotate a profile about the z axis.
 
     Args:
@@ -760,7 +764,9 @@ def sweep_section(
     tangent, first_normal, second_normal = frame
     scales = _to_axis_scales(scale, len(centers))
     points = _sweep_points(section, scales, centers, first_normal, second_normal)
-    ring_fraction, ring_length = _compute_length_fractions(_repeat_first(section, axis=0))
+    ring_fraction, ring_length = _compute_length_fractions(
+        _repeat_first(section, axis=0)
+    )
     # A typical circumference: the mean scale of both axes is smaller at three quarters
     # of the centers. The ends, which may shrink to a point, hardly matter.
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
@@ -1079,7 +1085,9 @@ def crop_chart(patch: Patch) -> Patch:
 
     def rest(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at coordinates (N,) of the cropped chart."""
-        return patch.compute_rest_points(lower[0] + u * extent[0], lower[1] + v * extent[1])
+        return patch.compute_rest_points(
+            lower[0] + u * extent[0], lower[1] + v * extent[1]
+        )
 
     return replace(
         patch,

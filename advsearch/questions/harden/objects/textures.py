@@ -159,7 +159,9 @@ def blend_colors(a: Array, b: Array, weight: Array) -> Array:
 
 def band_mask(value: Array, low: float, high: float, soft: float) -> Array:
     """Return 1 between two values and 0 outside, with ramps `soft` wide."""
-    return compute_soft_step(value, low, soft=soft) * compute_soft_step(-value, -high, soft=soft)
+    return compute_soft_step(value, low, soft=soft) * compute_soft_step(
+        -value, -high, soft=soft
+    )
 
 
 def compute_soft_step(value: Array, edge: float, soft: float) -> Array:
@@ -186,7 +188,9 @@ def paint_two_color_clouds(
     """
     position = t.xyz / scale + offset
     # two octaves; the second is shifted, so that both have no common center
-    clouds = (compute_value_noise(position) + compute_value_noise(position * 2.0 + 5.3) * 0.5) / 1.5
+    clouds = (
+        compute_value_noise(position) + compute_value_noise(position * 2.0 + 5.3) * 0.5
+    ) / 1.5
     return blend_colors(a, b, np.clip((clouds - 0.5) * contrast + 0.5, 0.0, 1.0))
 
 
@@ -195,7 +199,11 @@ def paint_shaded_clouds(
 ) -> Paint:
     """Paint clouds of a color and a shade of it, `scale` wide."""
     return paint_two_color_clouds(
-        color, scale_brightness(color, factor), scale=scale, offset=offset, contrast=contrast
+        color,
+        scale_brightness(color, factor),
+        scale=scale,
+        offset=offset,
+        contrast=contrast,
     )
 
 
@@ -211,7 +219,9 @@ def add_specks(
     threshold = 1.0 - 1.1 * amount
     return paint_over(
         base,
-        lambda t: compute_soft_step(compute_value_noise(t.xyz / scale + offset), threshold, soft=0.12),
+        lambda t: compute_soft_step(
+            compute_value_noise(t.xyz / scale + offset), threshold, soft=0.12
+        ),
         paint_solid_color(color),
     )
 
@@ -273,7 +283,9 @@ def rings(
     Where the axis is z, these are rings around an upright object.
     """
     distance_from_middle = np.abs(t.xyz[:, axis] / period % 1.0 - 0.5)
-    return blend_colors(a, b, compute_soft_step(fraction / 2 - distance_from_middle, 0.0, soft=0.06))
+    return blend_colors(
+        a, b, compute_soft_step(fraction / 2 - distance_from_middle, 0.0, soft=0.06)
+    )
 
 
 def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
@@ -296,7 +308,9 @@ def stripes(
     """
     across, _ = _cells(t, cell)
     distance_from_middle = np.abs((across + slant * t.v) % 1.0 - 0.5)
-    return blend_colors(a, b, compute_soft_step(fraction / 2 - distance_from_middle, 0.0, soft=0.08))
+    return blend_colors(
+        a, b, compute_soft_step(fraction / 2 - distance_from_middle, 0.0, soft=0.08)
+    )
 
 
 @painter
@@ -328,7 +342,9 @@ def zigzag(t: Texels, a: Color, b: Color, cell: float) -> Array:
     across, up = _cells(t, cell)
     line_height = np.abs(across % 1.0 - 0.5)  # a triangular wave
     distance_from_line = np.abs((up + line_height) % 1.0 - 0.5)
-    return blend_colors(a, b, compute_soft_step(0.25 - distance_from_line, 0.0, soft=0.1))
+    return blend_colors(
+        a, b, compute_soft_step(0.25 - distance_from_line, 0.0, soft=0.1)
+    )
 
 
 @painter
@@ -339,7 +355,9 @@ def paint_over(t: Texels, base: Paint, mask: Mask, top: Paint) -> Array:
     color = np.array(base(t))
     if len(covered):
         covered_texels = Texels(t.xyz[covered], t.u[covered], t.v[covered], t.size)
-        color[covered] = blend_colors(color[covered], top(covered_texels), weight[covered])
+        color[covered] = blend_colors(
+            color[covered], top(covered_texels), weight[covered]
+        )
     return color
 
 
@@ -447,10 +465,14 @@ def _sample_irregular_paint(
     """
     if kind == "mottled":
         contrast = sampler(2.0, low=1.0, high=4.0)
-        return paint_two_color_clouds(a, b, scale=1.5 * cell, offset=offset, contrast=contrast)
+        return paint_two_color_clouds(
+            a, b, scale=1.5 * cell, offset=offset, contrast=contrast
+        )
     if kind == "speckled":
         amount = sampler(0.2, low=0.1, high=0.4)
-        return add_specks(paint_solid_color(a), b, scale=0.4 * cell, offset=offset, amount=amount)
+        return add_specks(
+            paint_solid_color(a), b, scale=0.4 * cell, offset=offset, amount=amount
+        )
     timber = sampler.sample_color("9a6a3c", "c89b62", "5b3a22")
     axis = int(sampler.sample_choice(0, 1, 2))
     return wood(timber, scale=0.5 * cell, offset=offset, axis=axis)

@@ -11,23 +11,27 @@ import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
 from advsearch.extend import assets
-from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
+from advsearch.questions.harden.objects.family import (
+    Instance,
+    make_family,
+    sample_material,
+)
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
-    paint_shaded_clouds,
     blend_colors,
+    choose_paint_or_random,
+    compute_soft_step,
     compute_value_noise,
     paint_over,
-    choose_paint_or_random,
+    paint_shaded_clouds,
+    paint_solid_color,
     painter,
     parse_hex_color,
     sample_paint,
     scale_brightness,
-    paint_solid_color,
-    compute_soft_step,
 )
 
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
@@ -253,7 +257,9 @@ def _ball_paint(
             paint_solid_color("eeeee6"),
         )
     if style == "star":
-        return paint_over(paint_solid_color(dark), _star(radius), paint_solid_color(light))
+        return paint_over(
+            paint_solid_color(dark), _star(radius), paint_solid_color(light)
+        )
     if style == "plain":
         return paint_shaded_clouds(dark, factor=1.2, scale=3.0, offset=offset)
     if style == "random":
@@ -376,7 +382,11 @@ def _banana_paint(sampler: ParameterSampler, path: Array, stem_length: float) ->
         """Paint the skin, then green, flecks, the brown stem and both dark ends."""
         stem_distance = np.linalg.norm(t.xyz - path[0], axis=1)
         tip_distance = np.linalg.norm(t.xyz - path[-1], axis=1)
-        color = blend_colors(skin, scale_brightness(skin, 0.86), compute_value_noise(t.xyz / 2.2 + offset))
+        color = blend_colors(
+            skin,
+            scale_brightness(skin, 0.86),
+            compute_value_noise(t.xyz / 2.2 + offset),
+        )
         stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem_length) / 2.6, 0.0, 1.0)
         tip_green = np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0)
         color = blend_colors(color, green, stem_green * 0.75)
@@ -384,8 +394,12 @@ def _banana_paint(sampler: ParameterSampler, path: Array, stem_length: float) ->
         color = blend_colors(color, brown, _flecks(t.xyz, offset, fleck_amount) * 0.85)
         stem_brown = compute_soft_step(-stem_distance, -0.5 * stem_length, soft=1.3)
         color = blend_colors(color, brown, stem_brown * 0.5)
-        color = blend_colors(color, dark, compute_soft_step(-stem_distance, -0.45, soft=0.5))
-        return blend_colors(color, dark, compute_soft_step(-tip_distance, -0.75, soft=0.5))
+        color = blend_colors(
+            color, dark, compute_soft_step(-stem_distance, -0.45, soft=0.5)
+        )
+        return blend_colors(
+            color, dark, compute_soft_step(-tip_distance, -0.75, soft=0.5)
+        )
 
     return paint
 
@@ -447,12 +461,15 @@ def book(sampler: ParameterSampler) -> Instance:
         height - 2 * overhang,
         size.thickness - 2 * board + 0.04,  # 0.02 inside of each cover, without a gap
     )
-    patches += shapes.make_rounded_box("pages", pages_center, pages_size, bevel=0.05, steps=1)
+    patches += shapes.make_rounded_box(
+        "pages", pages_center, pages_size, bevel=0.05, steps=1
+    )
     patches += _round_spine(size, bulge, board)
     # -122 degrees: seen from the usual camera, the spine is at the side and the front
     # cover is readable.
     rotated = shapes.transform_patches(
-        patches, shapes.make_rotation_matrix("z", sampler(-122.0, low=-150.0, high=-100.0))
+        patches,
+        shapes.make_rotation_matrix("z", sampler(-122.0, low=-150.0, high=-100.0)),
     )
     return Instance(
         rotated,
@@ -496,7 +513,9 @@ def _book_paints(sampler: ParameterSampler, size: _BookSize) -> dict[str, Paint]
     cloth = choose_paint_or_random(
         sampler,
         size.height,
-        paint_shaded_clouds(cloth_color, factor=0.85, scale=0.6, offset=offset, contrast=1.2),
+        paint_shaded_clouds(
+            cloth_color, factor=0.85, scale=0.6, offset=offset, contrast=1.2
+        ),
         p_random=0.3,
     )
     style = sampler.sample_choice("frame", "blocks", "picture", "plain")
@@ -536,11 +555,15 @@ def _spine_paint(t: Texels, cloth: Paint, gold: Array, size: _BookSize) -> Array
     )
     in_length = compute_soft_step(0.16 - end_fraction, 0.0, soft=0.01)
     from_middle = np.abs(z - size.thickness / 2)
-    in_thickness = compute_soft_step(0.22 * size.thickness - from_middle, 0.0, soft=0.05)
+    in_thickness = compute_soft_step(
+        0.22 * size.thickness - from_middle, 0.0, soft=0.05
+    )
     # noise that changes mostly along the spine: it gives bars instead of letters
     position = np.stack([y * 1.8, z * 0.2, 0 * end_fraction], axis=1)
     words = compute_soft_step(compute_value_noise(position + 3.0), 0.36, soft=0.1)
-    return blend_colors(cloth(t), gold, np.maximum(bands, in_length * in_thickness * words))
+    return blend_colors(
+        cloth(t), gold, np.maximum(bands, in_length * in_thickness * words)
+    )
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
@@ -837,7 +860,9 @@ def _sign_stand() -> list[Patch]:
     foot = shapes.make_rounded_box(
         "rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), bevel=0.02, steps=2
     )
-    block = shapes.make_rounded_box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), bevel=0.01, steps=1)
+    block = shapes.make_rounded_box(
+        "post", (0, 0, 0.07), (0.1, 0.1, 0.05), bevel=0.01, steps=1
+    )
     return foot + block
 
 
@@ -868,7 +893,10 @@ def _sign_plate(radius: float, height: float) -> list[Patch]:
     # an octagon whose middle is the origin
     back = np.insert(ring, 0, 0.0, axis=1)
     edge = shapes.sweep_section(
-        "metal", [(0.0, 0.0, 0.0), thickness * forwards], ring, start_axis=(0.0, 1.0, 0.0)
+        "metal",
+        [(0.0, 0.0, 0.0), thickness * forwards],
+        ring,
+        start_axis=(0.0, 1.0, 0.0),
     )
     plate = [
         shapes.make_cap_face("face", back + thickness * forwards, forwards),

@@ -5,23 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
+from advsearch.questions.harden.objects.family import (
+    Instance,
+    make_family,
+    sample_material,
+)
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
+    add_specks,
     band_mask,
-    make_range_mask,
-    paint_shaded_clouds,
-    paint_over,
     choose_paint_or_random,
+    compute_soft_step,
+    make_range_mask,
+    paint_over,
+    paint_shaded_clouds,
+    paint_solid_color,
     painter,
     rings,
     scale_brightness,
-    paint_solid_color,
-    add_specks,
-    compute_soft_step,
     wood,
 )
 
@@ -145,7 +149,9 @@ def hammer(sampler: ParameterSampler) -> Instance:
     half_face = face_radius * 1.2 if style == "sledge" else face_radius
     drop = max(half_head * 1.05, half_face) - half_grip
     tilt = -float(np.degrees(np.arctan2(drop, 0.8 * length)))
-    patches = shapes.transform_patches([*head, *handle], shapes.make_rotation_matrix("y", tilt))
+    patches = shapes.transform_patches(
+        [*head, *handle], shapes.make_rotation_matrix("y", tilt)
+    )
     patches = shapes.transform_patches(
         patches, shapes.make_rotation_matrix("z", sampler(58.0, low=20.0, high=90.0))
     )
@@ -305,7 +311,9 @@ def _hammer_handle(
         section = shapes.ellipse(1.0, 1.0, count=24)
     else:
         section = shapes.rectangle(2.0, 2.0, bevel=0.7)
-    handle = shapes.sweep_section("handle", path, section, scale, start_axis=(0.0, 1.0, 0.0))
+    handle = shapes.sweep_section(
+        "handle", path, section, scale, start_axis=(0.0, 1.0, 0.0)
+    )
     return half_thickness * (1.0 + swelling), handle
 
 
@@ -373,7 +381,9 @@ def _hammer_handle_paint(
         return paint_over(timber, dipped, paint_solid_color(accent))
     if kind == "rubber":
         grip = make_range_mask(beyond_end, -0.45 * length, axis=0, soft=0.05)
-        ribs = rings(accent, scale_brightness(accent, 0.7), period=1.1, fraction=0.2, axis=0)
+        ribs = rings(
+            accent, scale_brightness(accent, 0.7), period=1.1, fraction=0.2, axis=0
+        )
         return paint_over(paint_solid_color(scale_brightness(accent, 0.5)), grip, ribs)
     return timber
 
@@ -394,7 +404,9 @@ def _weights(
         return _hexagonal_weight(start, length, radius)
     if style == "globe":
         center_z = start + 0.8 * radius
-        return shapes.make_sphere_patches("weight", radius * 0.95, center=(0.0, 0.0, center_z))
+        return shapes.make_sphere_patches(
+            "weight", radius * 0.95, center=(0.0, 0.0, center_z)
+        )
     if style == "round":
         return _plate(start, length, radius)
     n_plates = 3
@@ -462,7 +474,9 @@ def _nut(sampler: ParameterSampler, start: float, radius: float) -> list[Patch]:
     # It begins inside the last plate, so that no gap shows.
     path = [(0, 0, start - 0.1), (0, 0, start + 0.6), (0, 0, start + 0.75)]
     scale = np.array([1.0, 1.0, 0.85]) * 0.42 * radius
-    return shapes.sweep_section("bar", path, section, scale, start_axis=(0.0, 1.0, 0.0), has_caps=True)
+    return shapes.sweep_section(
+        "bar", path, section, scale, start_axis=(0.0, 1.0, 0.0), has_caps=True
+    )
 
 
 @make_family(unit_in_metres=0.01)
@@ -475,7 +489,9 @@ def dumbbell(sampler: ParameterSampler) -> Instance:
     length = sampler(5.6, low=3.8, high=7.0)  # length of a weight
     bar = _dumbbell_bar(sampler, half_grip)
     weight = _weights(sampler, style, half_grip, length, radius)
-    other_weight = shapes.transform_patches(weight, shapes.make_rotation_matrix("y", 180.0))
+    other_weight = shapes.transform_patches(
+        weight, shapes.make_rotation_matrix("y", 180.0)
+    )
     upright = bar + weight + other_weight
     # laid down, and turned
     patches = shapes.transform_patches(
@@ -537,7 +553,11 @@ def _dumbbell_paints(
     if sampler.sample_bool(0.5, canonical=True):
         weight = paint_over(weight, _end_rings(tip, radius), paint_solid_color(accent))
     steel = sampler.sample_color("b4b8bd", "8d9298", "2b2d30", p_random=0.2)
-    knurl = paint_over(paint_solid_color(steel), _knurl_mask(half_grip), paint_solid_color(scale_brightness(steel, 0.55)))
+    knurl = paint_over(
+        paint_solid_color(steel),
+        _knurl_mask(half_grip),
+        paint_solid_color(scale_brightness(steel, 0.55)),
+    )
     return {
         "weight": choose_paint_or_random(sampler, 2 * tip, weight, p_random=0.35),
         "bar": knurl,

@@ -12,29 +12,33 @@ from typing import NamedTuple
 import numpy as np
 
 import advsearch.questions.harden.objects.shapes as shapes
-from advsearch.questions.harden.objects.family import Instance, make_family, sample_material
+from advsearch.questions.harden.objects.family import (
+    Instance,
+    make_family,
+    sample_material,
+)
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import (
     Paint,
     ParameterSampler,
     Texels,
-    make_range_mask,
+    add_specks,
     checks,
-    paint_shaded_clouds,
-    dots,
-    make_facing_mask,
-    gradient,
-    paint_two_color_clouds,
-    paint_over,
     choose_paint_or_random,
+    compute_soft_step,
+    dots,
+    gradient,
+    make_facing_mask,
+    make_range_mask,
+    paint_over,
+    paint_shaded_clouds,
+    paint_solid_color,
+    paint_two_color_clouds,
     painter,
     parse_hex_color,
     rings,
     sample_paint,
     scale_brightness,
-    paint_solid_color,
-    add_specks,
-    compute_soft_step,
     stripes,
     zigzag,
 )
@@ -80,7 +84,9 @@ def make_handle(
         )
     # up to a quarter thicker at both ends
     root_flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
-    return shapes.sweep_section("handle", shapes.to_xz_plane(curve), section, root_flare)
+    return shapes.sweep_section(
+        "handle", shapes.to_xz_plane(curve), section, root_flare
+    )
 
 
 def _handle_curve(
@@ -244,7 +250,10 @@ def mug(sampler: ParameterSampler) -> Instance:
     patches = shapes.transform_patches(
         # -108 degrees: in the usual view the handle is at the side, where it is
         # visible.
-        [*body, *shapes.transform_patches(handle, shapes.make_rotation_matrix("z", -108.0))],
+        [
+            *body,
+            *shapes.transform_patches(handle, shapes.make_rotation_matrix("z", -108.0)),
+        ],
         SEAM_ROTATION,
     )
     return Instance(
@@ -367,7 +376,9 @@ def _bowl_paints(
     raw_clay = paint_solid_color("9b7352")
     is_canonical = sampler.rng is None
     if is_canonical:
-        with_rim = paint_over(glaze, make_range_mask(0.93 * height, 2 * height, soft=0.25), accent)
+        with_rim = paint_over(
+            glaze, make_range_mask(0.93 * height, 2 * height, soft=0.25), accent
+        )
         outside = paint_over(with_rim, make_range_mask(-1.0, 0.55, soft=0.1), raw_clay)
     else:
         decoration = _ceramic(sampler, height, glaze, accent)
@@ -517,13 +528,22 @@ def _bottle_paints(
         outside = _add_label(sampler, outside, paper, ink, label_bottom, label_top)
     foil = sampler.sample_color("6d1a26", "b08d3c", "1c1f24", "23395d", "d5d5d5")
     if sampler.sample_bool(0.5, canonical=True):
-        foil_paint = add_specks(paint_solid_color(foil), scale_brightness(foil, 1.3), scale=0.5, offset=offset)
-        outside = paint_over(outside, make_range_mask(height * 0.8, 2 * height), foil_paint)
+        foil_paint = add_specks(
+            paint_solid_color(foil),
+            scale_brightness(foil, 1.3),
+            scale=0.5,
+            offset=offset,
+        )
+        outside = paint_over(
+            outside, make_range_mask(height * 0.8, 2 * height), foil_paint
+        )
     return {
         "outside": outside,
         "inside": paint_solid_color(scale_brightness(glass, 0.6)),
         "base": paint_solid_color(glass),
-        "cap": paint_solid_color(sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")),
+        "cap": paint_solid_color(
+            sampler.sample_color("c9a24b", "d0d0d0", "b5442e", "22262b")
+        ),
     }
 
 
@@ -752,7 +772,11 @@ def _vase_paint(
         (0.785, 0.805),
         (0.96, 2.0),
     ):
-        paint = paint_over(paint, make_range_mask(low * height, high * height, soft=0.12), paint_solid_color(ink))
+        paint = paint_over(
+            paint,
+            make_range_mask(low * height, high * height, soft=0.12),
+            paint_solid_color(ink),
+        )
     return paint_over(paint, _frieze(height), paint_solid_color(ink))
 
 
@@ -892,7 +916,11 @@ def _glass_profile(
         (stem_radius * 1.15, 2.4),
         (stem_radius, 0.6 * glass.bottom),
     ]
-    upper_side = [under[-1], (foot_radius, 0.08), *shapes.sample_spline(rising, count=14)]
+    upper_side = [
+        under[-1],
+        (foot_radius, 0.08),
+        *shapes.sample_spline(rising, count=14),
+    ]
     return [
         ("foot", shapes.subdivide(under, longest=1.5)),
         ("foot", np.array(upper_side)),
@@ -928,14 +956,20 @@ def _glass_paints(
     )
     drink = sampler.sample_color("6d1526", "d8b45a", "c46a6a", "3f1420", p_random=0.15)
     level = stem_height + depth * sampler(0.48, low=0.3, high=0.62)
-    glass = gradient(scale_brightness(tint, 0.86), scale_brightness(tint, 1.08), low=0.0, high=height)
+    glass = gradient(
+        scale_brightness(tint, 0.86), scale_brightness(tint, 1.08), low=0.0, high=height
+    )
     outside = glass
     inside = glass
     if sampler.sample_bool(0.5, canonical=True):  # filled
-        wine = paint_shaded_clouds(drink, factor=0.8, scale=3.0, offset=sampler.sample_noise_offset())
+        wine = paint_shaded_clouds(
+            drink, factor=0.8, scale=3.0, offset=sampler.sample_noise_offset()
+        )
         is_wine = make_range_mask(stem_height + 0.06 * depth, level, soft=0.1)
         outside = paint_over(glass, is_wine, wine)
-        inside = paint_over(glass, make_range_mask(0.0, level, soft=0.1), paint_solid_color(drink))
+        inside = paint_over(
+            glass, make_range_mask(0.0, level, soft=0.1), paint_solid_color(drink)
+        )
     outside = choose_paint_or_random(sampler, height, outside, p_random=0.3)
     if sampler.sample_bool(0.2, canonical=True):  # a golden rim
         is_rim = make_range_mask(height - 0.35, 2 * height, soft=0.1)

@@ -26,9 +26,9 @@ from advsearch.scene.importing.usd.layers import list_layer_files, unpack_packag
 from advsearch.scene.importing.usd.surface import (
     FIRST_TIME,
     BoundMaterial,
+    GltfMaterialWriter,
     PrimvarUse,
     TextureLayout,
-    GltfMaterialWriter,
 )
 
 # Limit of the different colors, and of the different opacities, of a mesh's faces that
@@ -460,7 +460,10 @@ class Conversion:
         """
         primvars = UsdGeom.PrimvarsAPI(prim)
         normals = self._read_normals(
-            mesh, primvars, mesh_faces.points, mesh_faces.point_of_corner[mesh_faces.triangles]
+            mesh,
+            primvars,
+            mesh_faces.points,
+            mesh_faces.point_of_corner[mesh_faces.triangles],
         )
         primitives = []
         n_faces = len(mesh_faces.corner_counts)
