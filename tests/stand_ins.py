@@ -105,7 +105,7 @@ def attack_on(
     problem: Any, config: AttackConfig, policy: Policy[Any], stages: Stages, run: RunDirectory | None = None
 ) -> RunState:
     """Attack a problem of one's own as a configuration describes it."""
-    problem.steps, problem.n_draws = choose_search_size(config, problem)
+    problem.steps, problem.conditions_per_evaluation = choose_search_size(config, problem)
     return search_and_verify(
         policy,
         Journal(run, ParallelEvaluator(problem)),

@@ -176,7 +176,7 @@ def assert_true_of_fixed_values(
     if not all(control.parameters and control.kind not in ("texture", "geometry") for control in drawn):
         return
     named: dict[str, dict[str, Any]] = {
-        control.kind: {one.name: control.chosen[one.name] for one in control.choices if not one.bounds}
+        control.kind: {one.name: control.choice_values[one.name] for one in control.choices if not one.bounds}
         for control in drawn
     }
     for name, value in said.items():

@@ -144,7 +144,7 @@ def load_model(
     )
     # A function that the caller gives takes precedence over that of the task. None
     # means that the output is logits.
-    read = read or (task and task.reader)
+    read = read or (task and task.output_reader)
     names = None if labels is None else read_labels(labels)
     origin = find_labels_origin(labels)
     if names is not None and task and task.names_source:

@@ -115,12 +115,12 @@ class JointTask(Task):
     @property
     def ambiguity_message(self) -> str:
         return "; ".join(
-            judge.ambiguities for judge in self.member_tasks if judge.ambiguities
+            judge.ambiguity_message for judge in self.member_tasks if judge.ambiguity_message
         )
 
     @property
     def output_remarks(self) -> tuple[str, ...]:
-        return _distinct(judge.remarks for judge in self.member_tasks)
+        return _distinct(judge.output_remarks for judge in self.member_tasks)
 
     @property
     def target_names(self) -> tuple[str, ...]:

@@ -344,11 +344,11 @@ def test_a_worker_that_is_not_fit_is_given_nothing_more(monkeypatch: pytest.Monk
     lacks = Prediction("finished", ("tcp://there", Reply(failure=Failure.MISSING_FILES, error="it lacks mug.obj")))
     done = Prediction("finished", ("tcp://there", Reply(value=3)))
     assert called(monkeypatch, full, lacks, done, executor=executor).value == 3
-    assert executor._refused == {"tcp://here": "the disk is full"} and executor._sending.done()
+    assert executor._refusal_by_address == {"tcp://here": "the disk is full"} and executor._sending.done()
     assert executor._fit == {"tcp://there"} and executor.stats.refused == 1
     executor._fit |= {"tcp://other"}
     assert called(monkeypatch, lacks, done, executor=executor).value == 3
-    assert executor._refused["tcp://there"] == "it lacks mug.obj", "it has them not although it was sent them"
+    assert executor._refusal_by_address["tcp://there"] == "it lacks mug.obj", "it has them not although it was sent them"
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -41,7 +41,7 @@ def failure(first: float, objective: float = 1.0) -> FoundFailure:
 def checked(known: Failures, *, rule: VerificationRule | None = None, trials: int = 20) -> Verifier:
     """An attack of which everything but the different failures has been checked."""
     problem: Any = Coin(domain=NAMED)
-    problem.rule = rule or problem.rule
+    problem.verification_rule = rule or problem.verification_rule
     verifier = Verifier(Journal(None, ParallelEvaluator(problem)), (8,), Stages(NullProgress()), look_sizes=TRIAL_LOOKS)
     nothing = (0.0, 0.0, 0.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
     found = SearchResult(torch.full((3,), 0.5), *nothing, failures=known)

@@ -55,8 +55,8 @@ def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
         return outcome(u)
 
     findings = finding(trial)
-    assert findings.bracket.is_closed and findings.bracket.confirmed
-    last = [f"check {findings.bracket.checks - one}" for one in (1, 2)]
+    assert findings.smallest_change_bracket.is_closed and findings.smallest_change_bracket.confirmed
+    last = [f"check {findings.smallest_change_bracket.n_checks - one}" for one in (1, 2)]
     assert sum(tried[kind] for kind in last) == MIN_CONFIRMING_TRIALS
     assert {tried[kind] for kind in tried if kind not in last} == {6, 2}
 
@@ -74,5 +74,5 @@ def test_an_interrupt_on_the_way_keeps_the_smallest_configuration_so_far(stop: i
         return outcome(u)
 
     findings = finding(trial)
-    assert findings.bracket is None and torch.equal(findings.search.best_u, passed[-1])
+    assert findings.smallest_change_bracket is None and torch.equal(findings.search.best_u, passed[-1])
     assert (len(passed) > 2) == (stop == 30)

@@ -90,7 +90,7 @@ def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     assert (ours != theirs).float().mean() < 0.002  # the ray through a pixel's middle is looked up, not worked out
     pictures = [one.radiance(one.start, seed=1, spp=16) for one in (wet, dry)]
     assert float((pictures[0] - pictures[1]).abs().mean()) > 0.02 * float(pictures[1].mean())
-    assert wet.scene.definition[0].gain == dry.scene.definition[0].gain
+    assert wet.scene.description_and_filter[0].gain == dry.scene.description_and_filter[0].gain
 
 
 def test_a_textures_derivative_goes_through_the_drops() -> None:

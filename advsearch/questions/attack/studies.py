@@ -250,8 +250,8 @@ def _check_not_lost(chains: Sequence[Chain], result: BatchResult) -> None:
         (chain_index,) = result.items
         first_attack = chains[chain_index][0]  # all have the same object and model
         title = first_attack.config.object
-        if first_attack.subject != title:
-            title += f" with {first_attack.subject}"
+        if first_attack.object_or_model != title:
+            title += f" with {first_attack.object_or_model}"
         raise ClusterError(
             f"{title}: {result.failure_reason}; leave it out, or go on without it"
         )

@@ -547,7 +547,7 @@ def _find_sweep_truth(
             (scene for scene in job.scenes if scene.object == object_name),
             job.scenes[0],
         )
-        return task.truth(job.make_facts(scene, {}))
+        return task.truth(job.make_ground_truth_facts(scene, {}))
     number = int(image_number)
     if number >= job.images_per_scene * len(job.scenes):
         raise InputError(

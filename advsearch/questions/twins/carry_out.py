@@ -411,7 +411,7 @@ class Comparison:
                 partial(self._make_twin, number, selection, layer, renderer)
             )
             for index, judge in enumerate(self._judges):
-                yield measurements.get_row(
+                yield measurements.get_or_measure_row(
                     make_row_name(number, index),
                     TwinRow,
                     partial(self._compare_object, number, selection, make_twin, judge),

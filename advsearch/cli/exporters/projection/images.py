@@ -86,7 +86,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
     with writing.name_setting_in_errors("out"), writing.storage_errors(out):
         for control, u in projectors:
             # several projectors have a folder each
-            folder = out / control.file_name if len(projectors) > 1 else out
+            folder = out / control.name_in_files if len(projectors) > 1 else out
             folder.mkdir(parents=True)
             notes += write_projector(folder, adversarial, control, control.values(u))
     return notes

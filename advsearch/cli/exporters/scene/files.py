@@ -132,7 +132,7 @@ def has_haze(renderer: Any, inputs: Mapping[str, Any]) -> bool:
 
     Haze with density 0 is invisible.
     """
-    description, _filter = renderer.scene.definition
+    description, _filter = renderer.scene.description_and_filter
     names = [
         part.name for part in description.parts if isinstance(part, parts.HazePart)
     ]
