@@ -258,8 +258,8 @@ class Domain:
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
         # the dataclass is frozen
-        object.__setattr__(self, "lower", lower)
-        object.__setattr__(self, "upper", upper)
+        object.__setattr__(self, "lower_bounds", lower)
+        object.__setattr__(self, "upper_bounds", upper)
 
     @property
     def initial_point(self) -> Tensor:

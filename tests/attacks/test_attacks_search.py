@@ -262,7 +262,7 @@ def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
 @pytest.fixture(autouse=True)
 def no_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of one test are not the next one's."""
-    monkeypatch.setattr(INTERRUPTS, "count", 0)
+    monkeypatch.setattr(INTERRUPTS, "n_received", 0)
 
 
 def interrupt_at(number: int, error: type[BaseException] = KeyboardInterrupt) -> Evaluate:

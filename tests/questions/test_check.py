@@ -118,7 +118,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(planning, function.__name__, partial(function, counts=(2,)))
     for name, value in {"FACTORS": (1.0, 3.0), "CONVERGED_SPP": 2, "CONVERGED_SPP_FACTOR": 2}.items():
         monkeypatch.setattr(planning, name, value)
-    monkeypatch.setattr(INTERRUPTS, "count", 0)
+    monkeypatch.setattr(INTERRUPTS, "n_received", 0)
     row = {"item": "tracing", "what": "tracing", "time_gain": 2.0, "seconds": 1.0, "safe": True}
     gain = GainRow.from_values({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
     monkeypatch.setattr(checking, "measure_gains", lambda *_, **__: [gain])
