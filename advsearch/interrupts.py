@@ -41,7 +41,7 @@ class Interrupts:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Count an interrupt, and raise KeyboardInterrupt.
 
-        Nothing is raised once all work is done (`ended`). A signal soon after another
+        Nothing is raised once all work is done (`is_work_done`). A signal soon after another
         one comes from the same Ctrl-C, and is ignored.
 
         Args:

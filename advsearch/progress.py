@@ -88,9 +88,9 @@ class Stages:
             name: name under which its seconds are stored. Stages of the same name add
                 up.
             title: name of the stage for the user, such as "searching".
-            total: number of its steps; None if they are not counted.
+            total_seconds: number of its steps; None if they are not counted.
             hint: what the stage consists of, and the setting that makes it shorter.
-            at_most: whether `total` is an upper bound.
+            at_most: whether `total_seconds` is an upper bound.
         """
         self.end()
         self._name = name

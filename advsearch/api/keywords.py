@@ -383,7 +383,7 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
 
     A scene, a model and controls may be Python objects. Since a configuration is stored
     in a file, its settings have the names of these objects. The objects themselves are
-    attached to it (`Config.python_object`), with a list of those that only this Python
+    attached to it (`Config.get_python_object`), with a list of those that only this Python
     session has, and that no file can name.
 
     Args:

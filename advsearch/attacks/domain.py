@@ -230,7 +230,7 @@ class Domain:
         object.__setattr__(self, "blocks", tuple(self.blocks))
 
     def _compute_bounds(self) -> None:
-        """Compute `lower` and `upper`, the bounds (d,) of every element of u.
+        """Compute `lower_bounds` and `upper_bounds`, the bounds (d,) of every element of u.
 
         An l-infinity ball around the start is a box too, so they are the bounds of its
         intersection with the block's own bounds.
@@ -254,7 +254,7 @@ class Domain:
                     f"[{block.low}, {block.high}], got {low:.6g} to {high:.6g}"
                 )
             if block.norm == "linf" and block.epsilon is not None:
-                # A slice is a view, so this changes `lower` and `upper` in place.
+                # A slice is a view, so this changes `lower_bounds` and `upper_bounds` in place.
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
         # the dataclass is frozen

@@ -170,7 +170,7 @@ class Evaluation:
         """Return the evaluation as it is passed to policies, without NaN.
 
         - Gradient elements that are NaN or infinite become zero, whether the objective
-          is finite or not. Their number is added to `non_finite`.
+          is finite or not. Their number is added to `n_non_finite`.
         - If the objective is NaN or infinite, it becomes -inf, the worst value. All of
           its gradient becomes zero and its success false.
         """
@@ -188,7 +188,7 @@ class Evaluation:
     def _sanitize_gradient(self) -> Evaluation:
         """Return the evaluation with zeros in place of NaN or infinite gradients.
 
-        The number of elements that were replaced is added to `non_finite`.
+        The number of elements that were replaced is added to `n_non_finite`.
         """
         gradient = self.gradient
         if gradient is None:
@@ -299,7 +299,7 @@ class Policy(ABC, Generic[State]):
 
     Attributes:
         name: name for messages and the log.
-        handles_choices: whether it searches discrete choices (`Block.options`) itself.
+        handles_choices: whether it searches discrete choices (`Block.n_options`) itself.
             Any other policy is wrapped in `Choices` by `search`, and only gets numbers.
     """
 

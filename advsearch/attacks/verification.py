@@ -149,7 +149,7 @@ class VerificationRule:
     def min_trials(self) -> int:
         """Smallest number of trials that can verify a claim.
 
-        If `percent` of these trials succeed, the lower bound of the interval of the
+        If `required_percent` of these trials succeed, the lower bound of the interval of the
         success rate is at least `MIN_RATE`.
         """
         return next(
@@ -580,7 +580,7 @@ def _list_outcomes(
 ) -> tuple[bool | None, ...]:
     """Return whether each trial is a success, or None if it does not count.
 
-    If conditions vary (`VerificationRule.is_conditional`), a trial does not count if the clean
+    If conditions vary (`VerificationRule.has_varying_conditions`), a trial does not count if the clean
     prediction under the same conditions is wrong.
 
     Args:

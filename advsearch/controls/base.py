@@ -468,7 +468,7 @@ class Control:
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check the values of the choices, `self.chosen`.
+        """Check the values of the choices, `self.choice_values`.
 
         Does nothing by default. Subclasses override it for what `Choice` can't check,
         such as two choices that exclude each other.
@@ -627,7 +627,7 @@ class Control:
         return bound
 
     def bind_parameters(self) -> None:
-        """Set `slots`, `start`, `groups` and `adjusted_defaults` for `self.scene`.
+        """Set `parameter_slots`, `start`, `groups` and `adjusted_defaults` for `self.scene`.
 
         A slot is a parameter with the position of its coordinates in the control's
         slice of u; a fixed parameter has no coordinates. A group has the coordinates of
@@ -655,7 +655,7 @@ class Control:
         self.groups = tuple(
             self._make_group(slot) for slot in slots if slot.n_coordinates
         )
-        # For `values`: the lower bound and the width of the range of each coordinate,
+        # For `compute_values`: the lower bound and the width of the range of each coordinate,
         # (d,) each. All coordinates of a slot have the same range. A slot that is fixed
         # or has a list of values has no range; its placeholder is never read.
         placeholder = Range(0.0, 1.0)
@@ -926,7 +926,7 @@ class Control:
         `on_picture` instead.
 
         Args:
-            values: value of each parameter, by name.
+            compute_values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one. Only names in
                 `refines` may be returned again.
         """
@@ -953,7 +953,7 @@ class Control:
         it, by differentiable torch operations.
 
         Args:
-            values: value of each parameter, by name.
+            compute_values: value of each parameter, by name.
             image: (H, W, 3) display-referred sRGB in [0, 1].
         """
         return image
@@ -978,7 +978,7 @@ class Control:
         """Return further values to store with a configuration; none by default.
 
         Args:
-            values: value of each parameter, by name.
+            compute_values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one.
 
         Returns:
@@ -1055,7 +1055,7 @@ class Control:
         """Return images to store with a result; none by default.
 
         Args:
-            values: value of each parameter, by name.
+            compute_values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one.
 
         Returns:
@@ -1089,7 +1089,7 @@ class Control:
         """Return other files to store with a result; none by default.
 
         Args:
-            values: value of each parameter, by name.
+            compute_values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one.
 
         Returns:

@@ -598,7 +598,7 @@ class Slot:
         )
 
     def get_start_coordinates(self) -> list[float]:
-        """Return the coordinates of `start_value`; none if the parameter is fixed."""
+        """Return the coordinates of `get_start_value`; none if the parameter is fixed."""
         spec = self.parameter_spec
         value = self.get_start_value()
         if isinstance(spec, Range):

@@ -97,7 +97,7 @@ class CroppedSearch(PredictedSearch):
         the light paths of the search; the full image has fewer samples.
 
         Args:
-            windowing: the window.
+            selected_window: the window.
             kind: kind of the search.
             number: index of the query, for the seed.
             image: full image; it is stored, to be compared with later ones.

@@ -257,7 +257,7 @@ class Problem:
         Args:
             u: (d,) the configuration.
             seed: seed of the noise and, if they are drawn, of the conditions.
-            spp: samples per pixel.
+            search_spp: samples per pixel.
             with_conditions: whether conditions are drawn; else they leave the scene
                 unchanged.
 
@@ -387,7 +387,7 @@ class Problem:
             predict: function from a full configuration to an image (H, W, 3).
             full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise of the traced images.
-            spp: samples per pixel of a rendered image.
+            search_spp: samples per pixel of a rendered image.
             is_random: (d,) bool, which searched coordinates of `full_u` were set to
                 random values for this comparison. They are no change by the search.
             renderer: traces the images; None for that of the problem.
@@ -670,7 +670,7 @@ class Problem:
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search by its mean over sampled conditions.
 
-        Each of the `n_draws` conditions is rendered once. The noise of its image has
+        Each of the `conditions_per_evaluation` conditions is rendered once. The noise of its image has
         the same seed as the condition. If the query requests an image, it is rendered
         under conditions that leave the scene unchanged, as no sampled one represents
         all of them.
@@ -728,7 +728,7 @@ class Problem:
         Args:
             full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise.
-            spp: samples per pixel.
+            search_spp: samples per pixel.
             collected_light: light that an earlier call collected at `full_u`; None to
                 collect it now.
         """

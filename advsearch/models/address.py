@@ -384,7 +384,7 @@ class AddressModel(models.RemoteNetwork):
         return torch.tensor(rows).log()
 
     def _request_texts(self, images: Sequence[Image8Bit]) -> list[list[str]]:
-        """Return the texts about each image, one for each of `times` requests.
+        """Return the texts about each image, one for each of `n_answers_per_image` requests.
 
         If an answer has scores in place of a text, its text is the name with the
         highest score.
@@ -489,7 +489,7 @@ class AddressModel(models.RemoteNetwork):
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
         """Return the JSON body of a request about an image.
 
-        It follows the protocol of OpenAI's chat if `chat` is not empty, and else the
+        It follows the protocol of OpenAI's chat if `chat_model_name` is not empty, and else the
         plain protocol, {"image": PNG in base64, "prompt": question}.
         """
         encoded = base64.b64encode(models.encode_levels(image)).decode()

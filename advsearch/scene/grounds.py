@@ -294,7 +294,7 @@ def find_valid_range(
     if abs(rotation) > MAX_MAP_ROTATION:
         return NO_RANGE
     # A camera that moves back by d sees things at a distance r too large by the factor
-    # (r + d) / r. The nearest things count in its direction of view (`towards`).
+    # (r + d) / r. The nearest things count in its direction of view (`view_azimuth`).
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
         surroundings.nearest_distance, camera.view_azimuth
     )

@@ -109,7 +109,7 @@ class Crop(NamedTuple):
 # Largest size of a group whose motion of outlines is measured.
 MAX_MEASURED_SIZE = 64
 # fraction of the noise over which the tone curve is nearly straight; see
-# `Renderer.render_halves`
+# `Renderer.render_independent_images`
 STRAIGHT_FRACTION = 0.0625
 
 
@@ -805,7 +805,7 @@ class Renderer:
     ) -> Tensor:
         """Return the linear radiance of scene inputs, differentiable in them.
 
-        If paths are traced, it counts in `renders`; a prediction does not.
+        If paths are traced, it counts in `n_renders`; a prediction does not.
 
         Args:
             inputs: inputs of the scene.

@@ -76,7 +76,7 @@ class Movable:
     vertices: Float64Array  # (V, 3) in the coordinates of its mesh
     joint_nodes: IntArray  # (J,) nodes of the joints; its own node if it has no skin
     inverse_binds: Float64Array  # (J, 4, 4) inverse bind matrices
-    joints: IntArray  # (V, n) indices into `nodes`
+    joints: IntArray  # (V, n) indices into `joint_nodes`
     weights: Float64Array  # (V, n) of the joints; they sum to 1
     targets: tuple[MorphTarget, ...]  # morph targets
     rest_weights: Float64Array  # (T,) their weights at rest

@@ -359,7 +359,7 @@ class SurfaceParts:
         outside of the map count as on its border.
 
         Args:
-            face: (n,) index of the face.
+            face_of_part: (n,) index of the face.
             uv: (n, 2) the mesh's own texture coordinates.
         """
         if self.is_unwrapped:

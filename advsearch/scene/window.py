@@ -53,7 +53,7 @@ class Window(NamedTuple):
         It is differentiable with respect to these (h, w, ...).
         """
         pasted = image.clone()
-        # `select` returns a view, through which `pasted` is written.
+        # `crop_image` returns a view, through which `pasted` is written.
         self.crop_image(pasted)[...] = pixels
         return pasted
 

@@ -424,8 +424,8 @@ class Config(BaseModel):
 
         The file has a mapping from settings to values, which may also have `schema`,
         `command` and `base` (see `read_yaml`). A setting in the file that affects more
-        than the run, such as an address to connect to (`powers`), is ignored, since
-        somebody else may have written the file; `left_out` lists it.
+        than the run, such as an address to connect to (`settings_with_effects`), is ignored, since
+        somebody else may have written the file; `omitted_settings` lists it.
 
         Args:
             path: path of the file.
@@ -496,7 +496,7 @@ class Config(BaseModel):
 
         A part, such as an attack of a study, reads its settings from its own file. But
         settings with an effect outside of the run, such as an address to connect to,
-        are never read from files (`powers`). So they are passed on, if they do not
+        are never read from files (`settings_with_effects`). So they are passed on, if they do not
         change the numbers of the run (`changeable_settings`).
         """
         return {
@@ -508,7 +508,7 @@ class Config(BaseModel):
         }
 
     def check_no_effects(self, where: str) -> None:
-        """Check that no setting has an effect outside of the run (`powers`).
+        """Check that no setting has an effect outside of the run (`settings_with_effects`).
 
         This is for files of which the user cannot confirm single settings, such as
         those that another file names.
@@ -602,7 +602,7 @@ class Config(BaseModel):
         """Return the configuration as YAML.
 
         `from_yaml` returns an equal configuration. Only settings with an effect outside
-        of the run (`powers`) are lost: they are not read from files.
+        of the run (`settings_with_effects`) are lost: they are not read from files.
         """
         data = {"schema": written.SCHEMA, "command": self.command, **self.to_json()}
         note = ""

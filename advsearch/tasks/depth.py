@@ -277,7 +277,7 @@ class Depth(Task):
 
         The kind is that of the options, or that which the network states. If it is
         unknown, or predictions can't be judged, the message about it is stored in
-        `missing`, which `ambiguities` returns.
+        `missing_option_message`, which `ambiguity_message` returns.
         """
         kind = self._get_kind(output[0])
         missing = self._describe_missing_option(kind, truth)

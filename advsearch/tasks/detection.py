@@ -259,7 +259,7 @@ class Detection(ClassTask):
             truth: truth of that image; None if it is unknown.
 
         Returns:
-            The task with its `doubts`: why its format may be wrong, or "".
+            The task with its `format_doubts`: why its format may be wrong, or "".
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)

@@ -115,7 +115,9 @@ class JointTask(Task):
     @property
     def ambiguity_message(self) -> str:
         return "; ".join(
-            judge.ambiguity_message for judge in self.member_tasks if judge.ambiguity_message
+            judge.ambiguity_message
+            for judge in self.member_tasks
+            if judge.ambiguity_message
         )
 
     @property

@@ -70,7 +70,7 @@ class ReferencedFiles:
         """Return the content of a file that a mesh file names.
 
         The name is tried as written, and then as other systems or folders may spell it
-        (`_list_spellings`). If it is not read, `refused` gets the reason.
+        (`_list_spellings`). If it is not read, `refusal_by_name` gets the reason.
 
         Raises:
             FileNotFoundError: the file is missing or must not be read.
@@ -84,7 +84,7 @@ class ReferencedFiles:
     def read_or_explain(self, name: str) -> bytes | str:
         """Return the content of a file that a mesh file names, or why it is not read.
 
-        The reason is a text; unlike `get`, this method does not store it in `refused`.
+        The reason is a text; unlike `read_file`, this method does not store it in `refusal_by_name`.
         If no spelling of the name works, it is the reason of the last spelling that was
         refused for more than a missing file.
         """

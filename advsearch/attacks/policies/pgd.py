@@ -377,7 +377,7 @@ class AscentPolicy(Policy[Ascent]):
 class PGD(AscentPolicy):
     """Projected gradient ascent (Madry et al. 2018) for a noisy objective.
 
-    One step, with P the projection onto the domain and `steepest` the sign of a vector
+    One step, with P the projection onto the domain and `compute_steepest_step` the sign of a vector
     in an l-infinity block and the vector over its norm in an l2 or box block, scaled by
     the block's radius:
 
@@ -395,7 +395,7 @@ class PGD(AscentPolicy):
     to it only if the last window lags behind it by two standard deviations of the
     window.
 
-    In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size
+    In a domain without noise (`Domain.is_noise_free`) no gradient is clipped, and the step size
     falls linearly over the planned steps. This reached larger objectives than
     Auto-PGD's rule at every budget that was tried (docs/policies/pgd.md). In addition
     it is halved after a window that gained less than `MIN_WINDOW_GAIN` of the gain of

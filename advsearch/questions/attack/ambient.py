@@ -30,7 +30,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     follows the ambient light, so that the projector's light gets darker in the image.
     Nothing else changes. The trials have the same seeds in every light, and no other
     stage uses these seeds. The results are stored in
-    `verifier.state.ambient_verifications`, by lux.
+    `verifier.state.verification_by_lux`, by lux.
 
     Args:
         verifier: verifier of the attack.

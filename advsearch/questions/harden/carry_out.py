@@ -388,7 +388,7 @@ class Hardening:
             measurement: a key of `MEASUREMENTS`.
             control: control that was searched.
             number: number of the scene.
-            is_wrong: whether it found a wrong prediction.
+            is_wrong_by_search: whether it found a wrong prediction.
         """
         kind = f"{measurement} {control}"
         self.is_wrong_by_search[kind, number] = is_wrong

@@ -72,7 +72,7 @@ class Lesson:
 
     @property
     def plain_image(self) -> Tensor:
-        """The image of `levels` (H, W, 3), sRGB in [0, 1]."""
+        """The image of `plain_image_uint8` (H, W, 3), sRGB in [0, 1]."""
         return self.plain_image_uint8 / 255.0
 
     @property
@@ -147,7 +147,7 @@ class RenderedLesson(Lesson):
         Args:
             right_classes: indices of the right classes.
             plain: the plain image (H, W, 3) in [0, 1].
-            images: the other images (N, H, W, 3) in [0, 1].
+            images_uint8: the other images (N, H, W, 3) in [0, 1].
         """
         never_evaluated = torch.full((len(images),), torch.inf)
         return cls(

@@ -90,7 +90,7 @@ class Trainer(ABC):
         """Set up the trainer.
 
         Args:
-            work: samples scenes and items of the run.
+            scene_jobs: samples scenes and items of the run.
             student: the copy of the network that is trained.
             optimiser: function from a list of parameters to an optimizer; None for
                 AdamW.

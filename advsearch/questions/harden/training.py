@@ -102,7 +102,7 @@ class ClassifierTrainer(Trainer):
             student: the copy of the network that is trained.
             optimiser: function from a list of parameters to an optimizer; None for
                 AdamW.
-            beside: batches of the user's own images and class indices. Each step also
+            user_examples: batches of the user's own images and class indices. Each step also
                 trains with one of them. When they end, they are repeated.
         """
         super().__init__(work, student, optimiser)

@@ -366,7 +366,7 @@ class PictureBench:
         Returns:
             A row of the result for each reference.
         """
-        # "none" comes first, as in `_lines`: the other references need it.
+        # "none" comes first, as in `_estimators`: the other references need it.
         denoisers = list(dict.fromkeys(map(get_denoiser, self._estimators)))
         rows = []
         for index, denoiser in enumerate(denoisers):

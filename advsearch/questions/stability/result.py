@@ -123,7 +123,7 @@ def check_range(
     Args:
         description: what the number is.
         value: the number.
-        min_value, most: inclusive bounds; None for no bound.
+        min_value, max_value: inclusive bounds; None for no bound.
     """
     ok = not math.isnan(value)
     if min_value is not None:

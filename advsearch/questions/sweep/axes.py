@@ -844,7 +844,7 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the full sweep.
-            count: number of consecutive images of one scene.
+            n_images: number of consecutive images of one scene.
 
         Returns:
             (count, k) indices among `parts` of each of `sampled_numbers`.
@@ -879,7 +879,7 @@ class SceneConfigurations:
         Args:
             draws: draws of k numbers.
             first: number of the first image in the full sweep.
-            count: count of images.
+            n_images: count of images.
         """
         if self.independent_units.frames is None:
             return draws.points(self.independent_units.find_draw(first), count)
@@ -894,7 +894,7 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the scene.
-            count: count of images.
+            n_images: count of images.
         """
         if not self._axes:
             return ()
@@ -906,7 +906,7 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the scene.
-            count: number of images.
+            n_images: number of images.
             before: number of images of the scenes before this one. They have used the
                 draws before `before`; the grid starts anew in every scene.
         """

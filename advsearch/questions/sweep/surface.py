@@ -91,7 +91,7 @@ class PartCounts:
         self.visible_counts = np.zeros(n_parts, np.int64)
         self.wrong_counts = np.zeros(n_parts, np.int64)
         self.permuted_counts = np.zeros((N_PERMUTATIONS, n_parts), np.uint32)
-        # for the sequential sampling in `add`; failures left in each permutation
+        # for the sequential sampling in `add_image`; failures left in each permutation
         self._images_left = n_images
         self._failures_left = np.full(N_PERMUTATIONS, n_failures)
         self._random = np.random.default_rng(seed)

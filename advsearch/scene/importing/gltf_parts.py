@@ -146,7 +146,7 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
         roots = header.scenes[default_scene].nodes
     scene_nodes = header.find_descendants(roots)  # with the roots themselves
     materials = header.materials
-    # `can_read` is also True for a material without the texture.
+    # `shares_layout` is also True for a material without the texture.
     return {
         "occlusion map{s}: left out": (
             material.occlusionTexture is not None for material in materials

@@ -166,7 +166,7 @@ def _read_joint_set(
             file.path, "four joints and four weights of each vertex", "others"
         )
     joints = file.read_stored_values(joints_index)[used].astype(np.int64)
-    # Weights may be stored as integers, which `read_numbers` converts to fractions.
+    # Weights may be stored as integers, which `read_float_rows` converts to fractions.
     weights = file.read_float_rows(weights_index, used)
     return VertexJoints(joints, weights)
 

@@ -310,7 +310,7 @@ class FileImages:
     def load_file(
         self, name: str, kind: ImageKind, message: str
     ) -> Float32Array | None:
-        """Return the values of an image that the file names; see `load`."""
+        """Return the values of an image that the file names; see `load_image`."""
         return self.load_image(
             name, lambda: self.references.read_file(name), kind, name, message
         )

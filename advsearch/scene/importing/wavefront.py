@@ -745,11 +745,11 @@ class ObjLines:
         """Replace negative indices (C,) in place by indices that count from 1.
 
         A negative index counts back from the line of its face: -1 is the last row of
-        the table `kind` above it.
+        the table `kind_of_line` above it.
 
         Args:
             index: (C,) indices of all corners.
-            kind: one of `TABLES`.
+            kind_of_line: one of `TABLES`.
             rows: (P,) the row of each face's line in the file.
             sizes: (P,) the number of corners of each face.
         """
@@ -789,7 +789,7 @@ class ObjLines:
         break for each line remain.
 
         Args:
-            kind: keyword, one of `KINDS`.
+            kind_of_line: keyword, one of `KINDS`.
         """
         is_selected = self.kind_of_line == KINDS.index(kind)
         # Lengths include line breaks, so that they add up to the length of the text.

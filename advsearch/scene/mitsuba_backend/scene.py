@@ -127,8 +127,8 @@ class MitsubaScene:
             filter: reconstruction filter, "box" or "gaussian".
             leave_out: names of work that is left out; see the class.
             max_depth: longest light path in segments.
-            sampler: Mitsuba's name of the sampler, such as "independent".
-            integrator: Mitsuba's name of the path integrator; None chooses one.
+            sampler_name: Mitsuba's name of the sampler, such as "independent".
+            integrator_name: Mitsuba's name of the path integrator; None chooses one.
         """
         with mitsuba_lock:
             # The import registers the plugins, which needs the variant.
@@ -200,7 +200,7 @@ class MitsubaScene:
         """Set the integrator of images, and the lengths from which paths may end early.
 
         Among walls light is reflected many times: there Russian roulette saves more
-        time than its noise costs. `integrator` is Mitsuba's type; None takes "path"
+        time than its noise costs. `integrator_name` is Mitsuba's type; None takes "path"
         there, and "prb" elsewhere.
         """
         self.integrator_name = integrator or "prb"
@@ -286,7 +286,7 @@ class MitsubaScene:
     def copy_with(self, **changes: Any) -> MitsubaScene:
         """Return another scene, made with the same arguments except for some changes.
 
-        `changes` may have `max_depth`, `sampler`, `integrator` and `leave_out`. The
+        `changes` may have `max_depth`, `sampler_name`, `integrator_name` and `leave_out`. The
         integrator is chosen again if it is not among them.
         """
         description, filter_name = self.description_and_filter
@@ -307,7 +307,7 @@ class MitsubaScene:
 
     @contextmanager
     def limit_depth(self, depth: int | None) -> Iterator[None]:
-        """Limit light paths to `depth` segments inside the `with`, if it is not
+        """Limit light paths to `current_max_depth` segments inside the `with`, if it is not
         None.
         """
         depth_before = self.current_max_depth
@@ -816,7 +816,7 @@ class MitsubaScene:
         """
         self._check_known(inputs)
         if self._values_to_upload:
-            # Write all inputs: without `_applied`, all of them count as changed.
+            # Write all inputs: without `_applied_values`, all of them count as changed.
             inputs = {**self._values_to_upload, **inputs}
             self._applied_values.clear()
         changes = self._find_changes(inputs)

@@ -190,7 +190,7 @@ class SceneRegistry:
     def free_unused(self) -> None:
         """Free the objects whose owner has been freed; call it only between renders.
 
-        It counts as a change of the population: callers test `unused` before.
+        It counts as a change of the population: callers test `unused_keys` before.
         """
         while self.unused_keys:
             self._held.pop(self.unused_keys.pop(), None)

@@ -517,7 +517,7 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     A texel's light above `HOT_FACTOR` times the mean, such as that of the sun, is hot.
     It gets rays of its own, since the coarse cells of the sky would blur its shadows;
     the rest stays in the cells. If no more than `MIN_HOT_FRACTION` of all light is hot,
-    nothing is treated so. `SkyLight.map`, which gloss reflects, has all light.
+    nothing is treated so. `SkyLight.coarse_map`, which gloss reflects, has all light.
     """
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]

@@ -710,7 +710,7 @@ def _collect(
     """
     # The renderer counts the values of all calls; those of this call are the increase.
     non_finite_before = renderer.n_non_finite
-    # `find_front` adds which part of a photograph is in front of the object.
+    # `find_front_axis` adds which part of a photograph is in front of the object.
     inputs = renderer.replace_photograph_depth(
         renderer.scene.input_assembler(renderer.space.inputs(u))
     )

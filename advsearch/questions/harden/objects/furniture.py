@@ -608,7 +608,7 @@ def lamp(sampler: ParameterSampler) -> Instance:
     """Make a table lamp of random proportions, shade and base.
 
     Lengths are in centimeters. `sampler(x, low=..., high=...)` returns x for the
-    canonical lamp and a uniform sample for a random one, and `sampler.pick` the first
+    canonical lamp and a uniform sample for a random one, and `sampler.sample_choice` the first
     choice or a random one.
     """
     total_height = sampler(48.0, low=42.0, high=58.0)
