@@ -40,6 +40,7 @@ from torch import Tensor
 
 from advsearch.errors import FileFormatError, InputError
 from advsearch.pictures import check_decodable, open_image, to_8bit_levels
+from advsearch.scene import rendered_channels as channels
 from advsearch.scene.assets import Float64Array, ObjectAsset
 from advsearch.scene.backdrop_photograph import (
     BackdropPhotograph as BackdropPhotograph,
@@ -274,11 +275,9 @@ def compose_over_photograph(
     shadow, and brightened by light that the object reflects.
 
     Args:
-        rendered: (H, W, C). Channels 0 to 2 are the object's radiance times its
-            coverage, and 3 is the coverage. With a plane, 4 to 6 are the change of its
-            radiance by the object. With a glossy plane, 7 to 9 are the change of what
-            its coat reflects, and 10 to 12 the environment in the coat without the
-            object. So C is 4, 7 or 13.
+        rendered: (H, W, C), where C is 4, 7 or 13, with the channels of
+            `advsearch.scene.rendered_channels`. The radiance is that of the object
+            times its coverage.
         behind: (H, W, 3) radiance of the photograph.
         inputs: result of `make_image_inputs`. The first channel of ``backdrop.front``
             is the fraction of the object that is hidden, the last that of the plane.
@@ -286,8 +285,8 @@ def compose_over_photograph(
     Returns:
         Radiance (H, W, 3).
     """
-    radiance = rendered[..., :3]
-    rendered_coverage = rendered[..., 3:4]
+    radiance = rendered[..., channels.RADIANCE]
+    rendered_coverage = rendered[..., channels.COVERAGE]
     coverage = rendered_coverage
     front = inputs.get("backdrop.front")
     if front is not None:
@@ -300,8 +299,8 @@ def compose_over_photograph(
         return radiance + uncovered * behind
 
     # change of the plane relative to its radiance; 0 where the plane is covered
-    relative_change = rendered[..., 4:7] / inputs["backdrop.plane"]
-    coat_change = rendered[..., 7:10]
+    relative_change = rendered[..., channels.PLANE_CHANGE] / inputs["backdrop.plane"]
+    coat_change = rendered[..., channels.COAT_CHANGE]
     if front is not None:
         # The last channel of two is the plane's. With one, it holds for both.
         visible_plane = 1.0 - front[..., -1:]
@@ -316,7 +315,10 @@ def compose_over_photograph(
     # coat. So the fraction of light that the shadow takes is added again for the part
     # of the photograph that is this reflection. The coat was rendered for the fraction
     # of the pixel that the object does not cover.
-    environment_in_coat = rendered[..., 10:] / (1.0 - rendered_coverage).clamp_min(1e-3)
+    uncovered_before = (1.0 - rendered_coverage).clamp_min(1e-3)
+    environment_in_coat = (
+        rendered[..., channels.ENVIRONMENT_IN_COAT] / uncovered_before
+    )
     unshaded = (uncovered - shade) * torch.minimum(environment_in_coat, behind)
     return radiance + (shade * behind + unshaded + coat_change).clamp_min(0.0)
 

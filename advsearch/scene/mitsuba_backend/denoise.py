@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import EnvironmentSetupError
+from advsearch.scene import rendered_channels as channels
 from advsearch.scene.assets import IntArray
 from advsearch.scene.mitsuba_backend.variant import mitsuba_lock
 
@@ -95,10 +96,8 @@ def denoise_image(
     plane is the ground of the photograph, on which the object's shadow falls.
 
     Args:
-        rendered: channels 0 to 2 are radiance. Channel 3, coverage, is returned as it
-            is. Channels 4 to 6 are the change of the plane's radiance by the object, 7
-            to 9 the change of what its coat reflects, and 10 to 12 what the coat
-            reflects of the environment.
+        rendered: the image, with the channels of `advsearch.scene.rendered_channels`.
+            Coverage is returned as it is.
         albedo, normal: (H, W, 3) float32 reflectance in [0, 1] and shading normal of
             the first hit.
         plane_radiance: (3,) radiance of the plane without the object; None if there is
@@ -106,31 +105,31 @@ def denoise_image(
         quick: whether to take less time, and leave a little more error.
     """
     remove_noise = partial(denoise, albedo=albedo, normal=normal, quick=quick)
-    color = rendered[..., :3].contiguous()
-    coverage = rendered[..., 3:4]
-    channels = [remove_noise(color), coverage]
+    color = rendered[..., channels.RADIANCE].contiguous()
+    coverage = rendered[..., channels.COVERAGE]
+    denoised = [remove_noise(color), coverage]
     if plane_radiance is not None:
         relative_change = _denoise_shade(
-            rendered[..., 4:7] / plane_radiance,
+            rendered[..., channels.PLANE_CHANGE] / plane_radiance,
             visible=(1.0 - coverage).clamp(0.0, 1.0),
             remove_noise=remove_noise,
         )
         # The plane is a surface: where the camera sees none, there is no normal.
         is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
-        channels.append(plane_radiance * is_surface * relative_change)
-    has_coat = rendered.shape[-1] > 7
+        denoised.append(plane_radiance * is_surface * relative_change)
+    has_coat = rendered.shape[-1] > channels.COAT_CHANGE.start
     if has_coat:
         # What the coat reflects without and with the object is denoised as two images,
         # which are then subtracted.
-        noisy_change = rendered[..., 7:10]
-        noisy_before = rendered[..., 10:].contiguous()
+        noisy_change = rendered[..., channels.COAT_CHANGE]
+        noisy_before = rendered[..., channels.ENVIRONMENT_IN_COAT].contiguous()
         noisy_after = (noisy_before + noisy_change).clamp_min(0.0)
         before = remove_noise(noisy_before)
         after = remove_noise(noisy_after)
         assert plane_radiance is not None
         fade = _compute_fade(noisy_change / plane_radiance)
-        channels += [(after - before) * fade, before]
-    return torch.cat(channels, dim=-1)
+        denoised += [(after - before) * fade, before]
+    return torch.cat(denoised, dim=-1)
 
 
 def _denoise_shade(
