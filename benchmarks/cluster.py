@@ -87,7 +87,7 @@ class ConstantRenderer:
     def __init__(self, space: Space, size: tuple[int, int]) -> None:
         self.space = space
         self.start = space.start
-        self.scene = SimpleNamespace(assembly=dict)
+        self.scene = SimpleNamespace(input_assembler=dict)
         self.image = torch.full((*size, 3), 0.5)
         self.formation = ImageFormation(resolution=size)
 

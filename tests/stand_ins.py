@@ -57,13 +57,13 @@ class StandInProblem:
     domain: Domain = field(default_factory=lambda: Domain(torch.full((6,), 0.5), (Block(4, "linf", 0.2), Block(2))))
     conditions: None = None
     searched_space: Any = field(default_factory=lambda: SimpleNamespace(controls=()))
-    rule: VerificationRule = WORST_CASE
-    spp: int = 4
+    verification_rule: VerificationRule = WORST_CASE
+    search_spp: int = 4
     search_depth: int | None = None
     seed: int = 3
     steps: int = 0
-    n_draws: int = 1
-    plan: StandInPlan = StandInPlan()
+    conditions_per_evaluation: int = 1
+    gradient_plan: StandInPlan = StandInPlan()
 
     def _logits(self, u: Tensor, seed: int) -> Tensor:
         noise = 0.02 * torch.randn(1, generator=torch.Generator().manual_seed(seed))

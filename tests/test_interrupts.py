@@ -59,7 +59,7 @@ def in_a_library() -> None:
 def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Handler, hook and counts are as before afterwards."""
     monkeypatch.setattr(sys, "unraisablehook", report_unraisable_error)
-    for name in ("count", "handled", "ended", "_last"):
+    for name in ("n_received", "n_handled", "is_work_done", "_last"):
         monkeypatch.setattr(INTERRUPTS, name, vars(Interrupts())[name])
     yield
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -84,8 +84,8 @@ FAULTS = (
     Fault(
         "scene: gradients have the noise of the picture",
         "advsearch/scene/renderer.py",
-        'seeds.stream(renderer.root_seed, "gradient", ctx.seed)',
-        'seeds.stream(renderer.root_seed, "primal", ctx.seed)',
+        'seeds.derive_seed(renderer.root_seed, "gradient", ctx.seed)',
+        'seeds.derive_seed(renderer.root_seed, "primal", ctx.seed)',
         ("tests/scene/test_renderer.py",),
     ),
     Fault(
@@ -202,8 +202,8 @@ FAULTS = (
     Fault(
         "attacks: trials of the wrong group count",
         "advsearch/attacks/verification.py",
-        "or clean.successes >= self.count_needed(clean.trials)",
-        "or adversarial.successes >= self.count_needed(adversarial.trials)",
+        "or clean.n_successes >= self.count_needed_successes(clean.n_trials)",
+        "or adversarial.n_successes >= self.count_needed_successes(adversarial.n_trials)",
         ("tests/attacks/test_attacks_verification.py",),
     ),
     Fault(
@@ -223,7 +223,7 @@ FAULTS = (
     Fault(
         "engine: a run that goes on evaluates again",
         "advsearch/engine/journal.py",
-        "return self._trials_of(query.kind).get(query.index)",
+        "return self._trials_of(query.kind).get(query.row_index)",
         "return None",
         ("tests/engine/test_resume.py",),
     ),
@@ -237,8 +237,8 @@ FAULTS = (
     Fault(
         "sweeps: a rate of another group",
         "advsearch/questions/sweep/result.py",
-        "adversarial=count_by_unit(adversarial, draws, adversarial_outcome),",
-        "adversarial=count_by_unit(clean, draws, clean_outcome),",
+        "adversarial=count_predictions(adversarial, draws, adversarial_outcome),",
+        "adversarial=count_predictions(clean, draws, clean_outcome),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(
@@ -272,15 +272,15 @@ FAULTS = (
     Fault(
         "report: the bleed is printed as a part of the size",
         "advsearch/report/sheets.py",
-        "(width - 2 * self.bleed[0]) * self.pixel[0], (\n            height - 2 * "
-        "self.bleed[1]\n        ) * self.pixel[1]",
-        "width * self.pixel[0], height * self.pixel[1]",
+        "(width - 2 * self.bleed[0]) * self.pixel_size_mm[0], (\n            height - 2 * "
+        "self.bleed[1]\n        ) * self.pixel_size_mm[1]",
+        "width * self.pixel_size_mm[0], height * self.pixel_size_mm[1]",
         ("tests/report/test_sheets.py",),
     ),
     Fault(
         "viewer: any name leads to the server",
         "advsearch/trust/pages.py",
-        "if not _is_server_address(host, named, port, token):",
+        "if not _is_server_address(host, listen_host, port, token):",
         "if not host:",
         ("tests/viewer/test_server.py",),
     ),
@@ -353,14 +353,14 @@ FAULTS = (
     Fault(
         "hardening: what judges is trained on",
         "advsearch/questions/harden/training.py",
-        "searched = [copy.copy(lesson) for lesson in held_back]",
-        "searched = list(held_back)",
+        "searched = [copy.copy(lesson) for lesson in validation_items]",
+        "searched = list(validation_items)",
         ("tests/questions/test_hardening.py",),
     ),
     Fault(
         "hardening: plain pictures may be lost",
         "advsearch/questions/harden/rounds.py",
-        "return clean >= self.results[0].clean - self.config.clean_loss - 1e-9",
+        "return clean >= self.finished_rounds[0].clean - self.config.clean_loss - 1e-9",
         "return True",
         ("tests/questions/test_hardening.py",),
     ),

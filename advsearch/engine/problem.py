@@ -997,7 +997,7 @@ class Problem:
             objective=total_objective / len(evaluations),
             gradient=gradient,
             success=n_successes >= n_needed,
-            n_non_finite=sum(evaluation.non_finite for evaluation in evaluations),
+            n_non_finite=sum(evaluation.n_non_finite for evaluation in evaluations),
             cost=max(evaluation.cost for evaluation in evaluations),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
         )

@@ -205,7 +205,7 @@ def make_task(task: AnyTask) -> Task:
     created: Any = task_class(**options)
     if created.judges_rig:
         # Its option `task` names the task of each image.
-        created = replace(created, part=make_task(created.task))
+        created = replace(created, image_task=make_task(created.task))
     result: Task = created
     return result
 

@@ -534,7 +534,7 @@ def make_each_thing_task(task: Task) -> EachThingTask:
     attributes = {"name": task.name, "objective": task.objective}
     task_class: Any = type("EachThing", (EachThingTask,), attributes)
     result: EachThingTask = task_class(
-        part=task, minimise=task.minimise, target=task.target
+        thing_task=task, minimise=task.minimise, target=task.target
     )
     return result
 

@@ -44,7 +44,7 @@ def asked(api: Callable[..., None]) -> list[AttackConfig]:
     """The configurations that a successful stand-in was given."""
     given: list[AttackConfig] = []
 
-    def attack(config: AttackConfig, *, progress: Progress, resumed: Path | None = None) -> Any:
+    def attack(config: AttackConfig, *, progress: Progress, resumed_directory: Path | None = None) -> Any:
         given.append(config)
         return SUMMARY
 
@@ -103,7 +103,7 @@ def test_bad_input_is_one_line_and_status_2(
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
         "import sys, advsearch.experiment\n"
-        "def carry_out(config, *, progress, resumed): raise ValueError('a bug')\n"
+        "def carry_out(config, *, progress, resumed_directory): raise ValueError('a bug')\n"
         "advsearch.experiment.run_experiment = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
@@ -124,7 +124,7 @@ def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
 def test_what_the_api_raises_becomes_a_status(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str], error: BaseException, status: int, message: str
 ) -> None:
-    def attack(config: AttackConfig, *, progress: Progress, resumed: Path | None = None) -> Any:
+    def attack(config: AttackConfig, *, progress: Progress, resumed_directory: Path | None = None) -> Any:
         raise error
 
     api(attack)
@@ -147,7 +147,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
 def test_json_is_all_that_stands_on_standard_output(
     api: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def attack(config: AttackConfig, *, progress: Progress, resumed: Path | None = None) -> Any:
+    def attack(config: AttackConfig, *, progress: Progress, resumed_directory: Path | None = None) -> Any:
         print("an objective of the user prints")
         os.write(1, b"so does a native library\n")
         ctypes.CDLL(None).puts(b"and one that buffers")
@@ -167,7 +167,7 @@ def test_json_is_all_that_stands_on_standard_output(
     ("ending", "status"), [("found", 0), ("budget spent", 0), ("already wrong", 0), ("interrupted", 130)]
 )
 def test_the_status_of_an_attack(api: Callable[..., None], ending: str, status: int) -> None:
-    api(lambda config, progress, resumed: samples.attack(ending=ending))
+    api(lambda config, progress, resumed_directory: samples.attack(ending=ending))
     assert main(["attack", "--object", "mug"]) == status
     assert main(["attack", "--object", "mug", "--json"]) == status
 
@@ -211,8 +211,8 @@ def test_resume_goes_on_with_what_was_stopped(
         run.append_rows(Row("search", 0))
     found: list[Any] = []
 
-    def goes_on(config: Config, *, progress: Progress, resumed: Path | None) -> Any:
-        found.append((config.command, resumed))
+    def goes_on(config: Config, *, progress: Progress, resumed_directory: Path | None) -> Any:
+        found.append((config.command, resumed_directory))
         return answer
 
     api(goes_on)

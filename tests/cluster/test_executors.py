@@ -203,7 +203,7 @@ def executor_of_nobody(**more: Any) -> Any:
     """An executor that has not connected, with a worker that may be given calls."""
     executor = object.__new__(DaskExecutor)
     vars(executor).update(
-        description="here", stats=WorkerStats(), _fit=frozenset({"tcp://here"}), _refused={}, _sending=None,
+        description="here", stats=WorkerStats(), _usable_addresses=frozenset({"tcp://here"}), _refusal_by_address={}, _sending=None,
         _tell=lambda text: None, _contents={}, _plugin_name="files", **more,
     )  # fmt: skip
     return executor
@@ -243,7 +243,7 @@ def looked_at(versions: dict[str, Any], seconds: float) -> tuple[int, list[str]]
         _client=client, _connection=connection, _counted_at=time.monotonic(), _alone_since=then,
         _looked_at=float("-inf"),
     )  # fmt: skip
-    vars(executor).update(_fit=frozenset(), _tell=told.append)
+    vars(executor).update(_usable_addresses=frozenset(), _tell=told.append)
     return executor.count_workers(), told
 
 
@@ -339,14 +339,14 @@ def test_what_a_worker_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_worker_that_is_not_fit_is_given_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """What it was to do is done elsewhere; files are sent once to all that come."""
     executor = executor_of_nobody()
-    vars(executor)["_fit"] = frozenset({"tcp://here", "tcp://there"})
+    vars(executor)["_usable_addresses"] = frozenset({"tcp://here", "tcp://there"})
     full = Prediction("finished", ("tcp://here", Reply(failure=Failure.UNFIT, error="the disk is full")))
     lacks = Prediction("finished", ("tcp://there", Reply(failure=Failure.MISSING_FILES, error="it lacks mug.obj")))
     done = Prediction("finished", ("tcp://there", Reply(value=3)))
     assert called(monkeypatch, full, lacks, done, executor=executor).value == 3
     assert executor._refusal_by_address == {"tcp://here": "the disk is full"} and executor._sending.done()
-    assert executor._fit == {"tcp://there"} and executor.stats.refused == 1
-    executor._fit |= {"tcp://other"}
+    assert executor._usable_addresses == {"tcp://there"} and executor.stats.refused == 1
+    executor._usable_addresses |= {"tcp://other"}
     assert called(monkeypatch, lacks, done, executor=executor).value == 3
     assert executor._refusal_by_address["tcp://there"] == "it lacks mug.obj", "it has them not although it was sent them"
 

@@ -60,7 +60,7 @@ def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
         "mug", DARK, setting_values={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0}
     )
     control = ProjectorControl(
-        elevation=89, distance=3 * scene.size_in_metres, fov=20, lumens=5, ambient_lux=50, resolution=4
+        elevation=89, distance=3 * scene.size_in_metres, fov=20, lumens=5, ambient=50, resolution=4
     )
     prepared = control.prepare(scene)
     bound = control.bind(prepared)

@@ -26,7 +26,7 @@ NORM = {"distribution": "norm", "loc": 30.0, "scale": 10.0}
 def azimuths(given: Any, shares: np.ndarray) -> np.ndarray:
     """The azimuths at coordinates, as a search over these conditions has them."""
     bound = CameraControl(azimuth=given).bind(MUG)
-    return np.array([float(bound.values(torch.tensor([share]))["azimuth"]) for share in shares.tolist()])
+    return np.array([float(bound.compute_values(torch.tensor([share]))["azimuth"]) for share in shares.tolist()])
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_an_endless_tail_is_left_out_on_both_sides() -> None:
 def test_derivatives_reach_what_is_drawn() -> None:
     bound = CameraControl(azimuth=Normal(30.0, 10.0)).bind(MUG)
     u = torch.tensor([0.5], requires_grad=True)
-    (slope,) = torch.autograd.grad(bound.values(u)["azimuth"], u)
+    (slope,) = torch.autograd.grad(bound.compute_values(u)["azimuth"], u)
     assert float(slope) == pytest.approx(10.0 * np.sqrt(2.0 * np.pi), rel=1e-2)
 
 

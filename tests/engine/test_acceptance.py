@@ -56,10 +56,10 @@ class Tracer:
     def noisy(self, seed: int) -> Tensor:
         return self.picture + self.noise * torch.randn(64, 64, 3, generator=torch.Generator().manual_seed(seed % 2**31))
 
-    def render_halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
+    def render_independent_images(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
         return self.noisy(seed + 1), self.noisy(seed + 2), self.picture
 
-    def mask(self, u: Tensor) -> Tensor:
+    def compute_object_mask(self, u: Tensor) -> Tensor:
         return self.seen
 
 

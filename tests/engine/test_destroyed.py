@@ -303,12 +303,12 @@ UNTOUCHED: dict[Any, set[str]] = {
     Policy: {"propose", "takes_differences", "counts", "distribution", "failures"},
     NumberControl: {
         *(
-            "declare_parameters", "setting_name", "to_settings", "select_form", "get_mesh", "with_scene",
+            "declare_parameters", "get_setting_name", "to_settings", "select_form", "get_mesh", "with_scene",
             "list_allowed_values", "is_searched", "resolve_parameter",
         ),
         *(
-            "get_clean_value", "get_scene_value", "get_spec", "get_budget", "must_match_scene",
-            "record_adjusted_default", "values", "advance_time", "scale_ambient",
+            "get_clean_value", "get_value_without_control", "get_parameter_spec", "get_budget", "must_start_at_clean_value",
+            "record_adjusted_default", "compute_values", "advance_time", "scale_ambient",
         ),
     },
 }  # fmt: skip

@@ -20,7 +20,7 @@ def queries(count: int, **more: Any) -> list[Query]:
 class RendererCount:
     """Counts what was not finite."""
 
-    non_finite = 0
+    n_non_finite = 0
 
 
 def test_answers_come_in_the_order_of_the_queries_whoever_gives_them() -> None:

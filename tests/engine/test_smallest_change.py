@@ -32,9 +32,11 @@ def finding(trial: Callable[[str, int, Tensor], Any]) -> Any:
     def trials(kind: str, configurations: dict[int, Tensor]) -> list[Any]:
         return [trial(kind, number, u) for number, u in configurations.items()]
 
-    problem = SimpleNamespace(domain=DOMAIN, seed=0, rule=WORST_CASE, steps=1)
-    findings = SimpleNamespace(predictor=None, bracket=None, search=None)
-    searches: Any = SimpleNamespace(problem=problem, findings=findings, policy=None, start=said, search=search)
+    problem = SimpleNamespace(domain=DOMAIN, seed=0, verification_rule=WORST_CASE, steps=1)
+    findings = SimpleNamespace(predictor=None, smallest_change_bracket=None, search_result=None)
+    searches: Any = SimpleNamespace(
+        problem=problem, run_state=findings, policy=None, begin_stage=said, run_search=search
+    )
     verifier: Any = SimpleNamespace(begin_stage=said, try_configurations=trials, n_trials=20)
     with suppress(KeyboardInterrupt):
         find_smallest(searches, searches.policy, verifier)
@@ -74,5 +76,5 @@ def test_an_interrupt_on_the_way_keeps_the_smallest_configuration_so_far(stop: i
         return outcome(u)
 
     findings = finding(trial)
-    assert findings.smallest_change_bracket is None and torch.equal(findings.search.best_u, passed[-1])
+    assert findings.smallest_change_bracket is None and torch.equal(findings.search_result.best_u, passed[-1])
     assert (len(passed) > 2) == (stop == 30)

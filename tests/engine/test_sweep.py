@@ -79,8 +79,8 @@ class FakeRenderer:
     def __init__(
         self, scene: Any, space: Any, size: tuple[int, int], denoise: str, seed: int, sampler: str = "independent"
     ) -> None:
-        self.space, self.size, self.non_finite = space, size, 0
-        self.start, self.scene = space.start, SimpleNamespace(assembly=dict)  # nothing of it is light
+        self.space, self.size, self.n_non_finite = space, size, 0
+        self.start, self.scene = space.start, SimpleNamespace(input_assembler=dict)  # nothing of it is light
         self.formation, self.plan = ImageFormation(denoiser=denoise, resolution=size), GradientPlan(())
         self.seen: list[tuple[Tensor, int, int]] = []
         self.share_paths = nullcontext

@@ -19,7 +19,7 @@ def noted(monkeypatch: pytest.MonkeyPatch, after: int = -1) -> list[tuple[Any, .
     original, made = StandInProblem.evaluate, list[tuple[Any, ...]]()
 
     def evaluate(self: StandInProblem, query: Query) -> Evaluation:
-        if (query.phase is None and query.spp != self.spp) or query.kind.startswith("sample count"):
+        if (query.phase is None and query.spp != self.search_spp) or query.kind.startswith("sample count"):
             if len(made) == after:
                 raise KeyboardInterrupt
             made.append((query.u.numpy().tobytes(), query.seed, query.spp))

@@ -421,7 +421,7 @@ def test_a_pixel_between_two_depths_is_hidden_by_its_part() -> None:
     """Two of four points of the object are hidden, and one of the two of the ground in the next pixel."""
     infinite = math.inf
     surfaces = SimpleNamespace(
-        names=("ground", "object"),
+        shape_names=("ground", "object"),
         z_depth=torch.tensor([[2.0, 2.0, 3.0, infinite], [2.0, 2.0, 3.0, infinite]]),
         visible_mask=lambda name: torch.tensor([[False, False, True, False]] * 2),
     )

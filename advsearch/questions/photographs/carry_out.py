@@ -544,7 +544,7 @@ def _find_sweep_truth(
     task = job.tasks[model_index]
     if image_number is None or not _needs_position(task):
         scene = next(
-            (scene for scene in job.scenes if scene.object == object_name),
+            (scene for scene in job.scenes if scene.object_name == object_name),
             job.scenes[0],
         )
         return task.truth(job.make_ground_truth_facts(scene, {}))

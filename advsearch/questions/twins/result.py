@@ -161,7 +161,7 @@ class TwinsConfig(Config):
         return self.task if isinstance(self.task, str) else str(self.task["name"])
 
     @property
-    def used_threads(self) -> int | None:
+    def n_used_threads(self) -> int | None:
         return self.threads
 
     @property
