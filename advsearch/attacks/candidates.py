@@ -434,7 +434,8 @@ class Bracket:
 
     Attributes:
         largest_failing_scale: largest scale at which a search found nothing; 0 if none has failed.
-        smallest_passing_scale: smallest scale at which a configuration passed; infinity if none did.
+        smallest_passing_scale: smallest scale at which a configuration passed; infinity
+            if none did.
         u: (d,) the configuration at `smallest_passing_scale`; None if there is none.
         searches: number of searches so far.
         n_checks: number of configurations that went through the trials so far.

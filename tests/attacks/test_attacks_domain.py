@@ -231,7 +231,10 @@ def test_a_bad_epsilon_names_the_flag(norm: str, epsilon: float | None) -> None:
         (lambda: Block(1, n_options=-1), "expected a discrete choice to have at least one option"),
         (lambda: Block(1, periodic=True, n_options=3), "expected a discrete choice"),
         (lambda: Block(1, high=0.5, n_options=3), "expected a discrete choice"),
-        (lambda: Block(2, "linf", 0.1, unit_step_length=0.1), "expected a reach over 0 and norm 'box', got 0.1 and 'linf'"),
+        (
+            lambda: Block(2, "linf", 0.1, unit_step_length=0.1),
+            "expected a reach over 0 and norm 'box', got 0.1 and 'linf'",
+        ),
         (lambda: Block(2, unit_step_length=0.0), "expected a reach over 0 and norm 'box', got 0.0"),
         (lambda: Domain(torch.zeros(2), (Block(2),), gradient_cost=-1), "gradient_cost: expected at least 0, got -1"),
         (lambda: Domain(torch.zeros(3), (Block(2),)), r"expected shape \(2,\), the sum of the blocks, got \(3,\)"),

@@ -14,7 +14,9 @@ def trials(values: list[tuple[float, bool]]) -> list[Judgement]:
     return [Judgement(score, -score, right, Prediction("")) for score, right in values]
 
 
-def run(rule: VerificationRule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
+def run(
+    rule: VerificationRule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]
+) -> tuple[Ending, int, int]:
     result = verify(
         lambda queries: [Evaluation.from_judgement(trials(found)[one.row_index]) for one in queries],
         DOMAIN,
@@ -53,7 +55,10 @@ def test_easier_means_right_and_surer_than_the_clean_scene() -> None:
 
 
 def test_no_trial_is_no_proof() -> None:
-    assert OVER_CONDITIONS.decide_ending(Ending.BUDGET_SPENT, TrialCounts(10, 20, 1), TrialCounts(0, 1, 1)) is Ending.BUDGET_SPENT
+    assert (
+        OVER_CONDITIONS.decide_ending(Ending.BUDGET_SPENT, TrialCounts(10, 20, 1), TrialCounts(0, 1, 1))
+        is Ending.BUDGET_SPENT
+    )
 
 
 @pytest.mark.parametrize(

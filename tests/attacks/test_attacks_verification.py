@@ -255,7 +255,15 @@ def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
 
 
 def test_nineteen_of_twenty_are_needed() -> None:
-    assert [WORST_CASE.count_needed_successes(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
+    assert [WORST_CASE.count_needed_successes(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [
+        10,
+        19,
+        19,
+        20,
+        38,
+        95,
+        190,
+    ]
 
 
 @pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS, EASIER])
@@ -329,7 +337,10 @@ def test_the_interval_of_a_region_covers_although_it_is_sampled_until_nothing_di
     ],
 )  # fmt: skip
 def test_the_verdict(search_ending: Ending, clean: int, adversarial: int, expected: Ending) -> None:
-    assert WORST_CASE.decide_ending(search_ending, TrialCounts(clean, 20, 64), TrialCounts(adversarial, 20, 64)) is expected
+    assert (
+        WORST_CASE.decide_ending(search_ending, TrialCounts(clean, 20, 64), TrialCounts(adversarial, 20, 64))
+        is expected
+    )
 
 
 def test_a_real_success_is_verified() -> None:
@@ -498,7 +509,11 @@ def test_intervals_over_conditions_cover_as_often_as_they_say(counting: int) -> 
 def test_trials_that_were_asked_for_are_all_made() -> None:
     for told in ("0" * 20, "1" * 20):
         found = verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=20)
-        assert (found.adversarial_counts.n_trials, found.clean_counts.n_trials, found.stop_reason) == (20, 20, "asked for")
+        assert (found.adversarial_counts.n_trials, found.clean_counts.n_trials, found.stop_reason) == (
+            20,
+            20,
+            "asked for",
+        )
 
 
 @pytest.mark.medium

@@ -178,7 +178,9 @@ def test_a_scheduler_and_workers_of_their_own(tmp_path: Path, monkeypatch: pytes
     added.write_text("7")
     work = WorkerTask("cluster_work:squares", {"seconds": 0.01, "file": str(added)}, ("file",))
     with ExitStack() as later, started(*worker), started(*scheduler) as first:
-        with open_workers(work, workers=None, cluster=f"tcp://127.0.0.1:{port}", report_message=told.append) as executor:
+        with open_workers(
+            work, workers=None, cluster=f"tcp://127.0.0.1:{port}", report_message=told.append
+        ) as executor:
             check(executor, 40, added=7)
             assert executor is not None
             results = executor.compute(pieces(200))
@@ -203,7 +205,8 @@ def executor_of_nobody(**more: Any) -> Any:
     """An executor that has not connected, with a worker that may be given calls."""
     executor = object.__new__(DaskExecutor)
     vars(executor).update(
-        description="here", stats=WorkerStats(), _usable_addresses=frozenset({"tcp://here"}), _refusal_by_address={}, _sending=None,
+        description="here", stats=WorkerStats(), _usable_addresses=frozenset({"tcp://here"}), _refusal_by_address={},
+        _sending=None,
         _tell=lambda text: None, _contents={}, _plugin_name="files", **more,
     )  # fmt: skip
     return executor
@@ -348,7 +351,9 @@ def test_a_worker_that_is_not_fit_is_given_nothing_more(monkeypatch: pytest.Monk
     assert executor._usable_addresses == {"tcp://there"} and executor.stats.refused == 1
     executor._usable_addresses |= {"tcp://other"}
     assert called(monkeypatch, lacks, done, executor=executor).value == 3
-    assert executor._refusal_by_address["tcp://there"] == "it lacks mug.obj", "it has them not although it was sent them"
+    assert executor._refusal_by_address["tcp://there"] == "it lacks mug.obj", (
+        "it has them not although it was sent them"
+    )
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -356,7 +361,9 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("advsearch.cluster.dask_executor.RECONNECT_SECONDS", 10_000.0)
     begun = time.monotonic()
     with pytest.raises(ClusterError, match="no scheduler"):
-        with open_workers(WorkerTask("a:b", {}), workers=None, cluster="tcp://127.0.0.1:9", report_message=lambda text: None):
+        with open_workers(
+            WorkerTask("a:b", {}), workers=None, cluster="tcp://127.0.0.1:9", report_message=lambda text: None
+        ):
             pass
     assert time.monotonic() - begun < 1_000.0  # and not `RECONNECT`
 

@@ -208,7 +208,9 @@ def test_headings_go_the_shorter_way_round(
 
 def _turned(scene: SceneDescription, control: Control, share: float) -> tuple[Tensor, Tensor]:
     """Sine and cosine of how far the object is turned."""
-    turn = placed(control, share)[:3, :3] @ torch.linalg.inv(torch.from_numpy(compute_object_to_world(scene)).float()[:3, :3])
+    turn = placed(control, share)[:3, :3] @ torch.linalg.inv(
+        torch.from_numpy(compute_object_to_world(scene)).float()[:3, :3]
+    )
     return turn[1, 0], turn[0, 0]
 
 

@@ -73,7 +73,9 @@ def test_at_its_start_all_stands_where_it_was_put(scene: SceneDescription) -> No
         f"{thing}.{parameter}" for thing in ("chair", "stop-sign", "car") for parameter in ("x", "y", "heading")
     ]
     for name in scene.things:
-        before = InputAssembler(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.size_in_metres
+        before = (
+            InputAssembler(scene).meshes[name].transform_mesh(None, None)[0].double().numpy() * scene.size_in_metres
+        )
         np.testing.assert_allclose(vertices(space, space.start, name), before, atol=CLOSE)
 
 

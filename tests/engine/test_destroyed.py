@@ -307,8 +307,8 @@ UNTOUCHED: dict[Any, set[str]] = {
             "list_allowed_values", "is_searched", "resolve_parameter",
         ),
         *(
-            "get_clean_value", "get_value_without_control", "get_parameter_spec", "get_budget", "must_start_at_clean_value",
-            "record_adjusted_default", "compute_values", "advance_time", "scale_ambient",
+            "get_clean_value", "get_value_without_control", "get_parameter_spec", "get_budget",
+            "must_start_at_clean_value", "record_adjusted_default", "compute_values", "advance_time", "scale_ambient",
         ),
     },
 }  # fmt: skip

@@ -87,7 +87,9 @@ def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:
 
 def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
     share = FailureRate(0.034, (0.021, 0.08), 22.5, 500)
-    known = replace(failures(0.9), cell_parameter_indices=(), n_failures=70, n_visited=500, n_cells=None, failure_rate=share)
+    known = replace(
+        failures(0.9), cell_parameter_indices=(), n_failures=70, n_visited=500, n_cells=None, failure_rate=share
+    )
     told = described(checked(known))
     assert failures_text(told).startswith(
         "claimed in 70 of 500 draws; of all configurations 2.1-8 % fail in one render (95 % interval), 3.4 % by the "

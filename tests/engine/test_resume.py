@@ -245,7 +245,11 @@ def test_the_random_searchs_configuration_is_taken_where_it_is_the_worse_one(pol
     problem: Any = Weaker()
     config = configuration().model_copy(update={"steps": 200})
     findings = attack_on(problem, config, policy, Stages(NullProgress()))
-    assert findings.search_result is not None and findings.random_search_result is not None and findings.verification is not None
+    assert (
+        findings.search_result is not None
+        and findings.random_search_result is not None
+        and findings.verification is not None
+    )
     assert (findings.outdone_verification is not None) == beaten
     random = findings.random_search_result.best_u
     assert torch.equal(findings.search_result.best_u, random) == beaten

@@ -197,7 +197,9 @@ def scene() -> advsearch.Scene:
     return advsearch.load_scene("mug")
 
 
-def points_of(scene: advsearch.Scene, grid: dict[str, Any], drawn: tuple[Any, ...] = (), samples: int = 1) -> SceneConfigurations:
+def points_of(
+    scene: advsearch.Scene, grid: dict[str, Any], drawn: tuple[Any, ...] = (), samples: int = 1
+) -> SceneConfigurations:
     axes = parse_axes(grid, drawn)
     space = make_space(add_grid_axes(drawn, axes, scene.description), scene.description)
     return SceneConfigurations(space, make_domain(space.controls), axes, samples, "sobol", 0)

@@ -36,7 +36,10 @@ def test_the_pictures_that_choose_the_sample_count_are_no_trials(
     made = noted(monkeypatch)
     findings = carry_out(tmp_path / "run", UNASKED)
     assert findings.verification is not None and findings.verification.ending is Ending.FOUND
-    assert findings.verification.adversarial_counts.n_trials in TRIAL_LOOKS and findings.verification.stop_reason == "decided"
+    assert (
+        findings.verification.adversarial_counts.n_trials in TRIAL_LOOKS
+        and findings.verification.stop_reason == "decided"
+    )
     assert len(set(made)) == len(made) == findings.verification_renders, "no picture is made twice"
     with RunDirectory.resume(tmp_path / "run") as run:
         stored = [row for row in run.store.rows() if row.phase is None]

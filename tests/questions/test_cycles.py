@@ -96,7 +96,9 @@ def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> No
 
 def test_blender_gets_the_field_of_view_in_radians(folder: Path, renderer: Renderer) -> None:
     (folder / "does.py").write_text("sys.exit(3)")
-    inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start)) | {"camera.fov": torch.tensor([60.0])}
+    inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start)) | {
+        "camera.fov": torch.tensor([60.0])
+    }
     with pytest.raises(BlenderError):
         by_cycles(renderer.scene.description_and_filter[0]).radiance(inputs, 0, 1)
     assert json.loads((folder / "scene.json").read_text())["fov"] == pytest.approx(1.0471976)

@@ -26,7 +26,10 @@ def test_the_distance_lies_where_half_of_the_pictures_show_it() -> None:
     assert found.distances == DISTANCES
     assert found.distance == pytest.approx(math.sqrt(20.0 * 40.0))
     assert (found.lower, found.upper) == (10.0, 80.0)
-    assert describe_detection_distance(found) == "Seen from 28.3 m in half of the pictures, 10 to 80 m with 95 % confidence."
+    assert (
+        describe_detection_distance(found)
+        == "Seen from 28.3 m in half of the pictures, 10 to 80 m with 95 % confidence."
+    )
 
 
 def test_a_share_that_rises_with_the_distance_is_pooled() -> None:

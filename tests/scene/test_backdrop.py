@@ -373,7 +373,10 @@ def test_the_object_has_the_noise_and_the_blur_of_the_photograph_and_is_behind_w
     again = advsearch.load_scene("mug", backdrop=tmp_path / "a.png", occluder=tmp_path / "mask.png", settings=NO_SHADOW)
     render = again.renderer("texture", resolution=96)
     assert (render(render.start, 0, 16).detach().numpy() * 255.0 == pictures["matched"]).all(), "it repeats"
-    assert not render.compute_object_mask(render.start)[:, :48].any() and render.compute_object_mask(render.start)[:, 48:].any()
+    assert (
+        not render.compute_object_mask(render.start)[:, :48].any()
+        and render.compute_object_mask(render.start)[:, 48:].any()
+    )
     steps = {name: np.abs(np.diff(picture, axis=1)).max() for name, picture in pictures.items()}
     assert steps["blurred"] < 0.6 * steps["plain"]
 

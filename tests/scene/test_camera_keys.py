@@ -56,7 +56,10 @@ def test_a_number_that_is_changed_is_seen_or_told(kind: str, tmp_path: Path) -> 
         except FileFormatError:
             assert not harmless(path) or "roi" in path, path
             continue
-        changed = (found.intrinsics, found.calibrated_shape) != (whole.intrinsics, whole.calibrated_shape) or found.reading_notes != ()
+        changed = (found.intrinsics, found.calibrated_shape) != (
+            whole.intrinsics,
+            whole.calibrated_shape,
+        ) or found.reading_notes != ()
         assert changed != harmless(path), path
 
 

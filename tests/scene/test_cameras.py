@@ -92,7 +92,9 @@ def test_a_panorama_has_what_is_ahead_in_its_middle_and_the_zenith_on_top() -> N
 
 def test_a_lens_that_folds_says_at_which_angle_and_is_black_beyond() -> None:
     lens = LENSES[FOLDING]
-    assert math.isclose(math.degrees(lens.fold_angle_radians), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6)
+    assert math.isclose(
+        math.degrees(lens.fold_angle_radians), math.degrees(math.atan(math.sqrt(1.0 / 1.8))), rel_tol=1e-6
+    )
     assert len(lens.notes) == 1 and "36.7 degrees" in lens.notes[0]
     _, inside = lens.compute_rays(torch.tensor([[0.5, 0.5], [0.0, 0.0]], dtype=torch.float64))
     assert inside[0] > 0.0 > inside[1]
@@ -125,7 +127,10 @@ def test_binned_pixels_are_fewer_and_see_the_same(tmp_path: Path) -> None:
     path.write_text(GOOD + "binning_x: 3\nbinning_y: 0\n")
     found = read_camera(str(path))
     assert whole.calibrated_shape == (720, 1280) and found.calibrated_shape == (720, 426)
-    assert found.intrinsic_by_name["fy"] == whole.intrinsic_by_name["fy"] and found.intrinsic_by_name["k1"] == whole.intrinsic_by_name["k1"]
+    assert (
+        found.intrinsic_by_name["fy"] == whole.intrinsic_by_name["fy"]
+        and found.intrinsic_by_name["k1"] == whole.intrinsic_by_name["k1"]
+    )
     assert found.intrinsic_by_name["fx"] * 426 * 3 == pytest.approx(whole.intrinsic_by_name["fx"] * 1280)
     assert found.intrinsic_by_name["cx"] * 426 * 3 == pytest.approx(whole.intrinsic_by_name["cx"] * 1280)
 

@@ -77,7 +77,9 @@ def test_a_mask_is_where_the_object_is_hit_first(moved: Renderer, seed: int) -> 
 def test_a_mask_is_of_its_own_configuration_and_leaves_renders_as_they_are(moved: Renderer) -> None:
     first, second = (torch.rand(moved.start.shape, generator=torch.Generator().manual_seed(seed)) for seed in (2, 3))
     before, mask = moved(first, seed=1, spp=2), moved.compute_object_mask(first)
-    assert not torch.equal(moved.compute_object_mask(second), mask) and torch.equal(moved.compute_object_mask(first), mask)
+    assert not torch.equal(moved.compute_object_mask(second), mask) and torch.equal(
+        moved.compute_object_mask(first), mask
+    )
     assert torch.allclose(moved(first, seed=1, spp=2), before, atol=1e-6)
     with pytest.raises(InputError, match="entry of u"):
         moved.compute_object_mask(first + 2.0)

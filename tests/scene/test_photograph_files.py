@@ -72,7 +72,9 @@ def test_the_first_photograph_is_the_clean_scene_and_one_is_chosen(folder: Path)
     for place, view in enumerate(description.photographs.scenes.values()):  # type: ignore[union-attr]
         inputs = space.inputs(torch.tensor([(place + 0.5) / 6]))
         seen = np.linalg.inv(inputs["camera.to_world"].double().numpy()) @ compute_object_to_world(description)
-        np.testing.assert_allclose(seen, np.linalg.inv(camera_to_world(view)) @ compute_object_to_world(view), atol=1e-5)
+        np.testing.assert_allclose(
+            seen, np.linalg.inv(camera_to_world(view)) @ compute_object_to_world(view), atol=1e-5
+        )
         gain = description.gain * 2.0 ** float(inputs["camera.exposure"])
         assert gain == pytest.approx(view.gain, rel=1e-5)
     chosen = make_space(make_controls({"backdrop": {"which": NAMES[2:4]}}), description)

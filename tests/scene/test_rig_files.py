@@ -52,7 +52,9 @@ def wanted(folder: Path) -> list[RigCamera]:
 @pytest.mark.parametrize("points", ["1.5 2.5 7 3 4 -1", ""])
 def test_poses_of_others_are_those_by_hand(tmp_path: Path, points: str) -> None:
     for found in (read_rig(transforms(tmp_path) + "#0,1,2,3"), read_rig(images(tmp_path, points=points))):
-        assert len(found) == 4 and all(one.camera_model is not None and one.camera_model.calibrated_shape == (24, 32) for one in found)
+        assert len(found) == 4 and all(
+            one.camera_model is not None and one.camera_model.calibrated_shape == (24, 32) for one in found
+        )
         for mount, by_hand in zip(found, wanted(tmp_path), strict=True):
             np.testing.assert_allclose(mount.pose, by_hand.pose, atol=1e-9)
 

@@ -11,7 +11,8 @@ def projected(description: SceneDescription) -> np.ndarray:
     """Vertices in units of half the picture, and their depth, by an independent pinhole projection."""
     camera = camera_to_world(description)
     world = (
-        description.object.mesh.vertices @ compute_object_to_world(description)[:3, :3].T + compute_object_to_world(description)[:3, 3]
+        description.object.mesh.vertices @ compute_object_to_world(description)[:3, :3].T
+        + compute_object_to_world(description)[:3, 3]
     )
     local = (world - camera[:3, 3]) @ camera[:3, :3]
     half = np.tan(np.radians(description.get_number("camera.fov")) / 2)

@@ -41,7 +41,9 @@ def transport() -> Callable[[Tensor], Tensor]:
     made, shape = TextureTransport((2, 2), (CELL_SIZE, CELL_SIZE)), (CELL_SIZE, CELL_SIZE, 3)
     places = torch.tensor([[0.1, 0.3], [0.2, 0.3], [0.3, 0.3], [0.3, 0.4]])
     weight = torch.arange(1.0, 13.0).reshape(4, 3) / 6.0
-    made.add_pass([PathVertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], pass_weight=1.0)
+    made.add_pass(
+        [PathVertices(torch.arange(4), places, weight, torch.tensor([True, True, False, True]))], pass_weight=1.0
+    )
     made.finish()
     spread = torch.randn(10, *shape, generator=torch.Generator().manual_seed(1)) / CELL_SIZE
     return lambda x: made(torch.einsum("n,nhwc->hwc", x.float(), spread)).double()
@@ -90,7 +92,9 @@ def test_a_shown_picture_is_the_encoded_one() -> None:
         assert at.grad is not None
         found.append((picture.detach(), at.grad))
     assert torch.equal(found[0][0], found[1][0]) and torch.equal(found[0][1], found[1][1])
-    assert torch.autograd.gradgradcheck(formation.map_to_display, torch.linspace(0.02, 0.6, 9).double().requires_grad_())
+    assert torch.autograd.gradgradcheck(
+        formation.map_to_display, torch.linspace(0.02, 0.6, 9).double().requires_grad_()
+    )
 
 
 ONCE = {"_Radiance", "_Differences", "_OnceDifferentiable"}

@@ -30,7 +30,9 @@ def test_cells_run_from_the_top_row_and_have_places_on_the_mesh() -> None:
     assert parts.centers[found[:3]] == pytest.approx(np.array([(0, 0, 1), (1, 0, 1), (1, 0.1, 0)]), abs=2.0 / MAP_SIZE)
     assert parts.face_of_part[found].tolist() == [1, 1, 2, 0]
     assert parts.center_uvs[0] == pytest.approx((0.5 / MAP_SIZE, 1 - 0.5 / MAP_SIZE)) and parts.is_covered.all()
-    assert parts.part_slices["face"] == slice(MAP_SIZE**2, MAP_SIZE**2 + 4) and parts.face_of_part[MAP_SIZE**2 :].tolist() == [
+    assert parts.part_slices["face"] == slice(MAP_SIZE**2, MAP_SIZE**2 + 4) and parts.face_of_part[
+        MAP_SIZE**2 :
+    ].tolist() == [
         0,
         1,
         2,

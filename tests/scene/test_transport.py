@@ -79,7 +79,9 @@ def vertices(rows: Sequence[tuple[int, float, float, float]], sharp: bool = True
     table = np.array(rows, dtype=np.float32).reshape(-1, 4)
     weight = torch.from_numpy(table[:, 3:]).expand(-1, 3).contiguous()
     seen = torch.full((len(table),), sharp)
-    return PathVertices(torch.from_numpy(table[:, 0]).long(), torch.from_numpy(table[:, 1:3]).contiguous(), weight, seen)
+    return PathVertices(
+        torch.from_numpy(table[:, 0]).long(), torch.from_numpy(table[:, 1:3]).contiguous(), weight, seen
+    )
 
 
 def test_a_lookup_is_bilinear_and_repeats_at_the_border() -> None:

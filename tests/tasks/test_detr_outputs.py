@@ -65,8 +65,12 @@ def test_names_say_how_logits_are_read(form: str, nothing: bool) -> None:
     assert found.right and found.prediction.label == "coffee mug"
     assert found.prediction.probability == pytest.approx(score)
     order = CHOSEN if nothing else ALONE
-    assert task.output_remarks == (f"The detector's output is read as a DETR's: `task='detection={{order: {order}}}'`.",)
-    assert not task.ambiguity_message and [one.label for one in task.predictions(model(picture), 1)[0]] == ["coffee mug"]
+    assert task.output_remarks == (
+        f"The detector's output is read as a DETR's: `task='detection={{order: {order}}}'`.",
+    )
+    assert not task.ambiguity_message and [one.label for one in task.predictions(model(picture), 1)[0]] == [
+        "coffee mug"
+    ]
 
 
 def test_a_tuple_is_read_as_is_said() -> None:

@@ -122,7 +122,9 @@ def on(network: nn.Module, labels: Any = NAMES, **options: Any) -> tuple[Detecti
     model = load_model(network, input_size=100, read=task.output_reader, labels=labels)
     output = model(PICTURE)
     names = tuple(labels)
-    return task.on(model).after_calibration(output, DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.image_size)), output
+    return task.on(model).after_calibration(
+        output, DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.image_size)
+    ), output
 
 
 @pytest.mark.filterwarnings("ignore:no gradient")
@@ -177,7 +179,9 @@ def test_what_fits_twice_is_asked_for() -> None:
         on(Head(square, len(names)), names)
     task, output = on(Head(square, len(names)), names, order=V8)
     truth = DetectionTruth((cup(len(names)),), TRUTH.box, TRUTH.image_size)
-    assert task.judge(output, truth)[0].prediction.probability == pytest.approx(0.8, abs=1e-4) and not task.output_remarks
+    assert (
+        task.judge(output, truth)[0].prediction.probability == pytest.approx(0.8, abs=1e-4) and not task.output_remarks
+    )
 
 
 @pytest.mark.parametrize("order", ["boxes objectness scores", "boxes, objectness, scores, channels, first"])
@@ -199,7 +203,11 @@ def test_names_and_size_come_from_the_network(names: Any) -> None:
     network.names, network.args = names, {"imgsz": 96}
     model = load_model(network, read=Detection().output_reader)
     assert model.labels == NAMES and model.input_size == (96, 96)
-    assert load_model(network, read=Detection().output_reader, labels=["x", "y", "z"], input_size=64).labels == ("x", "y", "z")
+    assert load_model(network, read=Detection().output_reader, labels=["x", "y", "z"], input_size=64).labels == (
+        "x",
+        "y",
+        "z",
+    )
 
 
 @pytest.mark.parametrize("iou", [0.3, 0.7])
@@ -257,5 +265,6 @@ def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
     output = loaded(PICTURE)
     task = Detection().on(loaded).after_calibration(output, TRUTH)
     assert (
-        astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.format_doubts
+        astuple(task.judge(output, TRUTH)[0].prediction) == ("cup", 1, pytest.approx(0.8, abs=1e-3))
+        and not task.format_doubts
     )

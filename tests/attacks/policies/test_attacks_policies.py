@@ -72,7 +72,11 @@ def linear(d: int, norm: str, seed: int) -> Problem:
     rng = seeded(seed, d)
     start, w = torch.rand(d, generator=rng), torch.randn(d, generator=rng)
     domain = domain_of(start, norm)
-    best = domain.project(start + 1e4 * w) if norm == "l2" else torch.where(w > 0, domain.upper_bounds, domain.lower_bounds)
+    best = (
+        domain.project(start + 1e4 * w)
+        if norm == "l2"
+        else torch.where(w > 0, domain.upper_bounds, domain.lower_bounds)
+    )
 
     def value(u: Tensor) -> float:
         return float((w.double() * (u - start).double()).sum())
