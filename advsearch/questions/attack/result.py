@@ -724,8 +724,8 @@ def _list_path_choices(path: Any) -> Sequence[Any]:
     """Return the paths among which a control chooses; none if it has a single one."""
     for slot in path.parameter_slots:
         is_path = slot.parameter.name == Control.PATH_PARAMETER
-        if is_path and isinstance(slot.spec, OneOf):
-            return slot.spec.values
+        if is_path and isinstance(slot.parameter_spec, OneOf):
+            return slot.parameter_spec.values
     return ()
 
 

@@ -439,7 +439,7 @@ def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> Result
         "estimator": "{0.estimator}",
         "samples": "{0.spp}",
         "error": lambda point: (
-            f"{'' if point.is_known else '< '}{100 * point.rms:.3g} %"
+            f"{'' if point.has_known_error else '< '}{100 * point.rms_error:.3g} %"
         ),
         "95 %": lambda point: (
             "heavy tails" if point.heavy_tailed else _format_interval(point.interval)

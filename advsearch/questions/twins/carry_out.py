@@ -421,7 +421,7 @@ class Comparison:
     def _is_stored(self, number: int, measurements: Any) -> bool:
         """Return whether the rows of an object are stored for all models."""
         return all(
-            measurements.read(make_row_name(number, index)) is not None
+            measurements.read_stored(make_row_name(number, index)) is not None
             for index in range(len(self._judges))
         )
 

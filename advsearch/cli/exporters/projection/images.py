@@ -88,7 +88,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
             # several projectors have a folder each
             folder = out / control.name_in_files if len(projectors) > 1 else out
             folder.mkdir(parents=True)
-            notes += write_projector(folder, adversarial, control, control.values(u))
+            notes += write_projector(folder, adversarial, control, control.compute_values(u))
     return notes
 
 
@@ -148,7 +148,7 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
     """
     number = {name: float(value) for name, value in values.items() if value.ndim == 0}
     unit = "m" if control.scene.object.size_in_metres is not None else "object sizes"
-    fov = control.part.fov  # horizontal field of view in degrees
+    fov = control.projector_part.fov  # horizontal field of view in degrees
     # illuminance of the object by a white image, in lux
     measurements = control.compute_measurements(values, {})
     white = measurements["white"]["value"]
@@ -160,7 +160,7 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
         f"{number['distance']:.3g} {unit} from the object's "
         "middle",
         f"a picture {fov:.3g} degrees wide (throw ratio {0.5 / half_width:.2f}), "
-        f"{control.part.aspect:.3g} times as wide as high",
+        f"{control.projector_part.aspect:.3g} times as wide as high",
         f"azimuth {number['azimuth'] % 360.0:.4g} and elevation "
         f"{number['elevation']:.4g} degrees around the "
         "object",
@@ -179,7 +179,7 @@ def describe_marks(control: Any, marked_texels: Sequence[MarkedTexel]) -> list[s
         marked_texels: the texels with a mark.
     """
     # half the width of the picture at distance 1
-    half_width = math.tan(math.radians(control.part.fov) / 2.0)
+    half_width = math.tan(math.radians(control.projector_part.fov) / 2.0)
     lines = []
     for index, texel in enumerate(marked_texels, 1):
         # Position in the picture, from -1 to 1 around its middle. Multiplied by the
@@ -187,7 +187,7 @@ def describe_marks(control: Any, marked_texels: Sequence[MarkedTexel]) -> list[s
         right_of_middle = 2 * texel.x - 1
         above_middle = 1 - 2 * texel.y
         right = math.degrees(math.atan(right_of_middle * half_width))
-        up = math.degrees(math.atan(above_middle * half_width / control.part.aspect))
+        up = math.degrees(math.atan(above_middle * half_width / control.projector_part.aspect))
         lines.append(
             f"{index}: row {texel.row}, column {texel.column}; {right:.2f} degrees to "
             f"the right of the middle, {up:.2f} up"
