@@ -322,7 +322,7 @@ class RuleCondition:
 
     @property
     def _values_text(self) -> str:
-        """The values that fulfil the condition, as text: names, arcs of a turn, or bounds."""
+        """The values that fulfil the condition, as text: names, arcs or bounds."""
         if self.options:
             return " or ".join(sorted(self.options))
         is_angle = self.turn > 0.0

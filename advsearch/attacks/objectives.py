@@ -119,7 +119,8 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     try:
         signature = inspect.signature(callee)
     except ValueError:
-        # A function written in C has no signature: it gets (output, images, truth).
+        # A function written in C has no signature. By default it gets (output, images,
+        # truth), and no further inputs.
         return ObjectiveSignature()
     by_position = _list_positional(signature)
     takes_images_first = bool(by_position) and by_position[0] in IMAGE_PARAMETERS
@@ -185,20 +186,20 @@ def _has_image_parameter(names: Sequence[str]) -> bool:
     unless the second is named like the truth, e.g. "target": then it is a loss whose
     third parameter is an option.
 
-    A function that is wrong may get True as well. It can't be called with three
-    arguments then, and the caller explains that.
+    The result is True for a function without a parameter for the truth, too. The caller
+    finds that it can't be called with three arguments, and explains this.
 
     Args:
         names: names of its positional parameters, in order, without requested inputs.
     """
-    if len(names) < 2:  # wrong, since output and truth are always passed
+    lacks_parameters = len(names) < 2  # output and truth are always passed
+    if lacks_parameters:
         return True
     second_name = names[1]
     if second_name in TRUTH_PARAMETERS:
         return False
     has_third = len(names) > 2
-    # Of two parameters, a second one with such a name is not the truth. The function is
-    # wrong, as it has no parameter for the truth.
+    # If the last of two parameters has such a name, there is none for the truth.
     lacks_truth = second_name in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS)
     return has_third or lacks_truth
 
@@ -251,9 +252,9 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
             result = _evaluate_each_image(objective, output, images, truth, inputs)
         values = _check_values(name, result, count)
         if values.requires_grad and _are_written_into((argument_copies, input_copies)):
-            # Writing in place may make torch's backward pass fail. It is tried here, so
-            # that the error names the function. If neither the output nor an input has
-            # a gradient, it is that of the images.
+            # The function has changed a copy in place, which may make torch's backward
+            # pass fail. It is tried here, so that the error names the function. The
+            # gradient is by the output and the inputs, or else by the images.
             sources = _list_differentiable((output, inputs)) or [images]
             _check_differentiable(name, values, sources)
         _check_keeps_gradient(name, values, (images, output, *inputs.values()))
@@ -685,7 +686,8 @@ def get_objective(
             function, task, takes_logits_of_task=False, user_function=objective
         )
     if kind.of_task is not None:
-        # It already has the target and the direction of the task.
+        # The objective that the task itself defines has its target and direction
+        # already.
         task_objective = kind.of_task(task)
         return task_objective if _is_built_in(kind) else _pass_copies(task_objective)
     if kind.of_features is not None:
@@ -693,7 +695,7 @@ def get_objective(
         takes_logits_of_task = False
     else:
         function = _make_output_objective(kind, targeted=targeted)
-        takes_logits_of_task = _has_other_outputs(task)
+        takes_logits_of_task = _must_convert_outputs(task)
     return _orient_objective(
         function, task, takes_logits_of_task=takes_logits_of_task, user_function=None
     )
@@ -707,15 +709,17 @@ def _is_built_in(kind: ObjectiveKind) -> bool:
 def _make_output_objective(kind: ObjectiveKind, *, targeted: bool) -> Objective:
     """Return the objective of a kind that has functions of the model's output.
 
-    A function of another package is wrapped as a user's: it gets copies of its
+    A function of another package is wrapped like one of a user: it gets copies of its
     arguments, and its mistakes are explained.
 
     Args:
         kind: kind with a `plain` or `targeted` form.
         targeted: which of these forms to take.
     """
-    form = kind.form(targeted=targeted)
-    return _ignore_inputs(form) if _is_built_in(kind) else wrap_objective(form)
+    function = kind.form(targeted=targeted)  # of (output, images, labels)
+    if _is_built_in(kind):
+        return _ignore_inputs(function)
+    return wrap_objective(function)
 
 
 def _make_feature_objective(
@@ -744,8 +748,8 @@ def _make_feature_objective(
     return objective if _is_built_in(kind) else _pass_copies(objective)
 
 
-def _has_other_outputs(task: Task) -> bool:
-    """Return whether the model's outputs have to be converted to logits of the labels.
+def _must_convert_outputs(task: Task) -> bool:
+    """Return whether the model's outputs have to be converted to logits of classes.
 
     `Task.as_logits` converts them. The outputs may be features that are compared with
     those of each label, or may have classes that mean "nothing here".
@@ -797,6 +801,7 @@ def _orient_objective(
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
         values = function(function_output, images, labels, more)
+        # it can only be checked if the values have a gradient by the model's output
         if must_check_direction and _has_slope_by_class(values, output):
             must_check_direction = False
             name = get_name(user_function)  # type: ignore[arg-type]
@@ -903,12 +908,14 @@ def _check_kind(
             f"got {kind.name}, which takes outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
-        # A distance from the clean image can only be maximized.
-        setting = "minimise"
-        reason = "its minimum is at the start already"
+        # An objective of features is a distance from the clean image, which can only be
+        # maximized.
         if targeted:
             setting = "target"
             reason = "it leads away from the clean image, to no class in particular"
+        else:
+            setting = "minimise"
+            reason = "its minimum is at the start already"
         raise InputError(
             f"{setting}: expected `objective` {' or '.join(OBJECTIVES)}, "
             f"got {kind.name}; {reason}"

@@ -149,7 +149,7 @@ class SearchResult:
 def count_planned_renders(
     steps: int, candidates: int = 4, repeats: int = 2, max_extra_repeats: int = 0
 ) -> int:
-    """Return the largest number of images that `search` renders with these arguments."""
+    """Return the largest number of images that `search` renders with the arguments."""
     return steps + candidates * (repeats + max_extra_repeats)
 
 
@@ -239,6 +239,7 @@ def search(
         with reraise_lost_interrupt():
             stopped = _explore(log, policy, steps, seed, is_out_of_time)
             if domain.draws_conditions:
+                # the last configuration of the policy becomes a candidate
                 log.pool = replace_worst(log.pool, log.last, log.size)
             if candidates:
                 # Step 1 made at most `steps` evaluations, with seed indices from 0 on.
@@ -332,6 +333,7 @@ def _add_policy_findings(result: SearchResult, log: _Log) -> SearchResult:
     state = log.state
     if policy is None or state is None:  # the search ended before the first proposal
         return result
+    # A batch that was completed has been passed to the policy, and is removed here.
     if log.evaluated_batch:
         state = policy.update(state, log.evaluated_batch)
     return replace(
@@ -455,7 +457,7 @@ class _Log:
             phase: "search" or "ranking". A ranking renders the candidates again, so it
                 adds no candidate.
         """
-        if proposal.gradient:
+        if proposal.gradient:  # all of it, or a "free" one
             self.gradients += 1
         self.renders += evaluation.cost
         if not evaluation.is_finite:

@@ -183,13 +183,13 @@ class Scene:
             }
             folder = replace(description.photographs, scenes=relit_scenes)
             relit = replace(relit, photographs=folder)
-        # The lamps of a place are on if the environment is dark, so that ground and lamps
-        # are added again.
+        # The lamps of a place are on if the environment is dark, so that ground and
+        # lamps are added again.
         grounded = with_requested_ground(relit)
         return Scene(add_lamps(grounded), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
-        """Explain what to use instead of `render`; called for missing attributes only."""
+        """Explain what to use instead of `render`; called for a missing attribute."""
         if name == "render":
             raise AttributeError(
                 "a scene has no `render`: advsearch.render(scene) makes a picture and "
@@ -235,7 +235,8 @@ class Scene:
         Raises:
             InputError: a name is unknown or a value out of range.
         """
-        # `resolved` has a value for every parameter, of which those of `overrides` count
+        # `resolved` has a value for every parameter, of which those of `overrides`
+        # count
         resolved = settings.resolve_settings(overrides)
         description = self.description
         check_mesh_names(description, overrides)

@@ -126,8 +126,8 @@ class Problem:
         n_searched: number of controls that are searched; None for all. The others are
             the conditions: every image has new ones from their full range.
         steps: number of renders of a search.
-        conditions_per_evaluation: number of conditions of an evaluation, whose objective is the mean over
-            them; 1 without conditions.
+        conditions_per_evaluation: number of conditions of an evaluation, whose
+            objective is the mean over them; 1 without conditions.
         search_depth: segments of the longest light path in a search; None for that of
             the scene.
         aovs: names of the layers of ground truth that are stored for the clean and the
@@ -670,10 +670,10 @@ class Problem:
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search by its mean over sampled conditions.
 
-        Each of the `conditions_per_evaluation` conditions is rendered once. The noise of its image has
-        the same seed as the condition. If the query requests an image, it is rendered
-        under conditions that leave the scene unchanged, as no sampled one represents
-        all of them.
+        Each of the `conditions_per_evaluation` conditions is rendered once. The noise
+        of its image has the same seed as the condition. If the query requests an image,
+        it is rendered under conditions that leave the scene unchanged, as no sampled
+        one represents all of them.
         """
         condition_seeds = [
             seeds.derive_seed(query.seed, "draw", index)
@@ -997,7 +997,7 @@ class Problem:
             objective=total_objective / len(evaluations),
             gradient=gradient,
             success=n_successes >= n_needed,
-            n_non_finite=sum(evaluation.non_finite for evaluation in evaluations),
+            n_non_finite=sum(evaluation.n_non_finite for evaluation in evaluations),
             cost=max(evaluation.cost for evaluation in evaluations),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
         )

@@ -35,15 +35,16 @@ class RunState:
     """The results of a run so far. A result that was not reached is None or empty.
 
     Attributes:
-        first_look_trials: renders of the clean configuration at the search's sample count.
+        first_look_trials: renders of the clean configuration at the search's sample
+            count.
         search_result: result of the search by the policy; a claim.
         random_search_result: result of the random search.
         sample_count: how the sample count of the verification was chosen.
         clean_trials: trials of the control group.
         verification: verification of the adversarial configuration of the run.
         baseline_verification: verification of the result of the random search.
-        result_without_print_terms: result of a search by the policy without print terms, if the search
-            of the run has them.
+        result_without_print_terms: result of a search by the policy without print
+            terms, if the search of the run has them.
         unprinted_verification: verification of that result.
         outdone_verification: verification of the policy's result, if the random search
             found a scene that is worse for the model. Then that scene is the
@@ -56,8 +57,8 @@ class RunState:
         smallest_change_bracket: the smallest change that makes the model fail.
         trial_images: images of the first trials, (H, W, 3) with 8-bit values in [0, 1],
             by kind and number. A resumed run only has those that it rendered itself.
-        search_frames: images of the search in its order, numpy (H, W, 3) with 8-bit values in
-            [0, 1].
+        search_frames: images of the search in its order, numpy (H, W, 3) with 8-bit
+            values in [0, 1].
         interrupted: whether the run was interrupted.
         predictor: predictor of the images of the searches; None if they were rendered.
         predictor_refusal: why images were not predicted, or only cropped.
@@ -131,7 +132,8 @@ def make_lost_remarks(n_lost: int) -> list[str]:
         return []
     verb, pronoun = ("has", "it") if n_lost == 1 else ("have", "them")
     return [
-        f"{format_count(n_lost, 'picture')} {verb} no answer, which counts as not right: "
+        f"{format_count(n_lost, 'picture')} {verb} no answer, which counts as not "
+        "right: "
         f"every worker that took {pronoun} died."
     ]
 

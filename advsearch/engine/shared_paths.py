@@ -1,4 +1,4 @@
-"""Find whether trials of one seed may share light paths that meet no searched surface."""
+"""Find whether trials of a seed may share light paths that meet no searched surface."""
 
 from __future__ import annotations
 

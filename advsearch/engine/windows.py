@@ -179,7 +179,7 @@ def find_searched_inputs(problem: Problem) -> frozenset[str]:
 
 
 def _find_box(problem: Problem) -> Window | None:
-    """Return the box around all searched meshes at the start; None if none is visible."""
+    """Return the box of all searched meshes at the start; None if none is visible."""
     surfaces = problem.renderer.find_surfaces(problem.domain.start)
     mask = torch.zeros(problem.renderer.formation.resolution, dtype=torch.bool)
     for name in find_searched_inputs(problem):

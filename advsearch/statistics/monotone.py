@@ -1,4 +1,4 @@
-"""Rates that fall along an axis: isotonic fit, and a test for places where they rise."""
+"""Rates that fall along an axis: isotonic fit, and a test of places where they rise."""
 
 from __future__ import annotations
 

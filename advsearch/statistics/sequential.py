@@ -103,11 +103,11 @@ class ConfidenceSequence:
         return sum(value * count for value, count in self._counts.items()) / self.count
 
     def is_over(self, mean: float) -> bool:
-        """Return whether the samples show that the true mean exceeds `mean`, in (0, 1)."""
+        """Return whether samples show that the true mean exceeds `mean`, in (0, 1)."""
         return self._has_won(mean, self._counts)
 
     def is_under(self, mean: float) -> bool:
-        """Return whether the samples show that the true mean is below `mean`, in (0, 1)."""
+        """Return whether samples show that the true mean is below `mean`, in (0, 1)."""
         mirrored = {1.0 - value: count for value, count in self._counts.items()}
         return self._has_won(1.0 - mean, mirrored)
 
