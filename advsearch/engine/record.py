@@ -111,8 +111,8 @@ class RunState:
             crop = str(self.crop_refusal) if self.crop_refusal else None
             return LinearTransport(used=False, reason=reason, crop=crop)
         summary = self.predictor.summarize()
-        # why a better method was not used: matrices for a crop, or light on surfaces
-        # for matrices
+        # Why a better method was not used. Matrices are better than a crop, and light
+        # on surfaces is better than matrices.
         better_method_refusal = self.predictor_refusal or self.surface_light_refusal
         # If the predictor was given up, its summary has that as the reason, which
         # stays.
@@ -201,7 +201,7 @@ def read_judgement(row: Row) -> Judgement:
     """Return the judgement of a row, the inverse of `add_judgement`.
 
     A None in the row means NaN in the judgement. In a row without a label, the output
-    of the model was NaN.
+    of the model was NaN. The objective is a column of the row of its own.
     """
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(
@@ -220,7 +220,7 @@ def make_verified_rate(verification: Verification) -> VerifiedRate:
     rate = make_rate(
         counts=verification.adversarial_counts,
         trials=verification.valid_trials,
-        successes=verification.successful_trials,
+        successes=verification.successful_trials,  # for their labels and outcomes
     )
     return rate.model_copy(update={"stopped": verification.stop_reason})
 
@@ -258,7 +258,7 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
         trials: judgements of the trials.
         spp: samples per pixel of their images.
     """
-    right = count_right(trials, spp)
+    right = count_right(trials, spp)  # counts, with the samples per pixel
     outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
     return ControlGroup(
         correct=right.n_successes, outcomes=outcomes, **_rate_fields(right, trials)
@@ -266,7 +266,11 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
 
 
 def _rate_fields(counts: TrialCounts, trials: Sequence[Judgement]) -> dict[str, Any]:
-    """Return the fields that all rates of a result have, from counts and trials."""
+    """Return the fields that all rates of a result have, from counts and trials.
+
+    They are the number of trials, the rate with its interval, and the number of trials
+    in which the model returned NaN.
+    """
     n_not_a_number = sum(trial.is_non_finite for trial in trials)
     return {
         "trials": counts.n_trials,

@@ -126,7 +126,7 @@ class Rendering:
             if file.suffix.lower() == ".exr":
                 # a single view, as was checked
                 write_exr(file, self.views[0].linear)
-                return self.formation.resolution
+                return self.formation.resolution  # (height, width)
             write_png(file, self._png_pixels)
         height, width = self._png_pixels.shape[:2]
         return height, width
@@ -475,9 +475,11 @@ def _render_view(
         truth_error = ""
         if task.varies:
             facts = _make_view_facts(description, space, renderer, u, settings)
+            # None and a message if the truth cannot be found
             truth, truth_error = _find_truth(task, facts)
         # From here on the predictions are read as the calibrated task does.
         task = task.after_calibration(output, truth)
+        # [0]: the batch has one image
         predictions = task.predictions(output, MAX_PREDICTIONS)[0]
         marks = () if truth is None else tuple(task.marks(output, truth)[0])
     view = View(
@@ -522,7 +524,7 @@ def _make_view_facts(
 ) -> Facts:
     """Return the facts of a configuration by which a task judges the view.
 
-    If the scene has a rig of several cameras, the field `views` has the facts of each.
+    If the scene has a rig of several cameras, `facts_of_views` has the facts of each.
 
     Args:
         description: the scene.
@@ -636,12 +638,13 @@ def make_facts(
     labelled_mesh = OBJECT if judge == ALL_THINGS else judge
 
     def make_thing_facts(mesh: str) -> Facts:
-        """Return the facts of a single thing, the object or another one."""
+        """Return the facts of a single thing by its mesh, the object or another one."""
         # without a stated label (None), the own label of the thing is right
         stated_label = label if mesh == labelled_mesh else None
         # a function, so that a task that does not need it does not render
         look = None
         if cached_render is not None:
+            # The unit of length of the scene is the size of the object, for all things.
             metres = description.object.size_in_metres
             look = partial(_look_at, cached_render, mesh, metres=metres)
         # The object has the name that the caller states. Another thing has the name of
@@ -652,6 +655,7 @@ def make_facts(
         own_label = description.things[mesh].label
         return Facts(mesh, stated_label, own_label, collect_numbers, look)
 
+    # each with the facts of all others
     facts_by_mesh = _add_others(
         {mesh: make_thing_facts(mesh) for mesh in (OBJECT, *description.things)}
     )
@@ -667,7 +671,8 @@ def _collect_numbers(
 
     Args:
         description: the scene, which has a value for every parameter.
-        describe: returns the values of the configuration, which replace those.
+        describe: returns the values of a configuration, such as {"camera.azimuth":
+            {"value": 30.0, "unit": "degrees"}}. They replace those of the scene.
     """
     configuration = {key: value["value"] for key, value in describe().items()}
     all_values = {**description.values, **configuration}
@@ -704,8 +709,8 @@ def make_sight(
     Args:
         surfaces: what each pixel shows.
         mesh: name of the mesh.
-        metres: size of the object in metres, which is the unit of length of the scene;
-            None if it is not known.
+        metres: length of a unit of the scene in metres, to convert depths; None if it
+            is not known. The unit is the size of the object, whatever `mesh` is.
     """
     return Sight(surfaces.visible_mask(mesh), surfaces.depth, surfaces.z_depth, metres)
 
@@ -724,7 +729,7 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         An entry for the object and for each other thing; None if the scene has only
         the object.
     """
-    description = renderer.scene.description_and_filter[0]
+    description, _ = renderer.scene.description_and_filter
     if not description.things:
         return None
     names = (OBJECT, *description.things)
@@ -743,13 +748,14 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         for name in names
     }
     for thing in find_visible_meshes(renderer, u, names):
+        visible_fraction = thing.visible_fraction
+        if visible_fraction is not None:  # it is None if it is not known
+            visible_fraction = round(visible_fraction, 4)
         things[thing.name] = {
             "label": labels[thing.name],
             "box": [*thing.box],
             "pixels": int(thing.mask.sum()),
-            "share": None
-            if thing.visible_fraction is None
-            else round(thing.visible_fraction, 4),
+            "share": visible_fraction,
             "truncated": thing.is_truncated,
             "distance": round(thing.distance, 3),
         }

@@ -86,7 +86,8 @@ class Windowing:
 def find_window(problem: Problem) -> Windowing | Refusal:
     """Return the smallest window outside of which a search changes little.
 
-    The box around what is searched is grown by each of `MARGINS` in turn. A window is
+    The box around what is searched is grown by each of `MARGINS`, in pixels, in turn. A
+    window is
     accepted if the images of three configurations look alike outside of it: the start,
     and the smallest and the largest allowed values of all coordinates. These are
     `N_WINDOW_IMAGES` full images of few samples.
@@ -119,7 +120,7 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         deviation = measure_outside(problem, window, start, extremes)
         if deviation.is_accepted:
             return Windowing(window, start, deviation)
-    return Refusal(f"its surroundings change with it: {_describe(deviation)}")
+    return Refusal(f"its surroundings change with it: {_describe_excess(deviation)}")
 
 
 def find_crop_refusal(problem: Problem) -> Refusal | None:
@@ -153,8 +154,8 @@ def find_searched_refusal(problem: Problem) -> Refusal | None:
 
     It does not if surfaces of meshes are searched, such as a texture, and the meshes
     stay where they are. Then the image changes where the meshes are visible. Lights
-    and moving things change it elsewhere. If nothing is searched that needs rays, as a
-    blur of the finished image, there is no part to trace, which is a refusal as well.
+    and moving things change it elsewhere. If all that is searched changes the finished
+    image, such as a blur, no part has to be traced, which is a refusal as well.
     """
     light_inputs = find_light_inputs(problem.renderer)
     input_names = find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
@@ -167,7 +168,8 @@ def find_searched_refusal(problem: Problem) -> Refusal | None:
             return Refusal(f"{part} is light, which shows everywhere")
         if name.endswith(MOVING_SUFFIXES):
             return Refusal(f"{part} moves")
-        if part not in mesh_names:
+        is_mesh = part in mesh_names  # only a mesh has a place in the image
+        if not is_mesh:
             return Refusal(f"{part} shows in more than a part of the picture")
     return None
 
@@ -190,8 +192,8 @@ def _find_box(problem: Problem) -> Window | None:
 def render_full(problem: Problem, u: Tensor) -> FullImage:
     """Render the full image of a configuration, to compare it with that of another.
 
-    It is traced twice with independent noise (`halves`); `radiance` is the denoised
-    mean of both. The two seeds are the same for every u, so that most of the noise
+    It is traced twice with independent noise (the two halves), and the mean of both is
+    denoised. The two seeds are the same for every u, so that most of the noise
     cancels in the difference of two images.
 
     Args:
@@ -208,7 +210,7 @@ def render_full(problem: Problem, u: Tensor) -> FullImage:
         halves, radiance = renderer.trace_independent_radiances(
             _compute_inputs(problem, u), noise_seed, PROBE_SPP
         )
-    return FullImage(u.detach().clone(), halves, radiance)
+    return FullImage(u.detach().clone(), independent_renders=halves, radiance=radiance)
 
 
 def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
@@ -232,6 +234,7 @@ def measure_outside(
     margin_changes = []
     for image in others:
         squared_differences.append(_measure_square(problem, window, before, image))
+        # error of the margin by pasting, and change of the margin by the search
         bias, change = _measure_margin(problem, window, before, image)
         margin_biases.append(bias)
         margin_changes.append(change)
@@ -243,7 +246,7 @@ def measure_outside(
         levels=math.sqrt(max(0.0, sum(squared_differences) / count)),
         margin_bias=sum(margin_biases) / count,  # mean error of the margin
         allowed_levels=MAX_LEVELS,
-        n_traced=count,
+        n_traced=count,  # full images
         allowed_margin_bias=allowed_bias,
     )
 
@@ -284,7 +287,8 @@ def _measure_square(
         difference_sums.append(_sum_over_squares(levels))
     # number of pixels outside of the window in each square, (1, 1, h, w)
     n_pixels = _sum_over_squares(outside)
-    # mean * mean * n_pixels in each square; the sums are each n_pixels times a mean
+    # A sum over a square is n_pixels times a mean. The product of both means is
+    # weighted by the number of pixels: mean * mean * n_pixels = sum * sum / n_pixels.
     first_sum, second_sum = difference_sums
     products = first_sum * second_sum / n_pixels.clamp_min(1.0)
     n_channels = 3.0
@@ -353,7 +357,7 @@ def _compute_margin(problem: Problem, radiance: Tensor, u: Tensor) -> float:
         return problem.judge(image, u).margin
 
 
-def _describe(deviation: Deviation) -> str:
+def _describe_excess(deviation: Deviation) -> str:
     """Return by how much a rejected deviation exceeds its limit, for a sentence."""
     has_accepted_levels = deviation.levels_fraction <= ACCEPTED_FRACTION
     if not has_accepted_levels:

@@ -82,13 +82,14 @@ def find_dips(
     counts_before = np.concatenate([[0], np.cumsum(counts)])
     dips = []
     for near in range(n_distances - 1):
-        # Every range that begins right behind this distance, by the index after its
-        # last distance.
+        # Every range that begins right behind this distance, by its end: the index
+        # after its last distance.
         end = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[end] - right_before[near + 1]
         counts_beyond = counts_before[end] - counts_before[near + 1]
         # the probability of as few right images here, if chance decides which of the
-        # images here and beyond are right
+        # images here and beyond are right; arguments: right images here, all images,
+        # all right images, images here
         p_values = hypergeom.cdf(
             right[near],
             counts_beyond + counts[near],
@@ -103,6 +104,7 @@ def find_dips(
         dip = Dip(
             distance=float(distances[near]),
             counts=(int(right[near]), int(counts[near])),
+            # last distance of the range: `best` counts from the one behind `near`
             until=float(distances[near + 1 + best]),
             counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
             p_value=min(1.0, float(p_values[best]) * n_comparisons),
