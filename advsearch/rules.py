@@ -804,6 +804,7 @@ def grow_trees(
         (estimator.tree_, columns) for estimator in (single_tree, *forest.estimators_)
     ]
     for index, column in enumerate(columns):
+        # only a column that is measured from another zero has a `turn`
         is_shifted_angle = column.full_condition.turn > 0.0
         if is_shifted_angle:
             # A tree of all columns would first split another column of the same angle.

@@ -248,6 +248,39 @@ def estimate_failure_rate(
     sample failed, otherwise 0. Given the samples before, the mean of x_t is the rate p.
     Let b_t be an upper bound of the weights that q_t can give.
 
+    Args:
+        weights: (n,) w_t, over 0; n is at least 1.
+        bounds: (n,) b_t, at least 1 and at least w_t, known before sample t.
+        failed: (n,) bool, whether the model was wrong at a sample.
+        unknown: (n,) bool, whether a sample could not be evaluated. The interval holds
+            whether these failed or not.
+    """
+    weights = weights.double()
+    # The lower bound of the rate assumes that no unknown sample failed, the upper bound
+    # that all of them did. Each has its own x_t.
+    x_if_unknown_pass = weights * (failed & ~unknown)
+    x_if_unknown_fail = weights * (failed | unknown)
+    n_samples = len(weights)
+    total = float(x_if_unknown_pass.sum())
+    # number of equally weighted failures that are worth as much (Kish 1965)
+    effective = 0.0
+    if total:
+        effective = total**2 / float(x_if_unknown_pass.square().sum())
+    estimate = None
+    if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
+        # The mean of x_t may exceed 1 by chance, as weights do; a rate can't.
+        estimate = min(1.0, total / n_samples)
+    interval = _bound_failure_rate(
+        x_if_unknown_pass, x_if_unknown_fail, bounds.double()
+    )
+    return FailureRate(estimate, interval, effective, draws=n_samples)
+
+
+def _bound_failure_rate(
+    x_if_unknown_pass: Tensor, x_if_unknown_fail: Tensor, bounds: Tensor
+) -> tuple[float, float]:
+    """Return a 95 % interval of a failure rate p, the mean of x_t over samples t.
+
     The interval is by betting (Waudby-Smith and Ramdas 2024, "Estimating means of
     bounded random variables by betting"). For each p in [0, 1], one gambler bets that
     the rate is over p, another one that it is under p. Both bet the fraction c of their
@@ -263,18 +296,10 @@ def estimate_failure_rate(
     falls with p and the second grows, so the interval has one lower and one upper end.
 
     Args:
-        weights: (n,) w_t, over 0; n is at least 1.
-        bounds: (n,) b_t, at least 1 and at least w_t, known before sample t.
-        failed: (n,) bool, whether the model was wrong at a sample.
-        unknown: (n,) bool, whether a sample could not be evaluated. The interval holds
-            whether these failed or not.
+        x_if_unknown_pass: (n,) x_t for the lower end of the interval.
+        x_if_unknown_fail: (n,) x_t for the upper end.
+        bounds: (n,) b_t, at least 1 and at least x_t, known before sample t.
     """
-    weights = weights.double()
-    bounds = bounds.double()
-    # The lower bound of the rate assumes that no unknown sample failed, the upper bound
-    # that all of them did. Each has its own x_t.
-    x_if_unknown_pass = weights * (failed & ~unknown)
-    x_if_unknown_fail = weights * (failed | unknown)
     # c of the formulas: 1, 1/2, 1/4, ...; (bets, 1)
     bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
     # The mean capital is compared with 40 = 2 / 0.05. Below, `logsumexp` gives the
@@ -295,23 +320,13 @@ def estimate_failure_rate(
         log_capital = torch.log1p(gains).sum(dim=1)
         return float(log_capital.logsumexp(dim=0)) >= log_limit
 
-    n_samples = len(weights)
-    total = float(x_if_unknown_pass.sum())
-    # number of equally weighted failures that are worth as much (Kish 1965)
-    effective = 0.0
-    if total:
-        effective = total**2 / float(x_if_unknown_pass.square().sum())
-    estimate = None
-    if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
-        # The mean of x_t may exceed 1 by chance, as weights do; a rate can't.
-        estimate = min(1.0, total / n_samples)
     # The interval begins where the bets on a larger rate have no longer won, and ends
     # where the bets on a smaller one begin to win.
     # `find_threshold` returns where a condition on p begins to hold. It tries only p
     # between 0 and 1, exclusive, so that neither p nor `bounds - p` is 0.
     lower = find_threshold(lambda p: not have_won_over(p))
     upper = find_threshold(have_won_under)
-    return FailureRate(estimate, (lower, upper), effective, draws=n_samples)
+    return lower, upper
 
 
 MAX_FAILURES = 24  # maximum number of failures in a result

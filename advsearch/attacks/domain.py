@@ -547,7 +547,8 @@ def project_l2_box(
         squared_distance += float(squares[-1].sum(dtype=torch.float64))
         squared_distance_in_box += float(rooms[-1].sum(dtype=torch.float64))
     # p(1), u clipped to the box, is the solution if it lies in the ball
-    if squared_distance_in_box <= (radius * (1.0 + ROUNDING_SLACK)) ** 2:
+    max_distance = radius * (1.0 + ROUNDING_SLACK)
+    if squared_distance_in_box <= max_distance**2:
         return u.clamp(low, high)
     # Without the box this would be the solution. The box makes g smaller, so that the
     # solution is at least as large: Newton's method begins on its left.
@@ -609,10 +610,12 @@ def _move_towards(
         strict=True,
     ):
         torch.lerp(center_chunk, u_chunk, t, out=out)
-        # farther from the center than the exact result, up to rounding
-        is_outside = (out - center_chunk).abs() > ((u_chunk - center_chunk) * t).abs()
-        rounded = torch.nextafter(out, center_chunk)
-        torch.where(is_outside, rounded, out, out=out).clamp_(low, high)
+        distance = (out - center_chunk).abs()
+        max_distance = ((u_chunk - center_chunk) * t).abs()
+        is_too_far = distance > max_distance
+        one_unit_nearer = torch.nextafter(out, center_chunk)
+        # `out` is a part of `moved`, so this writes the result there
+        torch.where(is_too_far, one_unit_nearer, out, out=out).clamp_(low, high)
     return moved
 
 

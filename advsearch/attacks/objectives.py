@@ -87,12 +87,12 @@ class ObjectiveSignature:
     """The arguments that a user's function takes.
 
     Attributes:
-        images: whether it takes (output, images, truth), not (output, truth).
+        takes_images: whether it takes (output, images, truth), not (output, truth).
         requested_inputs: names of the inputs that it requests by further parameters, of
             `REQUESTABLE_INPUTS`.
     """
 
-    images: bool = True
+    takes_images: bool = True
     requested_inputs: tuple[str, ...] = ()
 
 
@@ -221,19 +221,23 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         InputError: (when the objective is called) the result has a wrong type or shape,
             or does not depend on the arguments differentiably.
     """
-    name = get_name(function)
+    function_name = get_name(function)
     signature = read_signature(function)
 
     def objective(
-        output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
+        output: Any,
+        images: Tensor,
+        truth: Any,
+        read_input: ReadInput = reject_inputs,
+        /,
     ) -> Tensor:
         """Call the function with what it requests, and check what it returns, (N,)."""
-        inputs = {
-            input_name: more(input_name) for input_name in signature.requested_inputs
-        }
+        inputs = {name: read_input(name) for name in signature.requested_inputs}
         count = images.shape[0]
         labels = truth_to_labels(truth, output, count)
-        arguments = (output, images, labels) if signature.images else (output, labels)
+        arguments = (
+            (output, images, labels) if signature.takes_images else (output, labels)
+        )
         argument_copies = copy_value(arguments)
         input_copies = copy_value(inputs)
         try:
@@ -242,22 +246,23 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
             if not _is_label_set_rejected(labels, error):
                 raise
             raise InputError(
-                f"objective {name!r}: expected one right label for a loss of torch, "
-                f"got {len(labels)} (indices "
+                f"objective {function_name!r}: expected one right label for a loss of "
+                f"torch, got {len(labels)} (indices "
                 f"{labels}); use those of advsearch.losses, or name one with `label`"
             ) from error
         is_scalar = isinstance(result, Tensor) and result.ndim == 0
         if is_scalar and count > 1:
             # This calls `objective` again, with a count of 1.
             result = _evaluate_each_image(objective, output, images, truth, inputs)
-        values = _check_values(name, result, count)
+        values = _check_values(function_name, result, count)
         if values.requires_grad and _are_written_into((argument_copies, input_copies)):
             # The function has changed a copy in place, which may make torch's backward
             # pass fail. It is tried here, so that the error names the function. The
             # gradient is by the output and the inputs, or else by the images.
             sources = _list_differentiable((output, inputs)) or [images]
-            _check_differentiable(name, values, sources)
-        _check_keeps_gradient(name, values, (images, output, *inputs.values()))
+            _check_differentiable(function_name, values, sources)
+        # values without a gradient, though an argument has one, are an error
+        _check_keeps_gradient(function_name, values, (images, output, *inputs.values()))
         return values
 
     return objective
@@ -791,7 +796,7 @@ def _orient_objective(
         output: Any,
         images: Tensor,
         truth: Any,
-        more: ReadInput = reject_inputs,  # reads further inputs by name
+        read_input: ReadInput = reject_inputs,  # reads further inputs by name
         /,
     ) -> Tensor:
         """Return the values (N,) of the function, negated if the task minimizes."""
@@ -800,7 +805,7 @@ def _orient_objective(
         function_output = output
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
-        values = function(function_output, images, labels, more)
+        values = function(function_output, images, labels, read_input)
         # it can only be checked if the values have a gradient by the model's output
         if must_check_direction and _has_slope_by_class(values, output):
             must_check_direction = False

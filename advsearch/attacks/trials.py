@@ -324,16 +324,11 @@ def _climb_ladder(
         if not may_settle(rung, count):  # but a later look may
             continue
         seeds = [derive_seed(seed, "sample count", number) for number in range(count)]
-        below = rung - 1
-        for rendered_rung in (below, rung):
-            n_rendered = len(margins_of_rungs[rendered_rung])
-            new_seeds = seeds[n_rendered:]
-            if new_seeds:
-                new_margins = margins(ladder[rendered_rung], new_seeds)
-                margins_of_rungs[rendered_rung] += new_margins
-        if _is_settled(
-            margins_of_rungs[rung], margins_of_rungs[below], n_looks, trials
-        ):
+        below = margins_of_rungs[rung - 1]
+        _render_missing(below, margins, ladder[rung - 1], seeds)
+        at_rung = margins_of_rungs[rung]
+        _render_missing(at_rung, margins, ladder[rung], seeds)
+        if _is_settled(at_rung, below, n_looks, trials):
             break
     return [margins_of_rung for margins_of_rung in margins_of_rungs if margins_of_rung]
 
@@ -373,6 +368,22 @@ def _is_settled(
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
     is_sign_constant = all(sign * value > 0.0 for value in at_rung)
     return is_mean_sure and is_extrapolated_sure and is_sign_constant
+
+
+def _render_missing(
+    rendered: list[float], margins: MarginsOf, spp: int, seeds: Sequence[int]
+) -> None:
+    """Render a configuration at one rung with the seeds that are missing there.
+
+    Args:
+        rendered: margins of the rung, for the first seeds; new ones are appended.
+        margins: function from (spp, seeds) to margins, which renders the configuration.
+        spp: samples per pixel of the rung.
+        seeds: all seeds, in order.
+    """
+    new_seeds = seeds[len(rendered) :]
+    if new_seeds:
+        rendered += margins(spp, new_seeds)
 
 
 def _may_settle(

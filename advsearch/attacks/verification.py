@@ -476,9 +476,9 @@ def verify(
         spp=spp,
         confidence=_choose_confidence(rule, has_several_looks=has_several_looks),
         renders=len(done) + len(clean_trials) - len(clean),  # without those of `clean`
-        stopped="asked for" if is_complete else "decided",
+        stop_reason="asked for" if is_complete else "decided",
         is_early=is_success and is_early,
-        begin=first_index,
+        first_index=first_index,
     )
 
 
@@ -616,9 +616,9 @@ def _summarize_trials(
     spp: int,
     confidence: float,
     renders: int,
-    stopped: str,
+    stop_reason: str,
     is_early: bool,
-    begin: int,
+    first_index: int,
 ) -> Verification:
     """Return the verification of a configuration by the trials of both groups.
 
@@ -633,10 +633,10 @@ def _summarize_trials(
         spp: samples per pixel.
         confidence: confidence of the interval of the success rate.
         renders: number of renders that the trials took.
-        stopped: why there are no more trials: "asked for" or "decided".
+        stop_reason: why there are no more trials: "asked for" or "decided".
         is_early: whether the claim was found at an early look. Then the reason states
             the larger number of successes that this look needs.
-        begin: index of the first trial.
+        first_index: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
     # None marks a trial that does not count. `TrialCounts` needs at least 1, as the
@@ -660,7 +660,7 @@ def _summarize_trials(
         clean_trials=tuple(clean_trials),
         adversarial_trials=tuple(trials),
         renders=renders,
-        stop_reason=stopped,
+        stop_reason=stop_reason,
         trial_successes=outcomes,
-        first_index=begin,
+        first_index=first_index,
     )

@@ -86,7 +86,7 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
     settings = {}
     for name, function in metrics.items():
         is_column = name in (*LEADING_COLUMNS, *TRAILING_COLUMNS)
-        if is_column or not name:
+        if is_column or not name:  # an empty name gets the same message
             raise InputError(
                 f"metrics: {name!r} is a column that rows have already; "
                 "choose another name"

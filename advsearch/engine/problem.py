@@ -879,13 +879,9 @@ class Problem:
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
-            if self.task.varies:
-                values = self._compute_objective_of_each(
-                    outputs_of_images, images, truths, variable_configurations
-                )
-            else:  # one truth holds for all images
-                inputs = self.make_objective_inputs(*variable_configurations)
-                values = self._compute_objective(outputs, images, truths[0], inputs)
+            values = self._compute_objectives_of_batch(
+                outputs, images, truths, variable_configurations
+            )
             derivative = torch.zeros_like(u) if needs_gradient else None
             # Objectives without a graph do not depend on u: the derivative stays 0.
             if values.requires_grad:
@@ -903,6 +899,30 @@ class Problem:
             )
             evaluations.append(evaluation)
         return list(zip(evaluations, outputs_of_images, strict=True)), derivative
+
+    def _compute_objectives_of_batch(
+        self,
+        outputs: Output,
+        images: Tensor,
+        truths: Sequence[Truth],
+        full_configurations: Sequence[Tensor],
+    ) -> Tensor:
+        """Return the objectives (N,) of a batch of images, with a graph.
+
+        Args:
+            outputs: the model's output for all N images.
+            images: (N, H, W, 3) sRGB in [0, 1].
+            truths: what is true of each image; all are equal if the truth of the task
+                does not vary.
+            full_configurations: N full configurations, which an objective may read.
+        """
+        if self.task.varies:
+            outputs_of_images = _split_batch(outputs, len(truths))
+            return self._compute_objective_of_each(
+                outputs_of_images, images, truths, full_configurations
+            )
+        inputs = self.make_objective_inputs(*full_configurations)
+        return self._compute_objective(outputs, images, truths[0], inputs)
 
     def _compute_objective_of_each(
         self,

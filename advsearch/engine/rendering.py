@@ -464,12 +464,11 @@ def _render_view(
     formation = renderer.formation
     u = _choose_configuration(space, settings.at)
     with torch.no_grad():
-        radiance = renderer.radiance(
-            u, seeds.derive_seed(settings.seed, "pictures"), settings.spp
-        )
-        image = round_to_8_bit(
-            space.apply_to_image(u, formation.map_to_display(radiance))
-        )
+        noise_seed = seeds.derive_seed(settings.seed, "pictures")
+        radiance = renderer.radiance(u, noise_seed, settings.spp)
+        displayed = formation.map_to_display(radiance)
+        # with what controls change in the finished image, such as a blur
+        image = round_to_8_bit(space.apply_to_image(u, displayed))
         output = model(image)
         truth = None
         truth_error = ""
@@ -729,7 +728,7 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         An entry for the object and for each other thing; None if the scene has only
         the object.
     """
-    description, _ = renderer.scene.description_and_filter
+    description, _filter = renderer.scene.description_and_filter
     if not description.things:
         return None
     names = (OBJECT, *description.things)

@@ -18,6 +18,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
+from advsearch.controls import Space
 from advsearch.engine.acceptance import N_VIEWS, ComparedView, Deviation
 from advsearch.engine.bank import sample_condition
 from advsearch.engine.problem import Problem
@@ -153,26 +154,42 @@ class SurfaceLight(PredictedSearch):
             )
             for control in space.controls
         }
-        # the searched coordinates come first, those of the conditions after them
-        is_moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})
-        self._is_moving = is_moving[:n_searched]
-        if self.moving_coordinates is not None:  # they were stated
-            self._is_moving = torch.zeros(n_searched, dtype=torch.bool).index_fill_(
-                0, self.moving_coordinates, True
-            )
+        self._is_moving = self._find_moving_coordinates()
         self._has_moving = bool(self._is_moving.any())
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
         self.draws_conditions = problem.conditions is not None and self._searches_colors
-        # Base colors are applied separately. So if nothing that is searched moves, only
-        # the inputs of the conditions, whose controls come last, have to be computed.
-        self._input_space = space
-        if not self._has_moving:
-            # `problem.n_searched` is None without conditions: then all controls count
-            n_searched_controls = problem.n_searched or 0
-            condition_controls = space.controls[n_searched_controls:]
-            self._input_space = replace(space, controls=condition_controls)
+        self._input_space = self._select_input_space()
+        # coordinates of the conditions only, which follow the searched ones
         self._needs_new_light = self._find_coordinates_of_light()[n_searched:]
+
+    def _find_moving_coordinates(self) -> Tensor:
+        """Return which searched coordinates move something, (d,) bool.
+
+        These are the stated `moving_coordinates`, or else those that move a camera or
+        change the environment.
+        """
+        n_searched = self.problem.domain.dim
+        if self.moving_coordinates is not None:
+            return torch.zeros(n_searched, dtype=torch.bool).index_fill_(
+                0, self.moving_coordinates, True
+            )
+        is_moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})
+        # the searched coordinates come first, those of the conditions after them
+        return is_moving[:n_searched]
+
+    def _select_input_space(self) -> Space:
+        """Return the space of the controls whose scene inputs have to be computed.
+
+        Base colors are applied separately. So if nothing that is searched moves, these
+        are only the controls of the conditions, which come last.
+        """
+        space = self.problem.space
+        if self._has_moving:
+            return space
+        # `problem.n_searched` is None without conditions: then all controls count
+        n_searched_controls = self.problem.n_searched or 0
+        return replace(space, controls=space.controls[n_searched_controls:])
 
     def _find_coordinates(self, inputs: frozenset[str]) -> Tensor:
         """Return which coordinates of the full space change given inputs, (d,) bool.

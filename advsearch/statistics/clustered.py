@@ -396,16 +396,7 @@ def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
     """
     # units with equal rates are counted, and computed once
     distinct_rates, n_units = np.unique(rates, axis=0, return_counts=True)
-    # columns (distinct, 1), which broadcast with the (m,) null rates to (distinct, m)
-    wrong_inside, has_inside, right_outside, has_outside = (
-        column[:, None] for column in distinct_rates.T
-    )
-    # Gain of a stake of 1 on each side: what is won, minus the stake. It is 0 on
-    # average if the rate of right predictions is m, and so that of wrong ones 1 - m. On
-    # a side without predictions there is neither stake nor gain.
-    gain_inside = wrong_inside / (1.0 - NULL_RATES) - has_inside
-    # not by a `gain_outside`, as the order of the sum determines the last bits
-    gains = gain_inside + right_outside / NULL_RATES - has_outside
+    gains = _compute_gains(distinct_rates)
     stake_fraction = 0.5 if is_cut else 1.0
     gains = stake_fraction * gains
     log_capitals = []  # (m,) for each stake
@@ -419,3 +410,21 @@ def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
     log_capital_of_rate = log_capital_of_rate - np.log(len(STAKES))
     smallest_log_capital = log_capital_of_rate.min()
     return float(min(1.0, np.exp(-smallest_log_capital)))
+
+
+def _compute_gains(rates: FloatArray) -> FloatArray:
+    """Return the gains of units from a stake of 1 on each side, (n, m).
+
+    They are for each of the m `NULL_RATES`. `rates` (n, 4) is as in `_betting_p_value`.
+    """
+    # columns (n, 1), which broadcast with the (m,) null rates to (n, m)
+    wrong_inside, has_inside, right_outside, has_outside = (
+        column[:, None] for column in rates.T
+    )
+    # Gain of a stake of 1 on each side: what is won, minus the stake. It is 0 on
+    # average if the rate of right predictions is m, and so that of wrong ones 1 - m. On
+    # a side without predictions there is neither stake nor gain.
+    gain_inside = wrong_inside / (1.0 - NULL_RATES) - has_inside
+    # not by a `gain_outside`, as the order of the sum determines the last bits
+    gains: FloatArray = gain_inside + right_outside / NULL_RATES - has_outside
+    return gains

@@ -53,6 +53,12 @@ class Runner:
     best_objective: float = -math.inf
     is_over: bool = False
 
+    def propose(self, limit: int) -> tuple[tuple[Proposal, ...], Runner]:
+        """Return at most `limit` proposals, and the search in the state after them."""
+        n = min(limit, self.renders_left)
+        proposals, state = self.policy.propose(self.state, n)
+        return proposals, replace(self, state=state)
+
     def charge(self, proposal: Proposal) -> Runner:
         """Return the search after it has paid for one of its proposals."""
         cost = proposal.max_cost(self.domain)
@@ -137,12 +143,9 @@ class Race:
             k = max(waiting, key=lambda index: runners[index].renders_left)
             proposer = runners[k]
             if k not in proposals:
-                proposals[k], state = proposer.policy.propose(
-                    proposer.state, min(max_proposals, proposer.renders_left)
-                )
-                # `charge` below stores it in `runners`. A search without a proposal
-                # stays in its state before.
-                proposer = replace(proposer, state=state)
+                # `charge` below stores the new state in `runners`. A search without a
+                # proposal stays in its state before.
+                proposals[k], proposer = proposer.propose(max_proposals)
             has_nothing_to_propose = not proposals[k]
             if has_nothing_to_propose:
                 self._retire(runners, k)  # in place: it gets no more renders

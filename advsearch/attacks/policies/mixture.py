@@ -207,9 +207,7 @@ class Components:
         sample_weights = (responsibility / counts.clamp(min=1e-12)).T
         # Means are computed from offsets x - old mean, in which angles do not wrap.
         offset = ranges.compute_offset(x[:, None], self.means)  # (n, k, d)
-        mean_offset = torch.einsum("kn,nkd->kd", sample_weights, offset)
-        squared_residual = (offset - mean_offset).square()
-        variance = torch.einsum("kn,nkd->kd", sample_weights, squared_residual)
+        mean_offset, variance = _compute_moments(offset, sample_weights)
         # of the normal distributions before they are truncated to the ranges
         means, stds = _correct_truncation(
             self.means + mean_offset, variance, counts[:, None], ranges
@@ -222,6 +220,19 @@ class Components:
         new_weights = (1.0 - UNIFORM_WEIGHT) * fraction
         new_weights += UNIFORM_WEIGHT / len(fraction)
         return Components(new_weights, means, stds, option_probs)
+
+
+def _compute_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean and variance of values by component, (k, d) each.
+
+    Args:
+        values: (n, k, d) values of n samples.
+        weights: (k, n) weights of the samples in each component, with the sum 1.
+    """
+    mean = torch.einsum("kn,nkd->kd", weights, values)
+    squared_residual = (values - mean).square()
+    variance = torch.einsum("kn,nkd->kd", weights, squared_residual)
+    return mean, variance
 
 
 def _correct_truncation(
@@ -525,7 +536,8 @@ class Mixture(Policy[MixtureState]):
         is_complete = state.n_evaluated >= self.population
         if not is_complete:
             return state
-        return self._begin_generation(state, self._fit(state))
+        next_mixture = self._fit(state)
+        return self._begin_generation(state, next_mixture)
 
     def failures(self, state: MixtureState) -> policies.Failures:
         """Return the worst failure of each component, and the estimated failure rate.

@@ -190,6 +190,16 @@ def choose_estimators(
     return plan
 
 
+def _count_renders(plan: GradientPlan, estimator: str) -> float:
+    """Return the renders that a gradient by one estimator takes.
+
+    They are the image itself, the renders of the differences, and the adjoint, which
+    takes as much time as `ADJOINT_RENDERS` renders.
+    """
+    is_adjoint = estimator in ADJOINT_ESTIMATORS
+    return 1.0 + plan.renders + (ADJOINT_RENDERS if is_adjoint else 0.0)
+
+
 def _score_estimators(
     bench: Bench,
     plan: GradientPlan,
@@ -213,14 +223,14 @@ def _score_estimators(
     for estimator in estimators:
         single_plan = restrict_plan(plan, group_names, estimator)
         gradients, seconds = bench.compute_gradients(
-            single_plan, "plan", repeats, f"{groups[0].name} by {estimator}"
+            single_plan,
+            stream="plan",
+            repeats=repeats,
+            label=f"{groups[0].name} by {estimator}",
         )
         cost = seconds
         if counts_renders:
-            is_adjoint = estimator in ADJOINT_ESTIMATORS
-            adjoint_renders = ADJOINT_RENDERS if is_adjoint else 0.0
-            # the image itself, the renders of the differences, and the adjoint
-            cost = 1.0 + single_plan.renders + adjoint_renders
+            cost = _count_renders(single_plan, estimator)
         residual = gradients - gradients.mean(dim=0)  # (repeats, d)
         gradients_of[estimator] = gradients
         cost_of[estimator] = cost
