@@ -217,11 +217,13 @@ def find_connected(first: IntArray, second: IntArray) -> IntArray:
         The group of each row (n,), named by the lowest `first` number in it.
     """
     group = first
-    # the lowest number of a group spreads from row to row until nothing changes
+    # The lowest number of a group spreads from row to row until nothing changes. In
+    # each round it spreads to rows with the same `second` number, then with the same
+    # `first`.
     while True:
         linked = group
         for number in (second, first):
-            # the lowest group of all rows with each number
+            # for each number, the lowest group of its rows; at first larger than all
             lowest = np.full(int(number.max()) + 1, len(group))
             np.minimum.at(lowest, number, linked)
             linked = lowest[number]

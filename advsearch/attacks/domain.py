@@ -613,9 +613,9 @@ def _move_towards(
         distance = (out - center_chunk).abs()
         max_distance = ((u_chunk - center_chunk) * t).abs()
         is_too_far = distance > max_distance
-        one_unit_nearer = torch.nextafter(out, center_chunk)
+        rounded_inwards = torch.nextafter(out, center_chunk)
         # `out` is a part of `moved`, so this writes the result there
-        torch.where(is_too_far, one_unit_nearer, out, out=out).clamp_(low, high)
+        torch.where(is_too_far, rounded_inwards, out, out=out).clamp_(low, high)
     return moved
 
 

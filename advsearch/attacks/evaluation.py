@@ -169,8 +169,8 @@ class Evaluation:
     def sanitize(self) -> Evaluation:
         """Return the evaluation as it is passed to policies, without NaN.
 
-        - Gradient elements that are NaN or infinite become zero, whether the objective
-          is finite or not. Their number is added to `n_non_finite`.
+        - Gradient elements that are NaN or infinite become zero. They are counted in
+          `n_non_finite`, also if the objective is not finite.
         - If the objective is NaN or infinite, it becomes -inf, the worst value. All of
           its gradient becomes zero and its success false.
         """

@@ -297,7 +297,8 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         stopped: why the search stopped.
         seconds: seconds that the search took.
     """
-    best = Candidate(log.domain.start, math.nan, False)
+    # without a success, so that nothing is claimed
+    best = Candidate(log.domain.start, objective=math.nan, success=False)
     if log.pool:  # else nothing could be evaluated
         best = select_best(log.pool)
     # mean of the renders in the ranking, of which one may be -inf

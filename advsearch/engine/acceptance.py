@@ -91,16 +91,18 @@ class Deviation:
         The error of the margin may be `MAX_MARGIN_BIAS`, or a fraction of the change of
         the margin by the search, whichever is larger.
         """
+        # Squared errors are estimates without noise, which may be below 0 by chance.
+        # The root is 0 then.
         square = statistics.fmean(view.squared_error for view in views)
         allowed_square = statistics.fmean(view.allowed_squared_error for view in views)
         margin_change = statistics.fmean(view.margin_change for view in views)
-        margin_limit = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * margin_change)
+        allowed_bias = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * margin_change)
         return cls(
             levels=_root(square),
             margin_bias=statistics.fmean(view.margin_bias for view in views),
             allowed_levels=max(MIN_ALLOWED_LEVELS, _root(allowed_square)),
             n_traced=sum(view.n_traced for view in views),
-            allowed_margin_bias=margin_limit,
+            allowed_margin_bias=allowed_bias,
         )
 
     @property

@@ -196,6 +196,7 @@ class Bank(PredictedSearch):
         """
         self.replay(query)  # the comparison and the growth that are due
         conditions = self._choose_conditions(query.kind, query.row_index)
+        # with the cost and the samples of the prediction
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
         if not query.includes_image:
             return evaluation

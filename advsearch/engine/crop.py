@@ -81,7 +81,7 @@ class CroppedSearch(PredictedSearch):
             self.selected_window = windowing
             self.window = windowing.window
             self.deviations.append(windowing.deviation)
-            # `find_window` has rendered these
+            # images that `find_window` has rendered
             tick(self.preparation_spp)
             self.n_traced += N_WINDOW_IMAGES
             self._renew_surroundings(

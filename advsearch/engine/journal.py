@@ -399,8 +399,9 @@ class Journal:
     def __post_init__(self) -> None:
         """Read from the store which machines and how many rows the run has.
 
-        A copy made by `dataclasses.replace`, for another problem of the same run, has
-        the same dicts and `_opened`, so that nothing is read again.
+        A copy made by `dataclasses.replace`, for another problem of the same run, gets
+        `_opened` and the same dicts, which are changed in place. So nothing is read
+        again.
         """
         if self.run_directory is not None and not self._opened:
             self.machines |= self.get_note(MACHINES_NOTE) or {}
@@ -688,6 +689,7 @@ class Journal:
         if seconds is None:
             return None
         stored: Iterable[Row] = ()
+        # The store has cached evaluations if an earlier process has begun the run.
         if self.run_directory is not None and self.run_directory.store.has_cached:
             stored = self.run_directory.store.rows(kind)
         search_seconds = []
@@ -695,7 +697,7 @@ class Journal:
         for row in stored:
             if row.phase == "search":
                 search_seconds.append(row.seconds or 0.0)
-            else:
+            else:  # "ranking"
                 has_ranking = True
         seconds_left = seconds - math.fsum(search_seconds)
         n_stored = len(search_seconds)

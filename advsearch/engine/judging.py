@@ -335,7 +335,8 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
             _unbatch(model_output, model_truth)
             for model_output, model_truth in zip(image_output, truth, strict=True)
         ]
-        outputs, truths = zip(*pairs, strict=True) if pairs else ((), ())
+        outputs = tuple(model_output for model_output, _ in pairs)
+        truths = tuple(model_truth for _, model_truth in pairs)
         return outputs, truths
     labels = truth_to_labels(truth, output, count=1)
     # a single label is a tensor (1,); any other truth stays as it is

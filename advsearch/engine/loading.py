@@ -916,7 +916,7 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             )
         if isinstance(control, Control):
             control_by_name[name] = control
-        elif _is_settings_of_control(control):
+        elif _is_settings_of_control(control):  # and not of one parameter
             control_by_name[name] = {
                 key: distribution_to_setting(value) for key, value in control.items()
             }

@@ -291,12 +291,14 @@ def check_distinct(names: Sequence[str], setting: str) -> Sequence[str]:
     Raises:
         InputError: there are none, or one comes twice.
     """
-    duplicates = [name for name in names if names.count(name) > 1]
-    if duplicates or not names:
-        raise InputError(
-            f"{setting}: expected different names, got {','.join(names)!r}; leave "
-            f"{', '.join(duplicates[:1])} out"
-        )
+    if not names:
+        raise InputError(f"{setting}: expected at least one name, got none")
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"{setting}: expected different names, got {','.join(names)!r}; leave "
+                f"{name} out"
+            )
     return names
 
 
@@ -496,8 +498,9 @@ def check_run_settings(config: SceneConfig) -> None:
     for setting, value in collect_run_settings(config).items():
         random_controls: Mapping[str, Any] = {}
         if setting not in SETTINGS_OF_SEARCHES:
-            # only some commands have controls that vary by chance
+            # `over` has the controls that vary by chance; only some commands have it
             random_controls = getattr(config, "over", {})
+        # several names may state parameters of one control
         controls = merge_control_settings({**config.controls, **random_controls})
         # kind of each control that does not take the setting, by its name
         rejecting_kinds = {}

@@ -282,7 +282,8 @@ class Problem:
             The judgement. It has the value of the objective, if there is one.
         """
         if self.objective is None:
-            # `{}`: no stated values in place of the configuration's
+            # Without an objective, `judge_images` does all that is needed. `{}`: no
+            # stated values in place of the configuration's.
             return self.judge_images(image[None], [full_u], [{}])[0]
         with torch.no_grad():
             output = self.model(image)
@@ -882,22 +883,14 @@ class Problem:
             values = self._compute_objectives_of_batch(
                 outputs, images, truths, variable_configurations
             )
-            derivative = torch.zeros_like(u) if needs_gradient else None
-            # Objectives without a graph do not depend on u: the derivative stays 0.
-            if values.requires_grad:
-                weights = compute_condition_weights(values)
-                weighted_sum = (values * weights).sum()
-                (derivative,) = torch.autograd.grad(weighted_sum, variable_u)
+            derivative = None
+            if needs_gradient:
+                derivative = _differentiate_weighted_sum(values, variable_u)
         judgements = self._judge_outputs(outputs, images, truths, full_configurations)
-        evaluations = []
-        for value, judgement in zip(values.detach(), judgements, strict=True):
-            evaluation = Evaluation(
-                objective=float(value),
-                gradient=None,
-                success=judgement.success,
-                judgement=judgement,
-            )
-            evaluations.append(evaluation)
+        evaluations = [
+            Evaluation(float(value), None, judgement.success, judgement=judgement)
+            for value, judgement in zip(values.detach(), judgements, strict=True)
+        ]
         return list(zip(evaluations, outputs_of_images, strict=True)), derivative
 
     def _compute_objectives_of_batch(
@@ -1090,6 +1083,19 @@ def _differentiate_by_inputs(objective: Tensor, variable_u: Tensor) -> Tensor:
         if gradient is not None:
             return gradient
     return torch.zeros(())
+
+
+def _differentiate_weighted_sum(values: Tensor, u: Tensor) -> Tensor:
+    """Return the derivative (d,) by u of objectives (n,) of conditions, weighted.
+
+    The weights are those of `compute_condition_weights`. Objectives without a graph do
+    not depend on u: then the derivative is 0.
+    """
+    if not values.requires_grad:
+        return torch.zeros_like(u, requires_grad=False)
+    weighted_sum = (values * compute_condition_weights(values)).sum()
+    (derivative,) = torch.autograd.grad(weighted_sum, u)
+    return derivative
 
 
 def compute_condition_weights(values: Tensor) -> Tensor:

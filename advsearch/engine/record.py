@@ -237,8 +237,8 @@ def make_rate(
         successes: judgements of the successes, whose labels and outcomes are counted.
     """
     labels = Counter(trial.prediction.label for trial in successes)
-    # The score is the margin with the opposite sign. In floating point -x is -0 for a
-    # mean score of 0, but 0.0 - x is 0.
+    # The mean margin is that of minus the score, as scores and margins have opposite
+    # signs. In floating point -x is -0 for a mean score of 0, but 0.0 - x is 0.
     mean_margin = 0.0 - mean_number(trial.score for trial in trials)
     return VerifiedRate(
         successes=counts.n_successes,

@@ -408,9 +408,9 @@ def render(
 def _list_view_warnings(rendered_views: Sequence[_RenderedView]) -> list[str]:
     """Return the task's warnings about the views, as sentences.
 
-    One states why the truth could not be drawn into a view, if that happened. The
-    others are the task's remarks on the first view that has any, since those on further
-    views say the same.
+    One states why the truth could not be drawn into a view, if that happened; of
+    several views, the last one. The others are the task's remarks on the first view
+    that has any, since those on further views say the same.
     """
     sentences = list[str]()
     truth_errors = [
@@ -461,14 +461,9 @@ def _render_view(
         settings.seed,
         sampler=settings.sampler,
     )
-    formation = renderer.formation
     u = _choose_configuration(space, settings.at)
     with torch.no_grad():
-        noise_seed = seeds.derive_seed(settings.seed, "pictures")
-        radiance = renderer.radiance(u, noise_seed, settings.spp)
-        displayed = formation.map_to_display(radiance)
-        # with what controls change in the finished image, such as a blur
-        image = round_to_8_bit(space.apply_to_image(u, displayed))
+        radiance, image = _render_image(renderer, u, settings)
         output = model(image)
         truth = None
         truth_error = ""
@@ -484,7 +479,7 @@ def _render_view(
     view = View(
         azimuth=description.get_number("camera.azimuth"),
         picture=image,
-        linear=radiance * formation.gain,
+        linear=radiance * renderer.formation.gain,
         predictions=predictions,
         marks=marks,
         surfaces=renderer.find_surfaces(u) if settings.with_surfaces else None,
@@ -492,7 +487,19 @@ def _render_view(
         truth=truth,
         things=find_visible_things(renderer, u),
     )
-    return _RenderedView(view, task, space, formation, truth_error)
+    return _RenderedView(view, task, space, renderer.formation, truth_error)
+
+
+def _render_image(
+    renderer: Renderer, u: Tensor, settings: _ViewSettings
+) -> tuple[Tensor, Tensor]:
+    """Return the radiance of a configuration u (d,), and its image of 8-bit values."""
+    noise_seed = seeds.derive_seed(settings.seed, "pictures")
+    radiance = renderer.radiance(u, noise_seed, settings.spp)
+    displayed = renderer.formation.map_to_display(radiance)
+    # with what controls change in the finished image, such as a blur
+    image = renderer.space.apply_to_image(u, displayed)
+    return radiance, round_to_8_bit(image)
 
 
 def _find_truth(task: Task, facts: Facts) -> tuple[Any, str]:

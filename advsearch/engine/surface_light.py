@@ -504,6 +504,7 @@ class SurfaceLight(PredictedSearch):
         conditions = []
         for position, new_condition in zip(positions, new_conditions, strict=True):
             stored_condition = self._bank_conditions[position]
+            # both are (k,), as `_needs_new_light` is
             condition = torch.where(
                 self._needs_new_light, stored_condition, new_condition
             )
@@ -542,7 +543,8 @@ class SurfaceLight(PredictedSearch):
         """
         # base colors, with a graph from u
         color = self.renderer.get_color(self.problem.searched_space.inputs(u))
-        # the same configurations, with a graph from u
+        # The same configurations with a graph from u, for controls that change the
+        # finished image, such as a blur.
         variable_configurations = [
             torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
         ]

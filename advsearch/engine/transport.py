@@ -381,7 +381,8 @@ class Transport(PredictedSearch):
                 self._full_images["start"] = windowing.start_image
                 self.n_traced += N_WINDOW_IMAGES  # those of `find_window`
             self._is_prepared = True
-        # `clean_matrix` may be shared with another search that has computed it.
+        # `clean_matrix` has predictors by window (None for full images). It may be
+        # shared with another search, which has computed this one.
         if self.window not in self.clean_matrix.predictors:
             predictor = self._make_predictor(
                 self.problem.domain.start,
@@ -416,7 +417,8 @@ class Transport(PredictedSearch):
             u: (d,) the configuration.
             kind: kind of the search.
             number: index of its query, for the seed.
-            tick: called with the samples that were traced.
+            tick: called with the samples that were traced for the predictor, without
+                those of the surroundings.
         """
         with self.measure_seconds():
             seed = seeds.derive_seed(self.problem.seed, f"transport {kind}", number)

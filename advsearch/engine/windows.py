@@ -141,10 +141,11 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
         )
     if renderer.scene.is_volumetric:
         return HAZE
-    definition, *_ = renderer.scene.description_and_filter
-    if definition.camera_model is not None:
+    description, _filter = renderer.scene.description_and_filter
+    if description.camera_model is not None:
         return Refusal("the camera has a lens of its own")
-    if renderer.formation.denoiser != "oidn":
+    is_denoised = renderer.formation.denoiser == "oidn"
+    if not is_denoised:
         return NOISE
     return find_searched_refusal(problem)
 
@@ -315,12 +316,13 @@ def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
     displayed pixel depends on its own radiance, so that the gradient of the sum has the
     derivative of each pixel.
     """
-    radiance = image.radiance.clone()
+    radiance = image.radiance.clone()  # (H, W, 3), or 4 with coverage
     inputs = _compute_inputs(problem, image.u)
     renderer = problem.renderer
     with torch.enable_grad():
         radiance.requires_grad_()
-        # the two steps of displaying an image, without rounding
+        # The two steps of displaying an image, without rounding. First exposure and
+        # backdrop are applied, then the tone curve.
         linear = renderer.finish_image(radiance, inputs, image.u, display=False)
         displayed = renderer.formation.map_to_display(linear)
         (slope,) = torch.autograd.grad(displayed.sum(), radiance)

@@ -508,7 +508,7 @@ class MapElites(Policy[ArchiveState]):
         random_points = samples[:n_random]
         observations = state.observations
         if observations is None:
-            # The other samples supply new options for choices of the offspring.
+            # Offspring may get new options for their choices from the other samples.
             offspring = [
                 domain.project(u) for u in state.make_offspring(samples[n_random:], rng)
             ]

@@ -257,7 +257,8 @@ def _correct_truncation(
     """
     uniform_mean = 0.5
     uniform_variance = UNIFORM_STD**2
-    # The variance is averaged with that of the prior, which is uniform.
+    # The prior is the uniform distribution, which counts as `PRIOR_COUNT` samples: its
+    # variance is averaged with that of the samples.
     pooled_variance = (counts * variance + PRIOR_COUNT * uniform_variance) / (
         counts + PRIOR_COUNT
     )
