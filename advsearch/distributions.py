@@ -83,8 +83,8 @@ TORCH_DISTRIBUTIONS: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] =
     "StudentT": ("t", lambda d: {"df": d.df, **_loc_scale(d)}),
     "Weibull": ("weibull_min", lambda d: {"c": d.concentration, "scale": d.scale}),
 }
-"""For each class of `torch.distributions` its name in scipy, and a function that returns
-its parameters there.
+"""For each class of `torch.distributions` its name in scipy, and a function that
+returns its parameters there.
 """
 
 

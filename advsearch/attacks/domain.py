@@ -666,7 +666,7 @@ def compute_half_widths(domain: Domain) -> Tensor:
 
 
 def find_periodic(domain: Domain) -> Tensor:
-    """Return which elements are periodic, so that u wraps at their bounds, (d,) bool."""
+    """Return which elements are periodic, so that u wraps at the bounds, (d,) bool."""
     sizes = torch.tensor([block.size for block in domain.blocks], dtype=torch.long)
     return torch.tensor(
         [block.periodic for block in domain.blocks], dtype=torch.bool

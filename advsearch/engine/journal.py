@@ -511,8 +511,9 @@ class Journal:
         if not is_same_query:
             raise InputError(
                 f"{self.run_directory.path}: cannot resume: evaluation "
-                f"{query.row_index} of the {query.kind} is not the one that was stored, "
-                "so advsearch, its packages or the number of threads have changed since; "
+                f"{query.row_index} of the {query.kind} is not the one that was "
+                "stored, so advsearch, its packages or the number of threads have "
+                "changed since; "
                 f"{self.run_directory.restart_advice}"
             )
         if cached.non_finite:

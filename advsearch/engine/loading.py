@@ -404,8 +404,8 @@ def _put_into_photographs(
         return make_photograph_scene(description, view, camera, occluder)
     if occluder is not None:
         raise InputError(
-            f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs to "
-            "one photograph; state it as `occluder` in the camera file beside that"
+            f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs "
+            "to one photograph; state it as `occluder` in the camera file beside that"
         )
     scenes: dict[str, SceneDescription] = {}
     # Files that are opened here belong to the folder.

@@ -667,8 +667,8 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
 
 
 _PROCESS_LOCK = threading.RLock()
-"""Lock that is held by the running experiment. The number of threads of torch and Dr.Jit
-and the recording of warnings are shared by the process.
+"""Lock that is held by the running experiment. The number of threads of torch and
+Dr.Jit and the recording of warnings are shared by the process.
 """
 
 

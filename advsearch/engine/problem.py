@@ -80,8 +80,8 @@ from few that are exact.
 """
 
 MAX_CACHED_COORDINATES = 64
-"""The truth of a configuration is cached if it has at most this many coordinates besides
-base colors.
+"""The truth of a configuration is cached if it has at most this many coordinates
+besides base colors.
 """
 
 MAX_CACHED_TRUTHS = 512

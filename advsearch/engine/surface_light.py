@@ -54,9 +54,9 @@ N_LIGHTS = 64
 COMPARISON_INTERVAL = 100
 BATCH_SIZE = 8  # images in a batch of the model
 N_CONDITION_SETS = 4
-"""Number of sets of conditions of a random search, which are used in turn. Such a search
-can't adapt to them, since it does not learn from evaluations. So the views of the
-cameras can be stored, and are traced only once for each set.
+"""Number of sets of conditions of a random search, which are used in turn. Such a
+search can't adapt to them, since it does not learn from evaluations. So the views of
+the cameras can be stored, and are traced only once for each set.
 """
 
 

@@ -47,8 +47,8 @@ from advsearch.scene.transport.matrix import ProgressCallback
 from advsearch.scene.window import Window
 
 MIN_STEPS = 16
-"""Smallest number of evaluations of a search for which the matrix pays. It costs as much
-as about 6 rendered evaluations with gradients (`benchmarks/transport.py`).
+"""Smallest number of evaluations of a search for which the matrix pays. It costs as
+much as about 6 rendered evaluations with gradients (`benchmarks/transport.py`).
 """
 # Smallest number of evaluations for each light for which basis images pay. A basis
 # image shows the scene under a single light; images under all lights are weighted sums.
@@ -244,8 +244,8 @@ class PredictedSearch(ABC):
 
     @abstractmethod
     def count_entries_and_bytes(self) -> tuple[int, int]:
-        """Return the number of entries of the matrices, for one color channel, and their
-        size in bytes.
+        """Return the number of entries of the matrices, for one color channel, and
+        their size in bytes.
         """
 
     def summarize_conditions(self) -> BankOfConditions | None:

@@ -36,8 +36,8 @@ from advsearch.scene.window import Window
 MIN_STEPS = 16  # smallest number of evaluations of a search for which a crop pays
 MAX_AREA = 0.3  # area of the largest window that pays, as a fraction of the image
 MAX_LEVELS = 0.1
-"""Allowed difference outside of the window, in levels of 255. It is the root mean square
-of the mean differences over squares of `SQUARE` pixels.
+"""Allowed difference outside of the window, in levels of 255. It is the root mean
+square of the mean differences over squares of `SQUARE` pixels.
 """
 SQUARE = 8  # side of these squares in pixels
 MARGINS = (8, 16, 24, 32, 48, 64, 96, 128)  # pixels around the box, smallest first

@@ -227,7 +227,8 @@ def _paired_p_value(unit_advantage: FloatArray) -> float:
 def _compare_independent_rows(
     first: npt.NDArray[np.bool_], second: npt.NDArray[np.bool_]
 ) -> tuple[float, tuple[float, float], float]:
-    """Compare two outcomes of independent rows by Newcombe's interval and McNemar's test.
+    """Compare two outcomes of independent rows by Newcombe's interval and McNemar's
+    test.
 
     Args:
         first, second: (n,) bool, whether each outcome happens.

@@ -48,7 +48,7 @@ each with one of these stakes. Large stakes decide soon if nearly all samples ag
 
 @dataclass
 class ConfidenceSequence:
-    """Samples in [0, 1], and an interval of their mean that is valid after each of them.
+    """Samples in [0, 1], and an interval of their mean that is valid after each one.
 
     So sampling may stop as soon as the interval decides a question.
 
@@ -125,7 +125,7 @@ class ConfidenceSequence:
         return lower, upper
 
     def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
-        """Return whether bets on "more than `mean`" have gained more than chance allows.
+        """Return whether bets on "more than `mean`" gained more than chance allows.
 
         If `mean` is the true mean, the capital reaches the threshold with a probability
         of at most 1 - confidence, divided by the number of sides (Ville's inequality).

@@ -29,7 +29,7 @@ MAX_MOVE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class BoxCoordinates:
-    """The k coordinates of the unit box: u[indices] = low + width * x for x in [0, 1]^k.
+    """The k coordinates of the unit box: u[indices] = low + width * x, x in [0, 1]^k.
 
     Attributes:
         indices: (k,) of the elements of u.
