@@ -83,8 +83,8 @@ TORCH_DISTRIBUTIONS: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] =
     "StudentT": ("t", lambda d: {"df": d.df, **_loc_scale(d)}),
     "Weibull": ("weibull_min", lambda d: {"c": d.concentration, "scale": d.scale}),
 }
-"""For each class of `torch.distributions` its name in scipy, and a function that returns
-its parameters there.
+"""For each class of `torch.distributions` its name in scipy, and a function that
+returns its parameters there.
 """
 
 
@@ -124,7 +124,9 @@ def distribution_to_setting(value: object) -> object:
         return _frozen_to_setting(value)
     inverse_cdf = getattr(value, "icdf", None) or getattr(value, "ppf", None)
     if inverse_cdf and kind.__module__.startswith("torch"):
-        torch = sys.modules["torch"]  # imported, as the value is an object of it
+        # This module does not import torch, which is slow. The value is an object of
+        # torch, so it is imported already.
+        torch = sys.modules["torch"]
 
         def evaluate_inverse_cdf(probability: float) -> float:
             return float(inverse_cdf(torch.tensor(probability, dtype=torch.float64)))
@@ -143,26 +145,28 @@ def _choices_to_setting(value: Mapping[Any, Any]) -> object:
     A mapping whose values are not all numbers, or which is a setting already, is
     returned unchanged.
     """
-    # weights may be numbers of numpy or torch
+    # Weights may be scalars of numpy or torch, which have 0 dimensions. Numbers of
+    # Python have no `ndim`.
     weights = [w.item() if getattr(w, "ndim", 1) == 0 else w for w in value.values()]
     are_numbers = all(
         isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights
     )
     is_setting = bool(value.keys() & {DISTRIBUTION, CHOICES})
     if value and are_numbers and not is_setting:
-        # An integer too large for a float raises here. Then the mapping is returned
-        # unchanged, and the check of the setting reports it.
+        # An integer too large for a float raises OverflowError. Then the mapping is
+        # returned unchanged, and the check of the setting reports it.
         with suppress(OverflowError):
             return {CHOICES: list(value), WEIGHTS: list(map(float, weights))}
     return value
 
 
 def _is_family_of_scipy(family: Any) -> bool:
-    """Return whether a family of distributions is one of scipy's.
+    """Return whether a family of distributions, such as `norm`, is one of scipy's.
 
     A user's family may have the same name, but has another class.
     """
     name = str(getattr(family, "name", ""))
+    # the default has a type that no family has
     family_of_scipy = getattr(sys.modules.get("scipy.stats"), name, NotImplemented)
     return type(family) is type(family_of_scipy)
 

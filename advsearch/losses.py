@@ -65,8 +65,8 @@ def carlini_wagner(
 ) -> Tensor:
     """Return `margin`, clipped at a confidence (Carlini and Wagner 2017, f_6).
 
-    Where it is clipped it has no gradient, so that a search improves the other terms of
-    the objective there.
+    The sign is opposite to theirs, as this is to be maximized. Where it is clipped it
+    has no gradient, so that a search improves the other terms of the objective there.
     """
     return margin(logits, labels).clamp(max=confidence)
 
@@ -209,8 +209,8 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
     """Compute a loss of logits for their labels, (N,).
 
     Args:
-        loss: objective function (logits, images, label set) -> (N,). It does not use
-            the images, so that it gets the logits in their place.
+        loss: function (logits, images, label set) -> (N,) that does not use the images.
+            The logits are passed as its images, too.
         logits: (N, C).
         labels: (N,) or (1,) int64, a label for each row or one for all rows; or the
             indices of a label set for all rows, any of which is right.
@@ -224,7 +224,7 @@ def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Te
             f"{type(labels).__name__}, the truth of another task than classification; "
             "a loss of your own takes it as it is"
         )
-    if not isinstance(labels, Tensor):
+    if not isinstance(labels, Tensor):  # a label set for all rows
         return loss(logits, logits, tuple(labels))
     label_sets = [(int(label),) for label in labels.flatten()]
     if len(label_sets) not in (1, len(logits)):

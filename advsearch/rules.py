@@ -118,7 +118,7 @@ def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
             columns[name] = column
             units[name] = "" if has_names else rows.attrs["units"][name]
     if "outcome" in rows:
-        # a factor may have this name, and stays
+        # If a factor has the name "outcome", its column stays.
         columns.setdefault("outcome", rows["outcome"])
     # In `rows.attrs` units are those of measurement; column "unit" is the group of
     # rows.
@@ -141,7 +141,9 @@ def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
     """
     if "outcome" not in rows:
         return None
-    counts = rows.loc[rows["correct"] != 1, "outcome"].astype(str).value_counts()
+    # a prediction that was not judged counts as wrong
+    is_wrong = rows["correct"] != 1
+    counts = rows.loc[is_wrong, "outcome"].astype(str).value_counts()
     counts_by_name = {
         outcome.value: int(counts[outcome.value])
         for outcome in Outcome
@@ -177,8 +179,9 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
 
     Such rows are no independent samples, but the same sample twice, if equal samples do
     not occur by chance. That is assumed if some numerical factor has at least half as
-    many values as there are rows. Otherwise the table is returned unchanged: values of
-    a grid, and names, also repeat in independent samples.
+    many values as there are rows. Otherwise the table is returned unchanged: if all
+    factors are names or have the values of a grid, independent samples may be equal,
+    too.
     """
     factors = list(table.attrs["units"])
     is_continuous = any(
@@ -195,6 +198,7 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     if n_configurations == len(table):  # all are different
         return table
     unit_index = np.unique(table["unit"], return_inverse=True)[1]
+    # units that share a configuration, directly or by other units
     merged = table.assign(unit=find_connected(unit_index, configuration))
     merged.attrs = table.attrs
     return merged
@@ -213,11 +217,13 @@ def find_connected(first: IntArray, second: IntArray) -> IntArray:
         The group of each row (n,), named by the lowest `first` number in it.
     """
     group = first
-    # the lowest number of a group spreads from row to row until nothing changes
+    # The lowest number of a group spreads from row to row until nothing changes. In
+    # each round it spreads to rows with the same `second` number, then with the same
+    # `first`.
     while True:
         linked = group
         for number in (second, first):
-            # the lowest group of all rows with each number
+            # for each number, the lowest group of its rows; at first larger than all
             lowest = np.full(int(number.max()) + 1, len(group))
             np.minimum.at(lowest, number, linked)
             linked = lowest[number]
@@ -277,7 +283,7 @@ class RuleCondition:
         """Return in which rows the condition holds, (n,) bool.
 
         A condition on an angle may hold from 350 to 10 degrees, through zero; then its
-        low bound is over its high bound.
+        low bound is over its high bound. Angles are compared modulo `turn`.
         """
         column = table[self.factor]
         if self.options is not None:
@@ -301,6 +307,7 @@ class RuleCondition:
         """
         if not self.turn:
             return ()
+        # modulo `turn`, as the range may go through 0
         width = (self.high - self.low) % self.turn
         starts = [
             self.low + offset for offset in np.arange(0.0, 360.0, self.turn).tolist()
@@ -322,7 +329,7 @@ class RuleCondition:
 
     @property
     def _values_text(self) -> str:
-        """The values that fulfil the condition, as text: names, arcs of a turn, or bounds."""
+        """The values that fulfil the condition, as text: names, arcs or bounds."""
         if self.options:
             return " or ".join(sorted(self.options))
         is_angle = self.turn > 0.0
@@ -467,16 +474,16 @@ def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> Fou
             choosing, seeds.derive_seed(seed, "rules", number)
         )
         if not conditions:
-            return FoundRules(accepted, None)
+            return FoundRules(accepted, best_rejected=None)
         inside = find_covered(conditions, counting)
         rule = CountedRule(conditions, counting[inside], counting[~inside])
         if not rule.holds:
-            return FoundRules(accepted, rule)
+            return FoundRules(accepted, best_rejected=rule)
         accepted.append(rule)
         # both without the rows of this rule
         choosing = choosing[~find_covered(conditions, choosing)]
         counting = rule.elsewhere
-    return FoundRules(accepted, None)
+    return FoundRules(accepted, best_rejected=None)
 
 
 # ---- the best conditions
@@ -542,8 +549,9 @@ class ConditionScorer:
         is_covered = find_covered(conditions, self.table)
         if int(is_covered.sum()) < self._min_rows:
             return -1.0
-        # The product is equal to the sum of the excess over the covered rows, divided
-        # by the number of all rows.
+        # The excess of a row is 1 if it is wrong, else 0, minus the rate in the table.
+        # The product is equal to its sum over the covered rows, divided by the number
+        # of all rows.
         return float(self._excess[is_covered].sum()) / len(self.table)
 
 
@@ -552,9 +560,10 @@ def shorten_conditions(
 ) -> RuleConditions:
     """Remove conditions that add little to the score, one at a time.
 
-    In each step the condition is removed whose removal costs least. The loss is that
-    from the score of all conditions. The steps end when it exceeds both a fraction of
-    this score and the standard error of the loss.
+    In each step the condition is removed whose removal costs least. The loss is the
+    score of all conditions, before the first step, minus the score of those that are
+    left. The steps end when it exceeds both a fraction of the first score and its own
+    standard error.
     """
     table = scorer.table
     full_score = scorer.score(conditions)
@@ -568,7 +577,8 @@ def shorten_conditions(
         is_added = find_covered(shorter, table) & ~find_covered(conditions, table)
         n_added = int(is_added.sum())
         # A loss below its standard error may be chance. Every row that is covered in
-        # addition changes the score by its excess / len(table); these are summed.
+        # addition changes the score by the row's wrongness minus the mean, divided by
+        # the number of all rows. The variances of these changes add up.
         standard_error = math.sqrt(n_added * variance) / len(table)
         loss = full_score - scorer.score(shorter)
         tolerated_loss = (1.0 - RETAINED_ACCURACY) * full_score
@@ -588,6 +598,7 @@ def adjust_bounds(
     """
     for _ in range(N_ADJUSTMENTS):
         for index in range(len(conditions)):
+            # with another lower or upper bound of this condition; none for names
             adjusted = [
                 (*conditions[:index], condition, *conditions[index + 1 :])
                 for condition in list_adjusted(conditions[index], scorer.table)
@@ -674,7 +685,7 @@ class TreeColumn(NamedTuple):
         turn = self.full_condition.turn
         if not turn:
             return condition
-        # An infinite bound is that of the full turn.
+        # An infinite bound becomes 0 or `turn`. Both bounds are then measured from 0.
         low = max(condition.low, 0.0) + self.zero
         high = min(condition.high, turn) + self.zero
         start = low % turn
@@ -727,7 +738,9 @@ def _list_rules_of_node(
         name: [] for name in factors
     }
     for column, condition in condition_of_column.items():
-        conditions_of_factor[condition.factor].append(column.to_factor(condition))
+        # the same condition by the factor itself, e.g. with angles from 0 degrees
+        factor_condition = column.to_factor(condition)
+        conditions_of_factor[condition.factor].append(factor_condition)
     # factors without a condition are left out
     yield from product(*filter(None, conditions_of_factor.values()))
 
@@ -743,7 +756,9 @@ def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
     columns = []
     for factor, unit in table.attrs["units"].items():
         values = table[factor]
-        full_condition = RuleCondition(factor, unit)
+        full_condition = RuleCondition(
+            factor, unit
+        )  # without bounds: all rows fulfil it
         if values.dtype == "category":
             names = values.cat.categories.tolist()
             full_condition = replace(full_condition, options=frozenset(names))
@@ -751,6 +766,7 @@ def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
             continue
         columns.append(TreeColumn(full_condition))
         if unit == "degrees" and np.ptp(values.to_numpy()) >= MIN_ANGLE_RANGE:
+            # modulo `turn` degrees, measured from `zero`
             columns += [
                 TreeColumn(replace(full_condition, turn=turn), zero=zero)
                 for turn, zero in ARCS
@@ -779,21 +795,22 @@ def grow_trees(
     columns = list_columns(table)
     data = np.stack([column.read_values(table) for column in columns], axis=1)
     is_right = table["correct"].to_numpy()
-    shape = {"max_depth": MAX_CONDITIONS, "min_samples_leaf": min_rows}
+    limits = {"max_depth": MAX_CONDITIONS, "min_samples_leaf": min_rows}
     random_state = seed % 2**32  # scikit-learn takes 32 bits
-    single_tree = make_tree(**shape, random_state=random_state).fit(data, is_right)
+    single_tree = make_tree(**limits, random_state=random_state).fit(data, is_right)
     # each split of the forest may use a random 60 % of the columns
     forest = make_forest(
-        N_TREES, **shape, max_features=0.6, random_state=random_state
+        N_TREES, **limits, max_features=0.6, random_state=random_state
     ).fit(data, is_right)
     trees = [
         (estimator.tree_, columns) for estimator in (single_tree, *forest.estimators_)
     ]
     for index, column in enumerate(columns):
+        # only a column that is measured from another zero has a `turn`
         is_shifted_angle = column.full_condition.turn > 0.0
         if is_shifted_angle:
             # A tree of all columns would first split another column of the same angle.
-            tree = make_tree(**shape).fit(data[:, [index]], is_right).tree_
+            tree = make_tree(**limits).fit(data[:, [index]], is_right).tree_
             trees.append((tree, [column]))
     return trees
 

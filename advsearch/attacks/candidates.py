@@ -248,19 +248,6 @@ def estimate_failure_rate(
     sample failed, otherwise 0. Given the samples before, the mean of x_t is the rate p.
     Let b_t be an upper bound of the weights that q_t can give.
 
-    The interval is by betting (Waudby-Smith and Ramdas 2024, "Estimating means of
-    bounded random variables by betting"). For each p in [0, 1], one gambler bets that
-    the rate is over p, another one that it is under p. Both bet the fraction c of their
-    capital on each sample. The capital starts at 1. After all samples it is
-
-        prod_t (1 - c + c x_t / p)               for the bet that the rate is over p;
-        prod_t (1 + c (p - x_t) / (b_t - p))     for the bet that it is under p.
-
-    If the rate is p, both bets are fair. Then the mean of the capital over several c
-    exceeds 2 / 0.05 with a probability of at most 0.025 (Ville 1939). So the values of
-    p at which neither bet exceeds this limit are a 95 % interval. The first capital
-    falls with p and the second grows, so the interval has one lower and one upper end.
-
     Args:
         weights: (n,) w_t, over 0; n is at least 1.
         bounds: (n,) b_t, at least 1 and at least w_t, known before sample t.
@@ -269,29 +256,10 @@ def estimate_failure_rate(
             whether these failed or not.
     """
     weights = weights.double()
-    bounds = bounds.double()
     # The lower bound of the rate assumes that no unknown sample failed, the upper bound
     # that all of them did. Each has its own x_t.
     x_if_unknown_pass = weights * (failed & ~unknown)
     x_if_unknown_fail = weights * (failed | unknown)
-    # c of the formulas: 1, 1/2, 1/4, ...; (bets, 1)
-    bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
-    # The mean capital is compared with 2 / 0.05. Below, `logsumexp` gives the logarithm
-    # of the sum over all bets, which is `N_BETS` times the mean.
-    log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
-
-    def is_too_low(p: float) -> bool:
-        """Return whether the bets that the rate is over p have won."""
-        factors = 1.0 - bet_sizes + bet_sizes * x_if_unknown_pass / p  # (bets, n)
-        log_capital = torch.log(factors).sum(dim=1)
-        return float(log_capital.logsumexp(dim=0)) >= log_limit
-
-    def is_too_high(p: float) -> bool:
-        """Return whether the bets that the rate is under p have won."""
-        gains = bet_sizes * (p - x_if_unknown_fail) / (bounds - p)  # (bets, n)
-        log_capital = torch.log1p(gains).sum(dim=1)
-        return float(log_capital.logsumexp(dim=0)) >= log_limit
-
     n_samples = len(weights)
     total = float(x_if_unknown_pass.sum())
     # number of equally weighted failures that are worth as much (Kish 1965)
@@ -302,11 +270,63 @@ def estimate_failure_rate(
     if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
         # The mean of x_t may exceed 1 by chance, as weights do; a rate can't.
         estimate = min(1.0, total / n_samples)
+    interval = _bound_failure_rate(
+        x_if_unknown_pass, x_if_unknown_fail, bounds.double()
+    )
+    return FailureRate(estimate, interval, effective, draws=n_samples)
+
+
+def _bound_failure_rate(
+    x_if_unknown_pass: Tensor, x_if_unknown_fail: Tensor, bounds: Tensor
+) -> tuple[float, float]:
+    """Return a 95 % interval of a failure rate p, the mean of x_t over samples t.
+
+    The interval is by betting (Waudby-Smith and Ramdas 2024, "Estimating means of
+    bounded random variables by betting"). For each p in [0, 1], one gambler bets that
+    the rate is over p, another one that it is under p. Both bet the fraction c of their
+    capital on each sample. The capital starts at 1. After all samples it is
+
+        prod_t (1 - c + c x_t / p)               for the bet that the rate is over p;
+        prod_t (1 + c (p - x_t) / (b_t - p))     for the bet that it is under p.
+
+    If the rate is p, both bets are fair. Then the mean of the capital over several c
+    exceeds 40 with a probability of at most 1 / 40 (Ville 1939), for either bet. That
+    is 0.05 for both together. So the values of p at which neither bet exceeds this
+    limit are a 95 % interval. The first capital
+    falls with p and the second grows, so the interval has one lower and one upper end.
+
+    Args:
+        x_if_unknown_pass: (n,) x_t for the lower end of the interval.
+        x_if_unknown_fail: (n,) x_t for the upper end.
+        bounds: (n,) b_t, at least 1 and at least x_t, known before sample t.
+    """
+    # c of the formulas: 1, 1/2, 1/4, ...; (bets, 1)
+    bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
+    # The mean capital is compared with 40 = 2 / 0.05. Below, `logsumexp` gives the
+    # logarithm of the sum over all bets, which is `N_BETS` times the mean.
+    log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
+
+    def have_won_over(p: float) -> bool:
+        """Return whether the bets that the rate is over p have won."""
+        # A bet of the whole capital (c = 1) is lost at the first sample without a
+        # failure. Its logarithm is -inf, which adds nothing to the sum below.
+        factors = 1.0 - bet_sizes + bet_sizes * x_if_unknown_pass / p  # (bets, n)
+        log_capital = torch.log(factors).sum(dim=1)
+        return float(log_capital.logsumexp(dim=0)) >= log_limit
+
+    def have_won_under(p: float) -> bool:
+        """Return whether the bets that the rate is under p have won."""
+        gains = bet_sizes * (p - x_if_unknown_fail) / (bounds - p)  # (bets, n)
+        log_capital = torch.log1p(gains).sum(dim=1)
+        return float(log_capital.logsumexp(dim=0)) >= log_limit
+
+    # The interval begins where the bets on a larger rate have no longer won, and ends
+    # where the bets on a smaller one begin to win.
     # `find_threshold` returns where a condition on p begins to hold. It tries only p
     # between 0 and 1, exclusive, so that neither p nor `bounds - p` is 0.
-    lower = find_threshold(lambda p: not is_too_low(p))
-    upper = find_threshold(is_too_high)
-    return FailureRate(estimate, (lower, upper), effective, draws=n_samples)
+    lower = find_threshold(lambda p: not have_won_over(p))
+    upper = find_threshold(have_won_under)
+    return lower, upper
 
 
 MAX_FAILURES = 24  # maximum number of failures in a result
@@ -433,7 +453,8 @@ class Bracket:
     """The bounds of the smallest scale.
 
     Attributes:
-        largest_failing_scale: largest scale at which a search found nothing; 0 if none has failed.
+        largest_failing_scale: largest scale at which a search found nothing; 0 if none
+            has failed.
         smallest_passing_scale: smallest scale at which a configuration passed; infinity
             if none did.
         u: (d,) the configuration at `smallest_passing_scale`; None if there is none.
@@ -453,9 +474,13 @@ class Bracket:
 
     @property
     def is_closed(self) -> bool:
-        """Whether high is within `RATIO` of low."""
+        """Whether the smallest passing scale is within `RATIO` of the largest failing.
+
+        False if no configuration passed.
+        """
         return (
             self.u is not None
+            # the 1e-9 is for rounding
             and self.smallest_passing_scale
             <= RATIO * (1.0 + 1e-9) * self.largest_failing_scale
         )
@@ -528,10 +553,11 @@ def find_smallest_change(
 
     Returns:
         The bracket. It is not `is_closed` if the searches did not suffice. If nothing
-        passed in the full budgets, its `low` is 1 and its `u` None.
+        passed in the full budgets, its `largest_failing_scale` is 1 and its `u` None.
     """
     full_u = search(domain, 0)  # the best configuration in the full budgets
-    # Nothing is known to pass yet, so `high` is infinite.
+    # Nothing is known to pass yet. The counts include the search above and the check
+    # below.
     bracket = Bracket(
         largest_failing_scale=0.0,
         smallest_passing_scale=math.inf,
@@ -539,13 +565,13 @@ def find_smallest_change(
         searches=1,
         n_checks=1,
     )
-    if not passes(full_u, 0):
+    if not passes(full_u, 0):  # the check with the index 0
         return replace(bracket, largest_failing_scale=1.0)
     bracket = _shorten(bracket, full_u, 1.0, passes, domain, likely)
     while (
         bracket.searches < MAX_SEARCHES
-        and bracket.smallest_passing_scale
-        > RATIO * bracket.largest_failing_scale  # not closed
+        # the bracket is not closed
+        and bracket.smallest_passing_scale > RATIO * bracket.largest_failing_scale
         and bracket.smallest_passing_scale > SMALLEST_SCALE
     ):
         scale = _choose_next_scale(bracket)
@@ -568,14 +594,14 @@ def _choose_next_scale(bracket: Bracket) -> float:
     """Return the scale of the budgets at which to search next, inside the bracket.
 
     It is the geometric mean of both bounds, or half the upper one if no search has
-    failed yet. If the bounds are close, it is high / `RATIO` instead. If the search
-    finds nothing there, this becomes the lower bound, and the bracket is closed.
+    failed yet.
     """
     has_failed_search = bracket.largest_failing_scale > 0.0
     if not has_failed_search:
         return bracket.smallest_passing_scale / 2.0
     scale = math.sqrt(bracket.largest_failing_scale * bracket.smallest_passing_scale)
-    # high / `RATIO` is at or below the mean of the bounds only if they are this close
+    # If the next search finds nothing, its scale becomes the lower bound. With bounds
+    # this close, that closes the bracket. `max` ensures this against rounding.
     can_close = (
         bracket.smallest_passing_scale <= RATIO**2 * bracket.largest_failing_scale
     )
@@ -592,8 +618,8 @@ def confirm_bracket(
     A configuration exactly at the limit passes its trials by chance. So it is tried
     with new seeds. If it does not pass, its change is made 2.5 % longer, which is half
     of `RATIO` on a logarithmic scale, and it is tried again. After `MAX_CONFIRMATIONS`
-    attempts the bracket is returned unconfirmed, with a configuration that was made
-    longer once more and not tried.
+    failed attempts the bracket is returned unconfirmed. Its configuration was made
+    longer after the last attempt, and was not tried.
 
     Args:
         bracket: result of `find_smallest_change`. If it has no configuration (`u`), it
@@ -613,7 +639,7 @@ def confirm_bracket(
         check_indices = range(bracket.n_checks, bracket.n_checks + times)
         if all(passes(bracket.u, check_index) for check_index in check_indices):
             return replace(bracket, n_checks=bracket.n_checks + times, confirmed=True)
-        growth *= math.sqrt(RATIO)
+        growth *= math.sqrt(RATIO)  # the 2.5 %
         scale = min(1.0, shortest_scale * growth)
         change = shortest_u - domain.start
         grown_u = scale_domain(domain, scale).project(domain.start + growth * change)
@@ -645,8 +671,8 @@ def _shorten(
     geometric mean of the bounds) is shorter.
 
     Args:
-        bracket: bracket so far. No length below its lower bound is tried, because a
-            search found nothing there.
+        bracket: bracket so far. No length below its largest failing scale is tried,
+            because a search found nothing there.
         u: (d,) a configuration that passes.
         length: length of u.
         passes: runs the trials of a configuration; returns whether it passes.
@@ -660,7 +686,7 @@ def _shorten(
     low = max(bracket.largest_failing_scale, SMALLEST_SCALE * length)
     high = length
     shortest_u = u
-    checks = bracket.n_checks
+    check_index = bracket.n_checks
 
     def shrink_to(scale: float) -> Tensor:
         # u has the scale `length`, so that its change is multiplied by this ratio
@@ -674,7 +700,7 @@ def _shorten(
         trial_length = _guess_shortest(likely, shrink_to, low, high)
     while high > LENGTH_RATIO * low:
         shorter_u = shrink_to(trial_length)
-        if passes(shorter_u, checks):
+        if passes(shorter_u, check_index):
             shortest_u = shorter_u
             high = trial_length
             geometric_mean = math.sqrt(high * low)
@@ -683,9 +709,12 @@ def _shorten(
             low = trial_length
             geometric_mean = math.sqrt(high * low)
             trial_length = min(geometric_mean, low * max_step_factor)
+        # not `**`, which raises OverflowError for large numbers
         max_step_factor = max_step_factor * max_step_factor
-        checks = checks + 1
-    return replace(bracket, smallest_passing_scale=high, u=shortest_u, n_checks=checks)
+        check_index = check_index + 1
+    return replace(
+        bracket, smallest_passing_scale=high, u=shortest_u, n_checks=check_index
+    )
 
 
 def _guess_shortest(

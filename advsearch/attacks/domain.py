@@ -47,8 +47,8 @@ class Block:
         n_options: number of options of a discrete choice; 0 for numbers. An element u
             means option floor(u * options). A choice has size 1, norm "box" and the
             bounds [0, 1], and no gradient.
-        unit_step_length: length of one unit step in a "box", over 0; None for half the diagonal of
-            the bounds.
+        unit_step_length: length of one unit step in a "box", over 0; None for half the
+            diagonal of the bounds.
 
     Raises:
         InputError: a value is outside these limits.
@@ -91,10 +91,10 @@ class Block:
             )
 
     def _check_budget(self, where: str) -> None:
-        """Raise InputError if epsilon, periodic or reach do not fit the norm.
+        """Raise InputError if epsilon, periodic or the reach do not fit the norm.
 
-        A ball ("linf" or "l2") needs an epsilon; only a box may be periodic or have a
-        reach.
+        A ball ("linf" or "l2") needs an epsilon. Only a box may be periodic or have a
+        `unit_step_length`, which messages call its reach.
 
         Args:
             where: " of 'pose.yaw'", say, for messages; empty without a name.
@@ -168,15 +168,15 @@ class Domain:
             central differences.
         partial_gradients: whether a search can request a "free" gradient: only those
             elements that cost no render.
-        is_noise_free: whether evaluations have no noise, so that equal configurations have
-            equal objectives and gradients. This is so if a matrix predicts the images
-            (docs/transport.md).
+        is_noise_free: whether evaluations have no noise, so that equal configurations
+            have equal objectives and gradients. This is so if a matrix predicts the
+            images (docs/transport.md).
         draws_conditions: whether evaluations have no noise of their own, but each one
             draws new conditions from a bank (docs/transport.md).
         restart_point: (d,) where a policy should begin instead of at the start, for
             policies that begin several times. Norm balls stay around the start.
-        lower_bounds: (d,) float32 lower bounds, of the intersection of the block's bounds and
-            its l-infinity ball.
+        lower_bounds: (d,) float32 lower bounds, of the intersection of the block's
+            bounds and its l-infinity ball.
         upper_bounds: (d,) float32 upper bounds of the same.
 
     Raises:
@@ -230,10 +230,10 @@ class Domain:
         object.__setattr__(self, "blocks", tuple(self.blocks))
 
     def _compute_bounds(self) -> None:
-        """Compute `lower_bounds` and `upper_bounds`, the bounds (d,) of every element of u.
+        """Compute `lower_bounds` and `upper_bounds`, the bounds (d,) of u's elements.
 
         An l-infinity ball around the start is a box too, so they are the bounds of its
-        intersection with the block's own bounds.
+        intersection with the block's own bounds. An l2 ball does not change them.
 
         Raises:
             InputError: the start lies outside the bounds of its block.
@@ -248,13 +248,13 @@ class Domain:
             if not bool(is_inside.all()):
                 low = float(start[part].min())
                 high = float(start[part].max())
+                where = f" of {block.name!r}" if block.name else ""
                 raise InputError(
-                    f"start{f' of {block.name!r}' if block.name else ''}: expected "
-                    "values in "
+                    f"start{where}: expected values in "
                     f"[{block.low}, {block.high}], got {low:.6g} to {high:.6g}"
                 )
             if block.norm == "linf" and block.epsilon is not None:
-                # A slice is a view, so this changes `lower_bounds` and `upper_bounds` in place.
+                # A slice is a view, so this changes `lower` and `upper` in place.
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
         # the dataclass is frozen
@@ -486,7 +486,7 @@ def _sample_ball(
 
 
 def option_center(u: Tensor, options: Tensor | int) -> Tensor:
-    """Return the center of the option that u lies in; option i of n is [i/n, (i+1)/n)."""
+    """Return the center of u's option; option i of n is [i / n, (i + 1) / n)."""
     return (torch.floor(u * options).clamp_(max=options - 1) + 0.5) / options
 
 
@@ -532,9 +532,9 @@ def project_l2_box(
         ball. A point inside is returned bit for bit; projecting a result again changes
         at most the last bits.
     """
-    # v_i^2 and room_i^2 in chunks, and their sums. room_i is computed by clipping u_i,
-    # which gives |v_i| if u_i is within the bounds. That is less than the room, but
-    # makes no difference: for s up to 1, min(s v_i^2, v_i^2) = s v_i^2.
+    # v_i^2 and room_i^2 in chunks, and their sums. `rooms` has the squared distance
+    # from the center to the clipped u_i. If u_i is within the bounds, this is v_i^2 and
+    # not room_i^2. But then the minimum in g is s v_i^2 with either, as s is at most 1.
     squares = []
     rooms = []
     squared_distance = 0.0
@@ -547,7 +547,8 @@ def project_l2_box(
         squared_distance += float(squares[-1].sum(dtype=torch.float64))
         squared_distance_in_box += float(rooms[-1].sum(dtype=torch.float64))
     # p(1), u clipped to the box, is the solution if it lies in the ball
-    if squared_distance_in_box <= (radius * (1.0 + ROUNDING_SLACK)) ** 2:
+    max_distance = radius * (1.0 + ROUNDING_SLACK)
+    if squared_distance_in_box <= max_distance**2:
         return u.clamp(low, high)
     # Without the box this would be the solution. The box makes g smaller, so that the
     # solution is at least as large: Newton's method begins on its left.
@@ -609,9 +610,12 @@ def _move_towards(
         strict=True,
     ):
         torch.lerp(center_chunk, u_chunk, t, out=out)
-        is_outside = (out - center_chunk).abs() > ((u_chunk - center_chunk) * t).abs()
-        rounded = torch.nextafter(out, center_chunk)
-        torch.where(is_outside, rounded, out, out=out).clamp_(low, high)
+        distance = (out - center_chunk).abs()
+        max_distance = ((u_chunk - center_chunk) * t).abs()
+        is_too_far = distance > max_distance
+        rounded_inwards = torch.nextafter(out, center_chunk)
+        # `out` is a part of `moved`, so this writes the result there
+        torch.where(is_too_far, rounded_inwards, out, out=out).clamp_(low, high)
     return moved
 
 
@@ -662,7 +666,7 @@ def compute_half_widths(domain: Domain) -> Tensor:
 
 
 def find_periodic(domain: Domain) -> Tensor:
-    """Return (d,) bool: whether an element is periodic, so that u wraps at its bounds."""
+    """Return which elements are periodic, so that u wraps at the bounds, (d,) bool."""
     sizes = torch.tensor([block.size for block in domain.blocks], dtype=torch.long)
     return torch.tensor(
         [block.periodic for block in domain.blocks], dtype=torch.bool
@@ -741,6 +745,8 @@ class SampleSequence:
         self._sampler = sampler
         self._seed = seed
         self._name = name
+        # Points are computed in blocks of equally many rows, one for each point. A
+        # block has at most `MAX_BLOCK_VALUES` values, and no more points than a net.
         max_rows_of_values = MAX_BLOCK_VALUES // max(1, dimensions)
         max_rows = max(1, min(POINTS_PER_NET, max_rows_of_values))
         # rounded down to a power of two, so that a net is divided into full blocks
@@ -748,7 +754,7 @@ class SampleSequence:
         self._block_index = -1  # none is loaded yet
         self._block = np.empty((0, dimensions))
         self._engine: Any = None
-        self._net = -1
+        self._net = -1  # there is no engine of a net yet
         self._n_sampled = 0
 
     def points(self, first: int, count: int) -> Float64Array:

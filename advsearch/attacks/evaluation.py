@@ -76,11 +76,11 @@ class Query:
             one kind may share them.
         has_success: for a trial, whether a search seeks a certain prediction, so that
             the evaluation can be a success.
-        requested_output: what is computed: a judgement; only an image ("picture"); or "light",
-            from which images can be predicted (`advsearch.scene.transport`), for a u of
-            the full space.
-        includes_image: whether the evaluation contains the image, too. For a row of a sweep
-            it is the bytes of a small JPEG file.
+        requested_output: what is computed: a judgement; only an image ("picture"); or
+            "light", from which images can be predicted (`advsearch.scene.transport`),
+            for a u of the full space.
+        includes_image: whether the evaluation contains the image, too. For a row of a
+            sweep it is the bytes of a small JPEG file.
     """
 
     u: Tensor
@@ -117,8 +117,8 @@ class Evaluation:
         judgement: the full result of the task, for the log; None without a task. No
             policy reads it.
         picture: (H, W, 3) image of 8-bit values in [0, 1]; None if not requested.
-        collected_light: result of a query for "light"; in the last row of a batch of a sweep, the
-            predictions so far.
+        collected_light: result of a query for "light"; in the last row of a batch of a
+            sweep, the predictions so far.
         predicted: 0 if the image was rendered; otherwise the samples per pixel of the
             renders that it was predicted from, 1 for a matrix.
         jpeg: JPEG file of the image of a row of a sweep; None if it is not stored.
@@ -169,8 +169,8 @@ class Evaluation:
     def sanitize(self) -> Evaluation:
         """Return the evaluation as it is passed to policies, without NaN.
 
-        - Gradient elements that are NaN or infinite become zero, whether the objective
-          is finite or not. Their number is added to `n_non_finite`.
+        - Gradient elements that are NaN or infinite become zero. They are counted in
+          `n_non_finite`, also if the objective is not finite.
         - If the objective is NaN or infinite, it becomes -inf, the worst value. All of
           its gradient becomes zero and its success false.
         """
@@ -243,8 +243,9 @@ class Proposal:
     def limit_cost(self, domain: Domain, renders_left: int) -> Proposal:
         """Return the proposal, reduced so that the remaining renders suffice for it.
 
-        Its `samples` (each costs a render) become `renders_left` at most. Its gradient
-        is dropped if no render would be left after it, to use the gradient for.
+        Its `samples` (each costs a render) become `renders_left` at most. A gradient
+        is only useful for a later render, which it leads to. So it is dropped if it
+        would use up the renders.
 
         Args:
             domain: states how many renders a gradient costs.
@@ -253,7 +254,8 @@ class Proposal:
         proposal = self
         if self.samples > renders_left:
             proposal = replace(self, samples=renders_left)
-        if proposal.gradient and proposal.max_cost(domain) >= renders_left:
+        uses_up_renders = proposal.max_cost(domain) >= renders_left
+        if proposal.gradient and uses_up_renders:
             return replace(proposal, gradient=False)
         return proposal
 
@@ -299,8 +301,9 @@ class Policy(ABC, Generic[State]):
 
     Attributes:
         name: name for messages and the log.
-        handles_choices: whether it searches discrete choices (`Block.n_options`) itself.
-            Any other policy is wrapped in `Choices` by `search`, and only gets numbers.
+        handles_choices: whether it searches discrete choices (`Block.n_options`)
+            itself. Any other policy is wrapped in `Choices` by `search`, and only gets
+            numbers.
     """
 
     name: ClassVar[str]

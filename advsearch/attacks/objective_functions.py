@@ -90,9 +90,9 @@ def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     overflow for logits of thousands, and keeps its digits where p is near 1.
 
     Its slope in l is 1 - p, which rounds to 0 where the model is sure (l very
-    negative). So for l < `MAX_LOG_ODDS` the value is that of the tangent at
-    `MAX_LOG_ODDS`: the slope stays 3e-7, and values get slightly under 0. That is
-    enough for policies that normalize their steps; `log_odds` has slope 1 everywhere.
+    negative). So for l below `MAX_LOG_ODDS` the softplus is continued by its tangent at
+    this point, which has the slope 3e-7 and gets slightly under 0. That is enough for
+    policies that normalize their steps; `log_odds` has slope 1 everywhere.
     """
     return _softplus(log_odds(logits, images, labels))
 
@@ -113,13 +113,14 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     logits cancel. Let s be the largest right logit, w the largest wrong one, and p_1 >=
     p_2 >= ... the sorted list of s and all wrong logits. The value is
 
-        (w - s) / (p_1 - p_3)                 where the model is right (w <= s): from -1 to 0;
-        (w - s) / (p_1 - (p_3 + p_4) / 2)     where it is wrong: over 0.
+        (w - s) / (p_1 - p_3)              where the model is right (w <= s); -1 to 0;
+        (w - s) / (p_1 - (p_3 + p_4) / 2)  where it is wrong; over 0.
 
     The first line is the ratio of Croce and Hein 2020 (Auto-PGD), section 4. The second
     has the denominator of their targeted form, because a search goes on after its first
-    success. There s may be p_3. Then w - s = p_1 - p_3, so that the first ratio would
-    be 1, without a gradient. Three more things differ from theirs:
+    success. With the first denominator, the ratio would be constant (1) wherever s is
+    p_3 and w is p_1, so that it would have no gradient. Three more things differ from
+    theirs:
 
     - Of several right labels only the one with the largest logit is in the list:
       otherwise three of them at the top would give a denominator of zero.
@@ -132,17 +133,17 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     right prediction, it is -1, however sure the model is.
 
     Raises:
-        InputError: fewer than two wrong classes. Of two numbers only the order is left
-            without scale and offset.
+        InputError: fewer than two wrong classes. Two logits without scale and offset
+            only have an order.
     """
     is_right_label = make_class_mask(logits, labels)
     top_logits, spread = _sort_logits(logits, is_right_label, "label")
     difference = margin(logits, images, labels)  # w - s
     gap_if_right = top_logits[:, 0] - top_logits[:, 2]  # p_1 - p_3
-    gap_if_wrong = _compute_wide_gap(top_logits)
+    gap_if_wrong = _compute_wide_gap(top_logits)  # p_1 - (p_3 + p_4) / 2
     is_wrong = difference > 0.0
     gap = torch.where(is_wrong, gap_if_wrong, gap_if_right)
-    return difference / _add_relief(gap, spread)
+    return difference / _bound_denominator(gap, spread)
 
 
 def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
@@ -150,13 +151,14 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 
     It is `targeted_margin` over p_1 - (p_3 + p_4) / 2, with p the sorted list of the
     largest logit in T and all logits not in T. This is the targeted ratio of Croce and
-    Hein 2020, section 4, but for the numerator: theirs, z_t - z_y with the right label
-    y, is over 0 also where a third class wins. Otherwise as `dlr`.
+    Hein 2020, section 4, with another numerator. Theirs is z_t - z_y with the right
+    label y, which is over 0 also where a third class wins. All else is as in `dlr`.
     """
     in_target = make_class_mask(logits, target, "target")
+    # `spread` is the distance from the largest to the smallest logit
     top_logits, spread = _sort_logits(logits, in_target, "target")
-    gap = _compute_wide_gap(top_logits)
-    return targeted_margin(logits, images, target) / _add_relief(gap, spread)
+    gap = _compute_wide_gap(top_logits)  # p_1 - (p_3 + p_4) / 2
+    return targeted_margin(logits, images, target) / _bound_denominator(gap, spread)
 
 
 def _compute_log_odds(logits: Tensor, group: Tensor) -> Tensor:
@@ -216,7 +218,7 @@ def _compute_wide_gap(top_logits: Tensor) -> Tensor:
     return top_logits[:, 0] - top_logits[:, -2:].mean(dim=1)
 
 
-def _add_relief(denominator: Tensor, spread: Tensor) -> Tensor:
+def _bound_denominator(denominator: Tensor, spread: Tensor) -> Tensor:
     """Return a denominator over 0, which is 1 if all logits are equal.
 
     Args:
@@ -278,10 +280,10 @@ def feature_distance(
     reference = _compute_reference(features, clean)
     length = torch.linalg.vector_norm(reference)
     scale = torch.where(length > 0.0, length, torch.ones_like(length))
-    start_direction = _make_start_direction(reference)
+    start_offset = _make_start_offset(reference)
 
     def objective(logits: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
-        displacement = (features(images) - reference) / scale + start_direction
+        displacement = (features(images) - reference) / scale + start_offset  # e + h r
         squared = displacement.square().sum(dim=1) + NEARBY**2
         distance: Tensor = squared.sqrt() - math.sqrt(2.0) * NEARBY
         return distance
@@ -298,8 +300,8 @@ def cosine_distance(
     It is 0 for equal directions and 2 for opposite ones. With both features scaled to
     length 1 and e their difference, it is |e|^2 / 2. Its gradient is zero at the clean
     image, where every search starts. So h e . r is added, with a fixed unit vector r
-    and h = `NEARBY`: at the clean image the gradient points along r, and beyond a few h
-    it is that of the distance.
+    and the small number h = `NEARBY`. At the clean image the gradient points along r.
+    Where |e| is more than a few h, the added gradient is negligible.
 
     Args:
         features: function from images to features (N, F); called once, for the clean
@@ -309,23 +311,23 @@ def cosine_distance(
 
     Returns:
         An objective (features (N, F), images, labels) -> (N,) that uses the features
-        only; at least -h^2 / 2.
+        only. Its minimum is at least -h^2 / 2, as |e|^2 / 2 + h e . r is.
     """
     reference = functional.normalize(_compute_reference(features, clean), dim=0)
-    start_direction = _make_start_direction(reference)
+    start_offset = _make_start_offset(reference)
 
     def objective(output: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
         displacement = functional.normalize(output, dim=1) - reference.to(output)
         squared_length = displacement.square().sum(dim=1)
-        along_start = displacement @ start_direction.to(output)
+        along_start = displacement @ start_offset.to(output)  # h e . r
         distance: Tensor = squared_length / 2.0 + along_start
         return distance
 
     return objective
 
 
-def _make_start_direction(reference: Tensor) -> Tensor:
-    """Return a fixed direction (F,) of length `NEARBY`."""
+def _make_start_offset(reference: Tensor) -> Tensor:
+    """Return h r: a fixed vector (F,) of length h = `NEARBY`."""
     direction = torch.randn(
         reference.shape, generator=torch.Generator().manual_seed(0)
     ).to(reference)

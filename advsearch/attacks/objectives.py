@@ -87,12 +87,12 @@ class ObjectiveSignature:
     """The arguments that a user's function takes.
 
     Attributes:
-        images: whether it takes (output, images, truth), not (output, truth).
+        takes_images: whether it takes (output, images, truth), not (output, truth).
         requested_inputs: names of the inputs that it requests by further parameters, of
             `REQUESTABLE_INPUTS`.
     """
 
-    images: bool = True
+    takes_images: bool = True
     requested_inputs: tuple[str, ...] = ()
 
 
@@ -119,7 +119,8 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     try:
         signature = inspect.signature(callee)
     except ValueError:
-        # A function written in C has no signature: it gets (output, images, truth).
+        # A function written in C has no signature. By default it gets (output, images,
+        # truth), and no further inputs.
         return ObjectiveSignature()
     by_position = _list_positional(signature)
     takes_images_first = bool(by_position) and by_position[0] in IMAGE_PARAMETERS
@@ -185,20 +186,20 @@ def _has_image_parameter(names: Sequence[str]) -> bool:
     unless the second is named like the truth, e.g. "target": then it is a loss whose
     third parameter is an option.
 
-    A function that is wrong may get True as well. It can't be called with three
-    arguments then, and the caller explains that.
+    The result is True for a function without a parameter for the truth, too. The caller
+    finds that it can't be called with three arguments, and explains this.
 
     Args:
         names: names of its positional parameters, in order, without requested inputs.
     """
-    if len(names) < 2:  # wrong, since output and truth are always passed
+    lacks_parameters = len(names) < 2  # output and truth are always passed
+    if lacks_parameters:
         return True
     second_name = names[1]
     if second_name in TRUTH_PARAMETERS:
         return False
     has_third = len(names) > 2
-    # Of two parameters, a second one with such a name is not the truth. The function is
-    # wrong, as it has no parameter for the truth.
+    # If the last of two parameters has such a name, there is none for the truth.
     lacks_truth = second_name in (*IMAGE_PARAMETERS, *REQUESTABLE_INPUTS)
     return has_third or lacks_truth
 
@@ -220,19 +221,23 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         InputError: (when the objective is called) the result has a wrong type or shape,
             or does not depend on the arguments differentiably.
     """
-    name = get_name(function)
+    function_name = get_name(function)
     signature = read_signature(function)
 
     def objective(
-        output: Any, images: Tensor, truth: Any, more: ReadInput = reject_inputs, /
+        output: Any,
+        images: Tensor,
+        truth: Any,
+        read_input: ReadInput = reject_inputs,
+        /,
     ) -> Tensor:
         """Call the function with what it requests, and check what it returns, (N,)."""
-        inputs = {
-            input_name: more(input_name) for input_name in signature.requested_inputs
-        }
+        inputs = {name: read_input(name) for name in signature.requested_inputs}
         count = images.shape[0]
         labels = truth_to_labels(truth, output, count)
-        arguments = (output, images, labels) if signature.images else (output, labels)
+        arguments = (
+            (output, images, labels) if signature.takes_images else (output, labels)
+        )
         argument_copies = copy_value(arguments)
         input_copies = copy_value(inputs)
         try:
@@ -241,22 +246,23 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
             if not _is_label_set_rejected(labels, error):
                 raise
             raise InputError(
-                f"objective {name!r}: expected one right label for a loss of torch, "
-                f"got {len(labels)} (indices "
+                f"objective {function_name!r}: expected one right label for a loss of "
+                f"torch, got {len(labels)} (indices "
                 f"{labels}); use those of advsearch.losses, or name one with `label`"
             ) from error
         is_scalar = isinstance(result, Tensor) and result.ndim == 0
         if is_scalar and count > 1:
             # This calls `objective` again, with a count of 1.
             result = _evaluate_each_image(objective, output, images, truth, inputs)
-        values = _check_values(name, result, count)
+        values = _check_values(function_name, result, count)
         if values.requires_grad and _are_written_into((argument_copies, input_copies)):
-            # Writing in place may make torch's backward pass fail. It is tried here, so
-            # that the error names the function. If neither the output nor an input has
-            # a gradient, it is that of the images.
+            # The function has changed a copy in place, which may make torch's backward
+            # pass fail. It is tried here, so that the error names the function. The
+            # gradient is by the output and the inputs, or else by the images.
             sources = _list_differentiable((output, inputs)) or [images]
-            _check_differentiable(name, values, sources)
-        _check_keeps_gradient(name, values, (images, output, *inputs.values()))
+            _check_differentiable(function_name, values, sources)
+        # values without a gradient, though an argument has one, are an error
+        _check_keeps_gradient(function_name, values, (images, output, *inputs.values()))
         return values
 
     return objective
@@ -685,7 +691,8 @@ def get_objective(
             function, task, takes_logits_of_task=False, user_function=objective
         )
     if kind.of_task is not None:
-        # It already has the target and the direction of the task.
+        # The objective that the task itself defines has its target and direction
+        # already.
         task_objective = kind.of_task(task)
         return task_objective if _is_built_in(kind) else _pass_copies(task_objective)
     if kind.of_features is not None:
@@ -693,7 +700,7 @@ def get_objective(
         takes_logits_of_task = False
     else:
         function = _make_output_objective(kind, targeted=targeted)
-        takes_logits_of_task = _has_other_outputs(task)
+        takes_logits_of_task = _must_convert_outputs(task)
     return _orient_objective(
         function, task, takes_logits_of_task=takes_logits_of_task, user_function=None
     )
@@ -707,15 +714,17 @@ def _is_built_in(kind: ObjectiveKind) -> bool:
 def _make_output_objective(kind: ObjectiveKind, *, targeted: bool) -> Objective:
     """Return the objective of a kind that has functions of the model's output.
 
-    A function of another package is wrapped as a user's: it gets copies of its
+    A function of another package is wrapped like one of a user: it gets copies of its
     arguments, and its mistakes are explained.
 
     Args:
         kind: kind with a `plain` or `targeted` form.
         targeted: which of these forms to take.
     """
-    form = kind.form(targeted=targeted)
-    return _ignore_inputs(form) if _is_built_in(kind) else wrap_objective(form)
+    function = kind.form(targeted=targeted)  # of (output, images, labels)
+    if _is_built_in(kind):
+        return _ignore_inputs(function)
+    return wrap_objective(function)
 
 
 def _make_feature_objective(
@@ -744,8 +753,8 @@ def _make_feature_objective(
     return objective if _is_built_in(kind) else _pass_copies(objective)
 
 
-def _has_other_outputs(task: Task) -> bool:
-    """Return whether the model's outputs have to be converted to logits of the labels.
+def _must_convert_outputs(task: Task) -> bool:
+    """Return whether the model's outputs have to be converted to logits of classes.
 
     `Task.as_logits` converts them. The outputs may be features that are compared with
     those of each label, or may have classes that mean "nothing here".
@@ -787,7 +796,7 @@ def _orient_objective(
         output: Any,
         images: Tensor,
         truth: Any,
-        more: ReadInput = reject_inputs,  # reads further inputs by name
+        read_input: ReadInput = reject_inputs,  # reads further inputs by name
         /,
     ) -> Tensor:
         """Return the values (N,) of the function, negated if the task minimizes."""
@@ -796,7 +805,8 @@ def _orient_objective(
         function_output = output
         if takes_logits_of_task:
             function_output = task.as_logits(output, labels)
-        values = function(function_output, images, labels, more)
+        values = function(function_output, images, labels, read_input)
+        # it can only be checked if the values have a gradient by the model's output
         if must_check_direction and _has_slope_by_class(values, output):
             must_check_direction = False
             name = get_name(user_function)  # type: ignore[arg-type]
@@ -903,12 +913,14 @@ def _check_kind(
             f"got {kind.name}, which takes outputs of {kind.task}"
         )
     if kind.needs_features and (targeted or minimise):
-        # A distance from the clean image can only be maximized.
-        setting = "minimise"
-        reason = "its minimum is at the start already"
+        # An objective of features is a distance from the clean image, which can only be
+        # maximized.
         if targeted:
             setting = "target"
             reason = "it leads away from the clean image, to no class in particular"
+        else:
+            setting = "minimise"
+            reason = "its minimum is at the start already"
         raise InputError(
             f"{setting}: expected `objective` {' or '.join(OBJECTIVES)}, "
             f"got {kind.name}; {reason}"

@@ -149,7 +149,7 @@ class SearchResult:
 def count_planned_renders(
     steps: int, candidates: int = 4, repeats: int = 2, max_extra_repeats: int = 0
 ) -> int:
-    """Return the largest number of images that `search` renders with these arguments."""
+    """Return the largest number of images that `search` renders with the arguments."""
     return steps + candidates * (repeats + max_extra_repeats)
 
 
@@ -239,6 +239,7 @@ def search(
         with reraise_lost_interrupt():
             stopped = _explore(log, policy, steps, seed, is_out_of_time)
             if domain.draws_conditions:
+                # the last configuration of the policy becomes a candidate
                 log.pool = replace_worst(log.pool, log.last, log.size)
             if candidates:
                 # Step 1 made at most `steps` evaluations, with seed indices from 0 on.
@@ -296,7 +297,8 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         stopped: why the search stopped.
         seconds: seconds that the search took.
     """
-    best = Candidate(log.domain.start, math.nan, False)
+    # without a success, so that nothing is claimed
+    best = Candidate(log.domain.start, objective=math.nan, success=False)
     if log.pool:  # else nothing could be evaluated
         best = select_best(log.pool)
     # mean of the renders in the ranking, of which one may be -inf
@@ -332,6 +334,7 @@ def _add_policy_findings(result: SearchResult, log: _Log) -> SearchResult:
     state = log.state
     if policy is None or state is None:  # the search ended before the first proposal
         return result
+    # A batch that was completed has been passed to the policy, and is removed here.
     if log.evaluated_batch:
         state = policy.update(state, log.evaluated_batch)
     return replace(
@@ -455,7 +458,7 @@ class _Log:
             phase: "search" or "ranking". A ranking renders the candidates again, so it
                 adds no candidate.
         """
-        if proposal.gradient:
+        if proposal.gradient:  # all of it, or a "free" one
             self.gradients += 1
         self.renders += evaluation.cost
         if not evaluation.is_finite:

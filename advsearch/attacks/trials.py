@@ -195,16 +195,18 @@ def choose_spp(
     follows is a single render. If there are as many renders as trials to come, m must
     only exceed its own standard error.
 
-    A margin at zero never settles: its verdict depends on the noise. At most about 5 %
-    settle with the wrong sign: 5.1 % of the hardest cases (`benchmarks/verdicts.py`).
+    A margin at zero never settles: its verdict depends on the noise. About 5 % of the
+    hardest cases settle with the wrong sign (`benchmarks/verdicts.py`: 5.1 %), and
+    fewer of all others.
     At each rung there are several looks, after more and more renders. The 5 % are
     divided equally among them (Bonferroni). A look is skipped if it cannot show that
     the margin has settled, according to the noise so far (`_may_settle`). If one
     configuration does not settle, the last rung is returned, with `converged` False.
 
     These renders must not be used as trials, because the rung is chosen by their
-    agreement. So trials have other seeds (`run_trials`). Otherwise a claim that holds
-    in 75 % of renders would be `found` in 5.9 % of all cases, instead of 2.2 %.
+    agreement. So trials have other seeds (`run_trials`). With the same seeds, a claim
+    that holds in only 75 % of renders would be confirmed in 5.9 % of all cases, and not
+    in 2.2 %.
 
     Args:
         margins: for each configuration, e.g. "adversarial" and "clean", a function
@@ -225,7 +227,7 @@ def choose_spp(
             f"got {list(ladder)}"
         )
     if len(ladder) == 1:
-        return SampleCount(ladder[0], False, (), 0)
+        return SampleCount(ladder[0], converged=False, table=(), renders=0)
     table = list[Rung]()
     n_renders = 0
     # Nothing settles at the rung with index 0, which has none below.
@@ -268,9 +270,10 @@ def _summarize_rung(
         at_rung: margins of the rung.
         below: margins of the rung below; empty at the first.
         looks: number of looks at a rung.
-        trials: number of trials that will follow, as in `choose_spp`.
+        trials: number of trials that will follow, see `_is_settled`.
     """
     mean = fmean(at_rung)
+    # distance of the mean from its one-sided confidence bound
     half_width = (
         _compute_quantile(len(at_rung), looks)
         * _compute_deviation(at_rung)
@@ -280,7 +283,8 @@ def _summarize_rung(
     if is_first_rung:
         return Rung(name, spp, mean, half_width, drift=math.nan, is_settled=False)
     is_settled = _is_settled(at_rung, below, looks, trials)
-    return Rung(name, spp, mean, half_width, mean - fmean(below), is_settled)
+    drift = mean - fmean(below)
+    return Rung(name, spp, mean, half_width, drift, is_settled)
 
 
 def _climb_ladder(
@@ -292,13 +296,14 @@ def _climb_ladder(
 ) -> list[list[float]]:
     """Return the margins of one configuration at each rung that was rendered.
 
-    Looks are made at rising rungs, and at each rung after more and more renders. They
-    end at the look at which the configuration has settled, or when neither it nor a
-    later one can show that it has. A look needs `count` renders at its rung and at the
-    rung below, with the same seeds at both, and renders those that are missing.
+    Looks are made at rising rungs, and at each rung after more and more renders. A look
+    that cannot show that the configuration has settled is skipped. Looks end when it
+    has settled, or when none of the remaining ones can show that it has. A look needs
+    `count` renders at its rung and at the rung below, with the same seeds at both, and
+    renders those that are missing.
 
     Args:
-        margins: renders the configuration; (spp, seeds) to margins.
+        margins: function from (spp, seeds) to margins, which renders the configuration.
         seed: root seed.
         ladder: samples per pixel of the rungs, ascending.
         look_sizes: numbers of renders at a rung after which there is a look, ascending.
@@ -316,19 +321,14 @@ def _climb_ladder(
         remaining_looks = looks[look_index:]  # including this one
         if not any(may_settle(*look) for look in remaining_looks):
             break
-        if not may_settle(rung, count):
+        if not may_settle(rung, count):  # but a later look may
             continue
         seeds = [derive_seed(seed, "sample count", number) for number in range(count)]
-        below = rung - 1
-        for rendered_rung in (below, rung):
-            n_rendered = len(margins_of_rungs[rendered_rung])
-            new_seeds = seeds[n_rendered:]
-            if new_seeds:
-                new_margins = margins(ladder[rendered_rung], new_seeds)
-                margins_of_rungs[rendered_rung] += new_margins
-        if _is_settled(
-            margins_of_rungs[rung], margins_of_rungs[below], n_looks, trials
-        ):
+        below = margins_of_rungs[rung - 1]
+        _render_missing(below, margins, ladder[rung - 1], seeds)
+        at_rung = margins_of_rungs[rung]
+        _render_missing(at_rung, margins, ladder[rung], seeds)
+        if _is_settled(at_rung, below, n_looks, trials):
             break
     return [margins_of_rung for margins_of_rung in margins_of_rungs if margins_of_rung]
 
@@ -344,20 +344,22 @@ def _is_settled(
     Args:
         at_rung: margins of a rung.
         below: margins of the rung below.
-        looks: number of looks, which share the 5 %.
+        looks: number of looks. The probability of an error, 5 %, is divided equally
+            among them.
         trials: number of trials that will follow, as in `choose_spp`.
     """
     mean = fmean(at_rung)
     deviation = _compute_deviation(at_rung)
     # The rung below may have more renders, from an earlier look there.
     count = min(len(at_rung), len(below))
-    # m + (m - m') of `choose_spp`, and its standard error
+    # The mean if more samples changed it as much again as the step from the rung below
+    # did, and its standard error.
     extrapolated = 2.0 * mean - fmean(below)
     single_render_error = math.hypot(2.0 * deviation, _compute_deviation(below))
     extrapolated_error = single_render_error / math.sqrt(count)
-    # With fewer renders than trials, a single render has to be sure: the trials that
-    # were not rendered are on the same side only if the mean exceeds its deviation.
-    # With as many, they are a sample of the trials, and the standard error suffices.
+    # With fewer renders than trials, the mean has to exceed the deviation of a single
+    # render, so that the other trials are on the same side, too. With as many renders
+    # as trials, its standard error suffices.
     are_as_many_as_trials = count == trials
     mean_error = deviation / math.sqrt(count) if are_as_many_as_trials else deviation
     sign = math.copysign(1.0, mean)
@@ -366,6 +368,22 @@ def _is_settled(
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
     is_sign_constant = all(sign * value > 0.0 for value in at_rung)
     return is_mean_sure and is_extrapolated_sure and is_sign_constant
+
+
+def _render_missing(
+    rendered: list[float], margins: MarginsOf, spp: int, seeds: Sequence[int]
+) -> None:
+    """Render a configuration at one rung with the seeds that are missing there.
+
+    Args:
+        rendered: margins of the rung, for the first seeds; new ones are appended.
+        margins: function from (spp, seeds) to margins, which renders the configuration.
+        spp: samples per pixel of the rung.
+        seeds: all seeds, in order.
+    """
+    new_seeds = seeds[len(rendered) :]
+    if new_seeds:
+        rendered += margins(spp, new_seeds)
 
 
 def _may_settle(
@@ -382,9 +400,11 @@ def _may_settle(
 
     - Largest: the mean at the last rendered rung, plus its standard error, plus as much
       again as it changed from the rung below.
-    - Smallest: 2 m - m' has to exceed its error (`_is_settled`). Here only m counts.
-      Standard deviations are those of the renders so far. At a rung that was not
-      rendered they are assumed to fall with the square root of the samples.
+    - Smallest: let m be the mean at the rung, and m' the one at the rung below. To
+      settle, 2 m - m' has to exceed its error (`_is_settled`). It is assumed here that
+      m = m', so that m has to exceed the error. The error follows from the standard
+      deviations of the renders so far. At a rung that was not rendered they are assumed
+      to fall with the square root of the samples.
 
     If margins at the rung have both signs, it cannot settle.
 
@@ -393,7 +413,8 @@ def _may_settle(
         ladder: samples per pixel of the rungs.
         rung: index of the rung in `ladder`.
         count: number of renders at the rung that the look would use.
-        looks: number of looks, which share the 5 %.
+        looks: number of looks. The probability of an error, 5 %, is divided equally
+            among them.
     """
     rendered_rungs = [index for index in range(rung + 1) if values[index]]
     if not rendered_rungs:
@@ -401,7 +422,7 @@ def _may_settle(
     was_rendered = bool(values[rung])
     if was_rendered and min(values[rung]) <= 0.0 <= max(values[rung]):
         return False
-    # The first look renders two rungs, so that there are always two here.
+    # The first look renders its rung and the one below, so that two are rendered now.
     last_rung = rendered_rungs[-1]
     last_values = values[last_rung]
     values_below = values[rendered_rungs[-2]]
@@ -456,11 +477,13 @@ def count_max_samples(
 ) -> int:
     """Return the maximum number of samples per pixel that `choose_spp` renders in all.
 
-    It is reached if only the last look at the last rung settles every configuration.
+    It is reached if only the last look at the last rung settles every configuration. A
+    single sample count is chosen without any render.
     """
     if len(ladder) == 1:
         return 0
-    return configurations * list_look_sizes(trials)[-1] * sum(ladder)
+    max_renders_of_rung = list_look_sizes(trials)[-1]  # of one configuration
+    return configurations * max_renders_of_rung * sum(ladder)
 
 
 def _compute_deviation(values: Sequence[float]) -> float:
@@ -505,13 +528,15 @@ def limit_ladder(
 ) -> Sequence[int]:
     """Return the sample counts of a ladder that a check can afford.
 
-    Its images take at most `MAX_SAMPLE_RATIO` the samples of the searches; the first
-    two counts are returned in any case.
+    The images of the check may take `MAX_SAMPLE_RATIO` times the samples of the
+    searches. The first two counts are returned in any case, as margins have to be
+    compared at two.
     """
+    max_samples = MAX_SAMPLE_RATIO * search_samples
     return [
         spp
         for index, spp in enumerate(ladder)
-        if index < 2 or n_images * spp <= MAX_SAMPLE_RATIO * search_samples
+        if index < 2 or n_images * spp <= max_samples
     ]
 
 
@@ -527,8 +552,8 @@ def choose_rate_spp(
 
     A configuration is rendered under the same `N_CONDITIONS` conditions at each rung.
     The mean change of the margins from the rung below has a 95 % interval (Student's
-    t). It is assumed that more samples would change all margins again by as much as one
-    of the bounds of this interval; the worse bound is taken. The configuration has
+    t). It is assumed that more samples would change all margins once more, by one of
+    the bounds of this interval: the one that changes more signs. The configuration has
     settled if this changes the sign in at most `MAX_MOVED_FRACTION` of the conditions
     (`estimate_moved_fraction`). The remaining error falls with the sample count, so the
     true change is smaller. `benchmarks/verdicts.py` measures the error of the rate.
@@ -571,15 +596,16 @@ def _climb_until_settled(
 
     Args:
         name: name of the configuration.
-        render: renders it; (spp, seeds) to margins.
+        render: function from (spp, seeds) to margins, one for each seed.
         seeds: one for each condition, the same at all sample counts.
         ladder: sample counts, ascending.
 
     Returns:
-        The rungs that were rendered; the last one may have not settled.
+        A row for each sample count that was rendered. The configuration may have not
+        settled at the last one.
     """
     rungs = list[Rung]()
-    below: FloatArray | None = None
+    below: FloatArray | None = None  # margins of the rung below
     for spp in ladder:
         at_rung = np.array(render(spp, seeds), dtype=np.float64)
         rungs.append(_summarize_conditions(name, spp, at_rung, below))
@@ -600,13 +626,14 @@ def _summarize_conditions(
         at_rung: (n,) margins of the rung, by condition.
         below: (n,) margins of the rung below; None at the first.
     """
-    # one-sided, as `Rung.half_width` is
+    # `Rung.half_width` is the distance of the mean from its one-sided confidence bound
     quantile = stdtrit(len(at_rung) - 1, CONFIDENCE)
     half_width = quantile * at_rung.std(ddof=1) / math.sqrt(len(at_rung))
     drift = math.nan
     is_settled = False
     if below is not None:
         drift = float(at_rung.mean() - below.mean())
+        # few margins would change their sign with more samples
         is_settled = estimate_moved_fraction(at_rung, below) <= MAX_MOVED_FRACTION
     mean = float(at_rung.mean())
     return Rung(name, spp, mean, float(half_width), drift, is_settled)

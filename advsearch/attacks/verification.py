@@ -2,7 +2,8 @@
 
 The configuration is rendered again in *trials*: with new seeds, enough samples, and 8
 bits per channel. The task evaluates the predictions. The clean configuration is
-rendered with the same seeds, as a control group. `VerificationRule` decides on the verdict.
+rendered with the same seeds, as a control group. `VerificationRule` decides on the
+verdict.
 """
 
 from __future__ import annotations
@@ -112,11 +113,12 @@ class VerificationRule:
         required_percent: percentage of the trials that have to succeed.
         has_control: whether the clean configuration is a control group. Then a trial
             only succeeds if the clean prediction with the same seed is right, and the
-            clean configuration has to be right in `required_percent` of its trials as well.
-        has_varying_conditions: whether conditions vary from trial to trial, some of which may
-            be difficult by themselves. Then only trials with a right clean prediction
-            count, and the percentage is of these. The clean configuration has to be
-            right in half of all trials.
+            clean configuration has to be right in `required_percent` of its trials as
+            well.
+        has_varying_conditions: whether conditions vary from trial to trial, some of
+            which may be difficult by themselves. Then only trials with a right clean
+            prediction count, and the percentage is of these. The clean configuration
+            has to be right in half of all trials.
     """
 
     required_percent: int = PASS_PERCENT
@@ -136,7 +138,8 @@ class VerificationRule:
         """
         n_required = self.count_percent(trials)
         if early and self.has_varying_conditions:
-            # an early look is always after exactly this many trials that count
+            # Every look before the last one is after a number of trials that count
+            # which is a key of `OVER_EARLY`.
             n_required = OVER_EARLY[trials]
         # with fewer trials than `min_trials`, even all successes are not enough
         return max(n_required, self.min_trials)
@@ -149,8 +152,8 @@ class VerificationRule:
     def min_trials(self) -> int:
         """Smallest number of trials that can verify a claim.
 
-        If `required_percent` of these trials succeed, the lower bound of the interval of the
-        success rate is at least `MIN_RATE`.
+        If `required_percent` of these trials succeed, the lower bound of the interval
+        of the success rate is at least `MIN_RATE`.
         """
         return next(
             n
@@ -203,26 +206,27 @@ class VerificationRule:
         return successes >= self.count_needed_successes(trials)
 
     def decide_ending(
-        self, search: Ending, clean: TrialCounts, adversarial: TrialCounts
+        self, search_ending: Ending, clean: TrialCounts, adversarial: TrialCounts
     ) -> Ending:
         """Return the ending of a run, by its search and by the trials of both groups.
 
-        It is FOUND if the adversarial trials have as many successes as the rule needs,
-        even if the search claimed nothing. The clean trials need as many right
-        predictions, unless there is no control group, or conditions vary: then trials
-        with a wrong clean prediction are left out already.
+        It is ALREADY_WRONG if the model is wrong about the clean configuration,
+        whatever else holds. It is FOUND if the adversarial trials have as many
+        successes as the rule needs, even if the search claimed nothing. The clean
+        trials need as many right predictions, unless there is no control group, or
+        conditions vary: then trials with a wrong clean prediction are left out already.
 
         A claim of the search that the trials do not confirm is NOT_VERIFIED. Any other
         ending of the search stays.
 
         Args:
-            search: how the search ended. INTERRUPTED is never changed.
+            search_ending: how the search ended. INTERRUPTED is never changed.
             clean: counts of the clean configuration, whose successes are right
                 predictions.
             adversarial: counts of the configuration that the search found.
         """
-        if search is Ending.INTERRUPTED:
-            return search
+        if search_ending is Ending.INTERRUPTED:
+            return search_ending
         if self.is_already_wrong(clean):
             return Ending.ALREADY_WRONG
         is_verified = adversarial.n_successes >= self.count_needed_successes(
@@ -235,8 +239,8 @@ class VerificationRule:
         )
         if is_control_right and is_verified:
             return Ending.FOUND
-        was_claimed = search is Ending.FOUND
-        return Ending.NOT_VERIFIED if was_claimed else search
+        was_claimed = search_ending is Ending.FOUND
+        return Ending.NOT_VERIFIED if was_claimed else search_ending
 
 
 WORST_CASE = VerificationRule()
@@ -264,8 +268,8 @@ class Verification:
         renders: number of renders of the trials.
         stop_reason: why there are no more trials: "asked for" (the number that was
             requested) or "decided" (further ones could not change the verdict).
-        trial_successes: for each adversarial trial, whether it is a success. None if it does
-            not count, because the clean prediction is wrong under its conditions.
+        trial_successes: for each adversarial trial, whether it is a success. None if it
+            does not count, because the clean prediction is wrong under its conditions.
         first_index: index of the first trial.
     """
 
@@ -283,7 +287,7 @@ class Verification:
 
     @property
     def valid_trials(self) -> tuple[Judgement, ...]:
-        """The adversarial trials that count; all of them if none does."""
+        """The adversarial trials that count; if none does, all of them."""
         valid_trials = tuple(
             trial
             for trial, outcome in zip(
@@ -314,18 +318,19 @@ def run_trials(
 ) -> tuple[Judgement, ...]:
     """Render and judge one configuration in several trials; return the new ones.
 
-    Trial k has the seed k of the stream "verification" of the root seed. So two groups
-    with the same root seed are rendered with the same noise, which makes one of them
-    the control group of the other.
+    The seed of trial k follows from the root seed and k, whatever the kind of the
+    queries. So two groups with the same root seed are rendered with the same noise,
+    which makes one of them the control group of the other.
 
     Args:
         evaluate: renders the queries and yields their evaluations, one by one.
         u: (d,) the configuration.
         spp: samples per pixel.
         seed: root seed.
-        trials: number of trials, those that are done included.
-        n_done: number of trials that are done already; they are not repeated.
-        first_index: index k of the first trial.
+        trials: number of trials in all, including those that are done.
+        n_done: number of trials, the first ones, that are done already; they are not
+            repeated.
+        first_index: index k of the first of all trials, done or not.
         kind: kind of the queries, such as "verification" or "control".
         n_images: number of trials, the first ones, whose images are requested.
         is_decided: called with the new trials after each of them; if it returns True,
@@ -386,18 +391,19 @@ def verify(
 
     `trials` may be several ascending numbers, such as `TRIAL_LOOKS`. They are looks:
     after that many trials the successes are counted, and if they suffice, no more
-    trials follow. If conditions vary, a look is after this many trials that count: those
-    with a right clean prediction (`OVER_LOOKS`). The last number is the
-    maximum of all trials.
+    trials follow. If conditions vary, a look is after this many trials that count:
+    those with a right clean prediction (`OVER_LOOKS`). The last number is the maximum
+    of all trials.
 
     Curtailed trials end as soon as more have failed than the rule allows: the remaining
     trials could not change the verdict. Their Clopper-Pearson interval still covers the
     rate in 95 % of all cases, because it contains the exact interval of this stopping
     rule (Jennison and Turnbull 1983).
 
-    Trials with several looks are always curtailed, but at least `VerificationRule.min_trials` are
-    made, as fewer say nothing about the rate. `benchmarks/verdicts.py` checks that
-    their intervals cover the rate, from the probability of every outcome.
+    Trials with several looks are always curtailed, but at least
+    `VerificationRule.min_trials` are made, as fewer say nothing about the rate.
+    `benchmarks/verdicts.py` checks that their intervals cover the rate, from the
+    probability of every outcome.
 
     Args:
         evaluate: renders the queries and yields their evaluations.
@@ -470,9 +476,9 @@ def verify(
         spp=spp,
         confidence=_choose_confidence(rule, has_several_looks=has_several_looks),
         renders=len(done) + len(clean_trials) - len(clean),  # without those of `clean`
-        stopped="asked for" if is_complete else "decided",
+        stop_reason="asked for" if is_complete else "decided",
         is_early=is_success and is_early,
-        begin=first_index,
+        first_index=first_index,
     )
 
 
@@ -531,8 +537,9 @@ def _extend_clean_trials(
         The number of trials that this look needs, including those that do not count.
         `clean_trials` may have more than these, from another verification.
     """
+    # number of trials, of which `look` have to count
     count = look
-    # If there are more than `count` already, none is run.
+    # `run_clean` runs those that are missing, so none if there are enough already.
     clean_trials += run_clean(trials=count, n_done=len(clean_trials))
     n_missing = look - rule.count_valid(clean_trials[:count])
     while n_missing > 0 and count < max_trials:
@@ -569,6 +576,7 @@ def _is_found(
     n_needed = rule.count_needed_successes(n_valid, early=is_early)
     outcomes = _list_outcomes(rule, trials, clean_trials_of_look)
     n_successes = outcomes.count(True)
+    # wrong in more than half of these trials
     is_clean_wrong = rule.is_already_wrong(count_right(clean_trials_of_look, spp))
     return n_successes >= n_needed and not is_clean_wrong
 
@@ -580,13 +588,14 @@ def _list_outcomes(
 ) -> tuple[bool | None, ...]:
     """Return whether each trial is a success, or None if it does not count.
 
-    If conditions vary (`VerificationRule.has_varying_conditions`), a trial does not count if the clean
-    prediction under the same conditions is wrong.
+    If conditions vary, a trial does not count if the clean prediction under the same
+    conditions is wrong.
 
     Args:
         rule: decides what a success is.
         trials: trials of the adversarial configuration.
-        clean_trials: clean trials of the same seeds; further ones are ignored.
+        clean_trials: clean trials of the same seeds. There may be more than `trials`;
+            further ones are ignored.
     """
     outcomes: list[bool | None] = []
     for trial, clean in zip(trials, clean_trials, strict=False):
@@ -607,9 +616,9 @@ def _summarize_trials(
     spp: int,
     confidence: float,
     renders: int,
-    stopped: str,
+    stop_reason: str,
     is_early: bool,
-    begin: int,
+    first_index: int,
 ) -> Verification:
     """Return the verification of a configuration by the trials of both groups.
 
@@ -624,21 +633,22 @@ def _summarize_trials(
         spp: samples per pixel.
         confidence: confidence of the interval of the success rate.
         renders: number of renders that the trials took.
-        stopped: why there are no more trials: "asked for" or "decided".
+        stop_reason: why there are no more trials: "asked for" or "decided".
         is_early: whether the claim was found at an early look. Then the reason states
             the larger number of successes that this look needs.
-        begin: index of the first trial.
+        first_index: index of the first trial.
     """
     outcomes = _list_outcomes(rule, trials, clean_trials)
-    # None marks a trial that does not count. `TrialCounts` needs at least 1, as the rate of
-    # none would be 0 / 0.
+    # None marks a trial that does not count. `TrialCounts` needs at least 1, as the
+    # rate of no trials would be 0 / 0.
     n_counted = max(1, len(outcomes) - outcomes.count(None))
     clean_counts = count_right(clean_trials, spp)
     counts = TrialCounts(outcomes.count(True), n_counted, spp, confidence)
     ending = rule.decide_ending(claim, clean_counts, counts)
+    n_needed = rule.count_needed_successes(n_counted, early=is_early)
     reason = (
-        f"{ending.explanation} A success in {counts.n_successes} of {n_counted} trials, "
-        f"{rule.count_needed_successes(n_counted, early=is_early)} are needed; clean right in "
+        f"{ending.explanation} A success in {counts.n_successes} of {n_counted} "
+        f"trials, {n_needed} are needed; clean right in "
         f"{clean_counts.n_successes} of {clean_counts.n_trials}."
     )
     return Verification(
@@ -650,7 +660,7 @@ def _summarize_trials(
         clean_trials=tuple(clean_trials),
         adversarial_trials=tuple(trials),
         renders=renders,
-        stop_reason=stopped,
+        stop_reason=stop_reason,
         trial_successes=outcomes,
-        first_index=begin,
+        first_index=first_index,
     )

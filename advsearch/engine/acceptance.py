@@ -91,16 +91,18 @@ class Deviation:
         The error of the margin may be `MAX_MARGIN_BIAS`, or a fraction of the change of
         the margin by the search, whichever is larger.
         """
+        # Squared errors are estimates without noise, which may be below 0 by chance.
+        # The root is 0 then.
         square = statistics.fmean(view.squared_error for view in views)
         allowed_square = statistics.fmean(view.allowed_squared_error for view in views)
         margin_change = statistics.fmean(view.margin_change for view in views)
-        margin_limit = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * margin_change)
+        allowed_bias = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * margin_change)
         return cls(
             levels=_root(square),
             margin_bias=statistics.fmean(view.margin_bias for view in views),
             allowed_levels=max(MIN_ALLOWED_LEVELS, _root(allowed_square)),
             n_traced=sum(view.n_traced for view in views),
-            allowed_margin_bias=margin_limit,
+            allowed_margin_bias=allowed_bias,
         )
 
     @property
@@ -125,10 +127,11 @@ class Deviation:
     def reason(self) -> str:
         """Why predictions may not replace rendered images, as a part of a sentence.
 
-        If the levels are small enough, it is the margin.
+        It is only read if the deviation is not accepted. The reason is the levels if
+        they are too large, and else the margin.
         """
         if not self.has_accepted_levels:
-            max_levels = ACCEPTED_FRACTION * self.allowed_levels
+            max_levels = ACCEPTED_FRACTION * self.allowed_levels  # for acceptance
             return (
                 f"{self.levels:.1f} levels of 255 off on the object, where "
                 f"{max_levels:.1f} would do"
@@ -143,7 +146,7 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     """Compare predictions with traced images over several views.
 
     `N_FIRST_VIEWS` are compared first. Only if these are neither clearly good nor
-    clearly bad, all `N_VIEWS` are, since each view takes three renders.
+    clearly bad, all `N_VIEWS` are: each view costs three traced images.
 
     Args:
         compare_view: function of the index of a view that compares a predicted image
@@ -152,10 +155,11 @@ def compare_views(compare_view: Callable[[int], ComparedView]) -> Deviation:
     views = [compare_view(index) for index in range(N_FIRST_VIEWS)]
     first = Deviation.from_views(views)
     margin_limit = CLEARLY_GOOD * first.allowed_margin_bias
+    # `levels_fraction`: error of the images as a fraction of the allowed error
     is_clearly_good = (
         first.levels_fraction <= CLEARLY_GOOD and abs(first.margin_bias) <= margin_limit
     )
-    # A margin alone is never clearly bad. The `not` makes NaN clearly bad.
+    # Only levels are clearly bad, never the margin. The `not` makes NaN clearly bad.
     is_clearly_bad = not first.levels_fraction < CLEARLY_BAD
     if is_clearly_good or is_clearly_bad:
         return first
@@ -191,7 +195,7 @@ def compare_with_traced(
     with torch.no_grad():
         # what the model would see in the search without a predictor
         search_image = renderer(u, seeds.derive_seed(seed, "rendered"), spp)
-        # two images with independent noise, and the denoised image of both
+        # two images with independent noise (the halves), and the denoised image of both
         *halves, converged = renderer.render_independent_images(u, seed, CHECK_SPP)
         object_mask = renderer.compute_object_mask(u)
     predicted_margin = measure_margin(predicted, u)

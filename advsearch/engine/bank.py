@@ -155,7 +155,11 @@ class Bank(PredictedSearch):
         return entries, self._bytes
 
     def summarize_conditions(self) -> BankOfConditions:
-        """Return how the bank has grown, and the gap of its latest comparison."""
+        """Return how the bank has grown, and the gap of its latest comparison.
+
+        The gap is the mean objective under conditions of the bank minus that under
+        unseen ones.
+        """
         return BankOfConditions(
             created=self._count_conditions(self._latest_step),
             dropped=self._n_dropped,
@@ -180,8 +184,9 @@ class Bank(PredictedSearch):
                 self._compare(query.u, query.row_index)
         self._fill(self._latest_step)
         if query.includes_image:
-            # The image is not needed. But its first one makes a renderer, which is
-            # counted in `n_traced` as when the query was evaluated.
+            # Only called because the first image makes a renderer, which is counted in
+            # `n_traced`. The count has to be the same if the evaluation of the query is
+            # read from the store.
             self._render_image(query.u)
 
     def evaluate(self, query: Query) -> Evaluation:
@@ -191,6 +196,7 @@ class Bank(PredictedSearch):
         """
         self.replay(query)  # the comparison and the growth that are due
         conditions = self._choose_conditions(query.kind, query.row_index)
+        # with the cost and the samples of the prediction
         evaluation = self._evaluate_under(conditions, query.u, query.gradient)
         if not query.includes_image:
             return evaluation
@@ -231,8 +237,8 @@ class Bank(PredictedSearch):
         count = min(self.problem.conditions_per_evaluation, len(self._conditions))
         previous_index = index - 1
         if kind != "search":
-            # Any other search runs after "search", when the bank no longer grows. With
-            # the size at its latest step, no condition is new.
+            # Any other search runs after "search", when the bank no longer grows. So
+            # all conditions that it had at its latest step are old.
             previous_index = self._latest_step
         size_before = self._count_conditions(previous_index)
         new = []
@@ -278,7 +284,7 @@ class Bank(PredictedSearch):
             full_u = torch.cat([u, condition.u])
             renderer = condition.renderer
             if condition.depends_on_searched_only:
-                # `linearized_at` has an entry for each input of the matrix
+                # `linearized_at` has the inputs of the matrix by name
                 matrix_inputs = {
                     name: searched_inputs[name] for name in renderer.linearized_at
                 }
@@ -292,7 +298,8 @@ class Bank(PredictedSearch):
         """Return the image (H, W, 3) of u (d,) without random conditions."""
         if self._image_renderer is None:
             seed = seeds.derive_seed(self.problem.seed, "bank still")
-            # without a seed, the conditions are those that leave the scene unchanged
+            # Without a seed, the conditions are those that leave the scene unchanged.
+            # These never vary, so that one renderer is enough.
             start = self.problem.make_full_configuration(self.problem.domain.start)
             self._image_renderer = self.problem.make_linear_renderer(start, seed, SPP)
             self.n_traced += 1
@@ -307,7 +314,8 @@ class Bank(PredictedSearch):
         - The bank begins with `INITIAL_CONDITIONS` for each draw of an evaluation.
         - It grows from the start to the first comparison, and from each comparison in
           `growth_steps` to the next one. While it grows, it gains one condition for
-          every `DRAWS_PER_CONDITION` draws.
+          every `DRAWS_PER_CONDITION` draws. A draw is a use of a condition: each
+          evaluation makes `conditions_per_evaluation` draws.
         - In the second half of a search it does not grow, so that the search can
           converge.
 
@@ -319,12 +327,13 @@ class Bank(PredictedSearch):
         index = min(index, last_index_of_first_half)
         n_growing_steps = 0  # number of evaluations so far at which the bank grew
         for begin in (0, *self.growth_steps):
-            n_since_begin = max(index - begin + 1, 0)
+            n_since_begin = max(index - begin + 1, 0)  # 0 if it begins later
             # the next comparison, which ends the growth, is `COMPARISON_INTERVAL` later
             n_growing_steps += min(n_since_begin, COMPARISON_INTERVAL)
-        draws = self.problem.conditions_per_evaluation
-        n_initial = INITIAL_CONDITIONS * draws
-        return n_initial + n_growing_steps * draws // DRAWS_PER_CONDITION
+        draws_per_step = self.problem.conditions_per_evaluation
+        n_initial = INITIAL_CONDITIONS * draws_per_step
+        n_draws = n_growing_steps * draws_per_step
+        return n_initial + n_draws // DRAWS_PER_CONDITION
 
     def _make_query(self, condition_index: int) -> Query:
         """Return the query that collects the light of the condition with an index.
@@ -338,7 +347,9 @@ class Bank(PredictedSearch):
         """
         assert self.problem.conditions is not None
         u = self.problem.domain.start
-        for growth_step in self.growth_steps:  # ascending
+        # The steps of the comparisons after which the bank grew are ascending, so that
+        # the latest one that applies remains.
+        for growth_step in self.growth_steps:
             size_before = self._count_conditions(growth_step - 1)
             was_added_later = condition_index >= size_before
             if was_added_later:
@@ -367,10 +378,11 @@ class Bank(PredictedSearch):
         if first_missing >= size:
             return
         with self.measure_seconds():
-            # An earlier call may have requested light for these conditions, too.
+            # An earlier call may have requested the light of these conditions already:
+            # that of all with an index below `_collected_until`.
             is_requested = first_missing < self._collected_until
             if not is_requested:
-                self._request_light(first_missing, index)
+                self._request_light(first_missing, evaluation_index=index)
             for number in range(first_missing, size):
                 # `_incoming` yields light in the order of the conditions
                 condition = self._make_condition(
@@ -381,17 +393,19 @@ class Bank(PredictedSearch):
                 tick(SPP)
                 self._drop_oldest()
 
-    def _request_light(self, first_missing: int, index: int) -> None:
-        """Request the light of all conditions that the bank needs before a comparison.
+    def _request_light(self, first_missing: int, evaluation_index: int) -> None:
+        """Request the light of all conditions that the bank gains before a comparison.
 
-        They are requested at once, so that workers collect them in parallel. Whether
-        more follow depends on the result of the comparison.
+        They are requested at once, so that workers collect them in parallel. How many
+        are added later is decided by the comparison.
 
         Args:
             first_missing: index of the first condition without a matrix.
-            index: index of the current evaluation.
+            evaluation_index: index of the current evaluation.
         """
-        next_comparison = (index // COMPARISON_INTERVAL + 1) * COMPARISON_INTERVAL
+        # comparisons are at the multiples of `COMPARISON_INTERVAL`
+        n_intervals = evaluation_index // COMPARISON_INTERVAL
+        next_comparison = (n_intervals + 1) * COMPARISON_INTERVAL
         last_before_comparison = next_comparison - 1
         self._collected_until = self._count_conditions(last_before_comparison)
         queries = [
@@ -428,6 +442,7 @@ class Bank(PredictedSearch):
             name in searched_inputs and torch.equal(searched_inputs[name], value)
             for name, value in inputs.items()
         )
+        # in place, so that equal tensors of several conditions take memory only once
         self._share_equal_inputs(inputs)
         return Condition(number, query.u[dim:], renderer, depends_on_searched_only)
 
@@ -478,10 +493,11 @@ class Bank(PredictedSearch):
                 SPP,
             )
 
-        is_accurate = self.compare(compare_view).is_accepted
+        is_accurate = self.compare(compare_view).is_accepted  # stores the deviation
         # the search has adapted to the conditions of the bank
         is_overfitted = gap > MIN_STANDARD_ERRORS * standard_error
         if not is_accurate or is_overfitted:
+            # `_count_conditions` lets the bank grow from these steps on
             self._grown_at[index] = u.detach().clone()
             self.growth_steps.append(index)
 
@@ -495,6 +511,7 @@ class Bank(PredictedSearch):
             u,
             gradient=False,
         )
+        # each evaluation comes with the output of the model
         return [evaluation.objective for evaluation, _ in evaluated]
 
     def _trace_unseen(self, u: Tensor, seed: int) -> list[float]:

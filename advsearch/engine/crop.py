@@ -56,7 +56,10 @@ class CroppedSearch(PredictedSearch):
         return self.refusal
 
     def count_entries_and_bytes(self) -> tuple[int, int]:
-        """Return 0 entries, as there is no matrix, and the bytes of stored images."""
+        """Return the entries of a matrix of light transport, and the bytes of memory.
+
+        There is no matrix, hence 0 entries. The memory is that of stored images.
+        """
         height, width = self.problem.renderer.formation.resolution
         # stored for each kind of search: the two halves of its full image, their mean,
         # and the surroundings of the window
@@ -78,7 +81,7 @@ class CroppedSearch(PredictedSearch):
             self.selected_window = windowing
             self.window = windowing.window
             self.deviations.append(windowing.deviation)
-            # `find_window` has rendered these
+            # images that `find_window` has rendered
             tick(self.preparation_spp)
             self.n_traced += N_WINDOW_IMAGES
             self._renew_surroundings(
@@ -97,7 +100,7 @@ class CroppedSearch(PredictedSearch):
         the light paths of the search; the full image has fewer samples.
 
         Args:
-            selected_window: the window.
+            windowing: the selected window.
             kind: kind of the search.
             number: index of the query, for the seed.
             image: full image; it is stored, to be compared with later ones.
@@ -108,6 +111,7 @@ class CroppedSearch(PredictedSearch):
         problem = self.problem
         seed = seeds.derive_seed(problem.seed, f"crop {kind}", number)
         with problem.renderer.scene.limit_depth(problem.search_depth):
+            # renders the surroundings
             renderer = problem.renderer.crop_to(
                 windowing.window, image.u, seed, problem.search_spp
             )
@@ -120,8 +124,11 @@ class CroppedSearch(PredictedSearch):
 
         None if there is no window, or the search ended with full images.
         """
-        if self.selected_window is None or kind in self.first_traced:
+        ended_with_full_images = kind in self.first_traced
+        if self.selected_window is None or ended_with_full_images:
             return None
+        # (full image, renderer) that this kind of search uses; at first those of the
+        # start
         _, renderer = self._current.get(kind, self._current["start"])
         return renderer
 
@@ -140,13 +147,14 @@ class CroppedSearch(PredictedSearch):
         """Return the renderer of the window for a query; None to render a full image.
 
         Every `COMPARISON_INTERVAL` queries of a search a full image is rendered. It is
-        compared outside of the window with the surroundings in use, and then replaces
-        them. After two comparisons in a row that differ too much, the search renders
-        full images from there on.
+        compared outside of the window with the surroundings in use, and new ones are
+        rendered in their place. After two comparisons in a row that differ too much,
+        the search renders full images from there on.
         """
         kind = query.kind
         number = query.row_index
-        # index of the first query that renders a full image
+        # Index of the first query that renders a full image; without one in
+        # `first_traced`, it is after all queries.
         first_full = self.first_traced.get(kind, self.steps)
         if query.phase != "search" or number >= first_full:
             return None

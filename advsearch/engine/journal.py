@@ -142,13 +142,13 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
         evaluations = list[Evaluation]()
 
         def get_key(item: WorkItem) -> ProblemKey:
-            key, _, _ = item
+            key, _preparation, _query = item
             return key
 
         # `groupby` groups neighbors, and queries of one problem follow one another
         for key, group in groupby(items, get_key):
             items_of_problem = list(group)
-            # All were sent in one call, so that they have the same preparation.
+            # All of them were sent together, and have the same preparation.
             _, preparation, _ = items_of_problem[0]
             queries = [query for _, _, query in items_of_problem]
             evaluations += get_evaluator(key).evaluate_all(queries, preparation)
@@ -180,7 +180,8 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
             f"{product}: {reason}; `advsearch resume RUN workers=null` makes it here"
         )
     gradient = torch.zeros_like(query.u) if query.gradient else None
-    # only an evaluation of a search, which has a phase, is paid from its budget
+    # An evaluation of a search, which has a phase, is paid from the budget of renders,
+    # also if it is lost. A trial has no cost.
     cost = 0 if query.phase is None else query.samples
     judgement = Judgement(
         score=math.nan,
@@ -291,6 +292,7 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
         return None
     closure = getattr(callee, "__closure__", None) or ()
     components = (
+        # the docstring, to leave it out
         _simplify_code(code, getattr(callee, "__doc__", None)),
         _simplify(getattr(callee, "__defaults__", None)),
         [_simplify(cell) for cell in closure],
@@ -319,9 +321,9 @@ def _simplify_code(code: CodeType, docstring: str | None = None) -> tuple[Any, .
 
     Args:
         code: compiled code of the function.
-        docstring: docstring of the function, which Python stores among the constants
-            and which is left out; None for code without one. Then constants of None are
-            left out, which changes all digests of such code alike.
+        docstring: docstring of the function. Python stores it among the constants,
+            where it is left out. None for code without one: then all constants that are
+            None are left out, which makes no difference between two digests.
     """
     constants = [
         _simplify_code(constant)
@@ -397,8 +399,9 @@ class Journal:
     def __post_init__(self) -> None:
         """Read from the store which machines and how many rows the run has.
 
-        A copy made by `dataclasses.replace`, for another problem of the same run, has
-        the same dicts and `_opened`, so that nothing is read again.
+        A copy made by `dataclasses.replace`, for another problem of the same run, gets
+        `_opened` and the same dicts, which are changed in place. So nothing is read
+        again.
         """
         if self.run_directory is not None and not self._opened:
             self.machines |= self.get_note(MACHINES_NOTE) or {}
@@ -454,19 +457,21 @@ class Journal:
         """Return the evaluated trials of a kind by their index.
 
         `store` adds new trials to this dict. The first call for a kind reads its rows
-        from the store, and counts those that were lost with their workers.
+        from the store, and counts the lost ones: their workers died, which their label
+        says.
         """
         if kind in self._trials:
             return self._trials[kind]
         rows: Iterable[Row] = ()
+        # `_counts` has the kinds of which rows were stored before
         if self.run_directory is not None and kind in self._counts:
             rows = self.run_directory.store.rows(kind)
         trials = {}
         for row in rows:
             # Rows of old runs may have no judgement.
             if row.correct is not None:
-                # See `_row_of_trial`: a predicted image has no seed, and the samples
-                # per pixel of the prediction. `predicted` is 0 for a rendered image.
+                # `predicted` is the number of samples per pixel of a prediction, or 0
+                # for a rendered image. A predicted image has no seed (`_row_of_trial`).
                 predicted = 0
                 is_predicted = row.seed is None
                 if is_predicted:
@@ -505,9 +510,10 @@ class Journal:
         is_same_query = cached.u == compute_digest(query.u) and row.seed == query.seed
         if not is_same_query:
             raise InputError(
-                f"{self.run_directory.path}: cannot resume: evaluation {query.row_index} of the "
-                f"{query.kind} is not the one that was stored, so advsearch, its "
-                "packages or the number of threads have changed since; "
+                f"{self.run_directory.path}: cannot resume: evaluation "
+                f"{query.row_index} of the {query.kind} is not the one that was "
+                "stored, so advsearch, its packages or the number of threads have "
+                "changed since; "
                 f"{self.run_directory.restart_advice}"
             )
         if cached.non_finite:
@@ -522,15 +528,16 @@ class Journal:
     ) -> list[Row]:
         """Store evaluations in one transaction, a row each.
 
-        For an evaluation of a search, gradient and image are stored with the row. They
-        are stored for one row only, so such an evaluation is stored by itself.
+        For an evaluation of a search, gradient and image are stored with the row. There
+        is room for one gradient and image in a call, so that such an evaluation is
+        stored by itself.
 
         Args:
             evaluated: queries and their evaluations; trials, or a single evaluation of
                 a search.
-            id_is_number: whether the id of a row is the index of its query plus 1. So
-                rows that come in any order have the same ids. Such rows, of a sweep,
-                are not cached in memory.
+            id_is_number: whether the id of a row is the index of its query plus 1, so
+                that it does not depend on the order in which rows come. This is for
+                rows of a sweep, which are not cached in memory.
 
         Returns:
             The rows.
@@ -548,8 +555,8 @@ class Journal:
                     trials = self._trials_of(query.kind)
                     trials[query.row_index] = replace(evaluation, picture=None)
             elif query.row_index < self._counts.get(query.kind, 0):
-                # The store has this row, but not its gradient, which a complete run
-                # deletes. So it was evaluated again, and is not stored twice.
+                # The store has this row, but not its gradient, which is deleted when a
+                # run is complete. So it was evaluated again, but is not stored again.
                 continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
@@ -600,8 +607,8 @@ class Journal:
         row = make_trial_row(
             query.kind,
             query.row_index,
-            # A predicted image has no noise, hence no seed. Its row has the samples per
-            # pixel of the prediction in place of those of a render.
+            # `predicted` is 0 for a rendered image. A predicted one has no noise, hence
+            # no seed, and `predicted` are the samples per pixel of the prediction.
             seed=None if evaluation.predicted else query.seed,
             spp=evaluation.predicted or query.spp,
             judgement=evaluation.required_judgement,
@@ -630,6 +637,8 @@ class Journal:
         problem = self.problem
         is_finite = evaluation.is_finite
         is_predicted = bool(evaluation.predicted)
+        # A cost of 1 is an image under each of the conditions of an evaluation.
+        n_renders = evaluation.cost * problem.conditions_per_evaluation
         row = Row(
             query.kind,
             query.row_index,
@@ -641,10 +650,7 @@ class Journal:
             values=problem.describe(query.u),
             seconds=evaluation.seconds,
             phase=query.phase,
-            # A cost of 1 is an image under each of the `n_draws` conditions.
-            renders=0
-            if is_predicted
-            else evaluation.cost * problem.conditions_per_evaluation,
+            renders=0 if is_predicted else n_renders,
             machine=evaluation.machine,
         )
         if evaluation.judgement is not None:
@@ -684,6 +690,7 @@ class Journal:
         if seconds is None:
             return None
         stored: Iterable[Row] = ()
+        # The store has cached evaluations if an earlier process has begun the run.
         if self.run_directory is not None and self.run_directory.store.has_cached:
             stored = self.run_directory.store.rows(kind)
         search_seconds = []
@@ -691,7 +698,7 @@ class Journal:
         for row in stored:
             if row.phase == "search":
                 search_seconds.append(row.seconds or 0.0)
-            else:
+            else:  # "ranking"
                 has_ranking = True
         seconds_left = seconds - math.fsum(search_seconds)
         n_stored = len(search_seconds)
@@ -747,10 +754,10 @@ def compute_digest(u: Tensor) -> bytes:
 
 
 def _restore_evaluation(row: Row, cached: CachedEvaluation) -> Evaluation:
-    """Return a search's evaluation from the store.
+    """Return a search's evaluation from the store, with what a search needs of it.
 
-    A row of an old run may have no judgement. Arrays of the store are read-only, so
-    they are copied.
+    A row of an old run may have no judgement, and then no `correct` either. Arrays of
+    the store are read-only, so they are copied.
 
     Args:
         row: row of the evaluation.

@@ -86,7 +86,7 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
     settings = {}
     for name, function in metrics.items():
         is_column = name in (*LEADING_COLUMNS, *TRAILING_COLUMNS)
-        if is_column or not name:
+        if is_column or not name:  # an empty name gets the same message
             raise InputError(
                 f"metrics: {name!r} is a column that rows have already; "
                 "choose another name"
@@ -131,10 +131,10 @@ def list_session_only_metrics(settings: Mapping[str, str]) -> list[str]:
 
 
 def check_metrics_importable(settings: Mapping[str, str]) -> None:
-    """Raise InputError for a metric that workers could not import."""
-    # the first of them is an error
+    """Raise InputError for the first metric that workers could not import."""
     for name in list_session_only_metrics(settings):
-        bare_name = settings[name].rpartition(":")[2]
+        # of "package.module:function", or a bare name already
+        _, _, bare_name = settings[name].rpartition(":")
         raise InputError(
             f"metrics: {name}: workers import a metric by its name, and {bare_name} "
             "has none that they could; write it as a function of a module, or leave "
@@ -222,8 +222,9 @@ def judge_images(
     """
     with torch.no_grad():
         if len(truths) == 1:
-            judgements = task.judge(output, truths[0])
-            truths = [truths[0]] * len(images)
+            (common_truth,) = truths
+            judgements = task.judge(output, common_truth)
+            truths = [common_truth] * len(images)  # for the metrics
         else:
             # A task judges a batch by one truth: here each image is its own batch.
             judgements = [
@@ -298,13 +299,13 @@ def add_metrics(
 
 
 def _to_metric_value(name: str, result: Any) -> float | None:
-    """Return what a metric returned as a number.
+    """Return one value that a metric returned, as a number.
 
     None stands for NaN and infinity, which JSON does not have.
 
     Args:
         name: name of the metric, for the message.
-        result: what it returned.
+        result: what it returned, or a value of the dict that it returned.
 
     Raises:
         InputError: it is no number.
@@ -312,6 +313,7 @@ def _to_metric_value(name: str, result: Any) -> float | None:
     try:
         value = float(result)
     except (TypeError, ValueError, RuntimeError):
+        # torch raises RuntimeError for a tensor of several values
         raise InputError(
             f"metrics: {name}: expected a number, or a dict from names to "
             f"numbers, got {result!r:.80}"
@@ -333,7 +335,8 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
             _unbatch(model_output, model_truth)
             for model_output, model_truth in zip(image_output, truth, strict=True)
         ]
-        outputs, truths = zip(*pairs, strict=True) if pairs else ((), ())
+        outputs = tuple(model_output for model_output, _ in pairs)
+        truths = tuple(model_truth for _, model_truth in pairs)
         return outputs, truths
     labels = truth_to_labels(truth, output, count=1)
     # a single label is a tensor (1,); any other truth stays as it is
@@ -409,6 +412,7 @@ def calibrate_task(
             **image_settings,
         )
         view = rendering.views[0]  # `render` made one, as `around` was not given
+        # the task now has the evidence of all scenes so far
         task = task.after_calibration(view.output, view.truth)
         if not task.ambiguity_message:
             return task
@@ -454,7 +458,7 @@ def check_truth(
         for facts_of_thing in judged_facts:
             task.check(facts_of_thing)
     except InputError as error:
-        # If the user stated a label, that is the error, which the task explains.
+        # If the user stated a label, it is wrong, and the message of the task says why.
         if facts.label is not None:
             raise
         rendering = render(
@@ -558,7 +562,7 @@ def make_domain(
                 group.budget.epsilon,
                 periodic=group.periodic,
                 name=f"{control.name}.{group.parameter}",
-                n_options=group.options,
+                n_options=group.options,  # number of options; 0 for a number
             )
             blocks.append(block)
     if start is None:
@@ -642,7 +646,7 @@ class ConfigurationInputs:
         Raises:
             InputError: "texture", and not exactly one control has searched colors.
         """
-        self.used = True
+        self.used = True  # the objective depends on more than the image
         if name == "inputs":
             inputs = [self._space.inputs(u) for u in self._configurations]
             return StackedTensors("input of the scene", inputs)
@@ -735,7 +739,7 @@ def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     if is_masked:
         # The N pixels that count, as an image (N, 1, 3) of one column.
         colors = colors[colors[..., 3] > 0][:, None, :3]
-    # which color is nearest has no derivative
+    # The choice of the nearest color has no derivative.
     fixed_colors = colors.detach()
     if palette is None:
         # The nearest color of the grid: each channel is rounded to a multiple of the
@@ -877,8 +881,9 @@ def _make_feature_objective(
         The objective, and a remark. The remark states which features are compared if
         they are not those before the last layer; else it is "".
     """
-    # Features are those before the last layer. If the task reads no logits, the output
-    # of the model itself, a function of the image, are the features.
+    # Features are those before the last layer of the model. If the task reads no
+    # logits, they are the output of the model. So the model itself is the function that
+    # computes features.
     features = features_of(model) if task.reads_logits else None
     with torch.no_grad():
         clean_image = renderer(renderer.start, seed=seed, spp=CLEAN_SPP)

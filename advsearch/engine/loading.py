@@ -126,7 +126,8 @@ class Scene:
             controls: controls that u varies.
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
-            seed: root of the noise; the `seed` of each call is added to it.
+            seed: root of the noise; together with the `seed` of a call, it determines
+                the noise of an image.
             estimators: how derivatives are computed, by "control.parameter", "control"
                 or "*". `advsearch check` lists the estimators.
             sampler: "multijitter", or "independent", which has more noise.
@@ -183,13 +184,13 @@ class Scene:
             }
             folder = replace(description.photographs, scenes=relit_scenes)
             relit = replace(relit, photographs=folder)
-        # The lamps of a place are on if the environment is dark, so that ground and lamps
-        # are added again.
+        # The lamps of a place are on if the environment is dark, so that ground and
+        # lamps are added again.
         grounded = with_requested_ground(relit)
         return Scene(add_lamps(grounded), self.is_session_only)
 
     def __getattr__(self, name: str) -> Any:
-        """Explain what to use instead of `render`; called for missing attributes only."""
+        """Explain what to use instead of `render`; called for a missing attribute."""
         if name == "render":
             raise AttributeError(
                 "a scene has no `render`: advsearch.render(scene) makes a picture and "
@@ -235,12 +236,13 @@ class Scene:
         Raises:
             InputError: a name is unknown or a value out of range.
         """
-        # `resolved` has a value for every parameter, of which those of `overrides` count
+        # `resolved` has a value for every parameter, of which those of `overrides`
+        # count
         resolved = settings.resolve_settings(overrides)
         description = self.description
         check_mesh_names(description, overrides)
         if description.camera_model is not None:
-            # it has its own focal lengths
+            # a camera model has focal lengths, and takes no field of view
             description.camera_model.check_no_fov(overrides)
         values = {**description.values, **{name: resolved[name] for name in overrides}}
         # A camera that has a height gets its elevation from that. So a stated elevation
@@ -252,7 +254,8 @@ class Scene:
             values=values,
             requested=description.requested | set(overrides),
         )
-        # The settings may request another ground, or switch lamps on or off.
+        # The settings may request another ground, or switch lamps on or off. So ground
+        # and lamps are added anew, in place of the old ones.
         grounded = with_requested_ground(changed)
         return Scene(add_lamps(grounded), self.is_session_only)
 
@@ -401,14 +404,14 @@ def _put_into_photographs(
         return make_photograph_scene(description, view, camera, occluder)
     if occluder is not None:
         raise InputError(
-            f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs to "
-            "one photograph; state it as `occluder` in the camera file beside that"
+            f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs "
+            "to one photograph; state it as `occluder` in the camera file beside that"
         )
     scenes: dict[str, SceneDescription] = {}
     # Files that are opened here belong to the folder.
     with track_opened_files(spec):
-        # A file with the cameras of all photographs is parsed only once. `camera` may
-        # also be the name of a camera, and stays.
+        # `camera` may be a file with the cameras of all photographs, which is parsed
+        # here only once. If it is something else, such as a name, it stays as it is.
         photograph_camera: Any = camera
         if camera is not None:
             photograph_camera = read_photograph_cameras(camera) or camera
@@ -487,7 +490,8 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         # file of the mask of what is in front of the object; "" without one
         occluder = photograph.front_spec or None
     camera = _camera_setting(description)
-    # In a folder, the scene shows one of its photographs. The settings name the folder.
+    # A scene in a folder of photographs shows one of them. The settings name the
+    # folder.
     if description.photographs is not None:
         backdrop = description.photographs.path
         camera = description.photographs.camera
@@ -578,12 +582,13 @@ def fit_camera(
                 "`set` camera.drops: of one camera, not of several; leave it out"
             )
         # Drops bend the ray of each pixel, so they need a camera model, which has a
-        # table of rays. A camera model without a name was made by an earlier call of
-        # this function, perhaps for another aspect, and is replaced.
+        # table of rays. A pinhole that is made here has no name. If an earlier call has
+        # made it, perhaps for another aspect, it is replaced.
         if camera_model is None or not camera_model.name:
             camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
     if camera_model is not None:
-        # A bundled lens depends on the aspect, and is made again; others stay.
+        # A bundled lens depends on the aspect, and is found again by its name. Any
+        # other camera model stays.
         bundled_models = make_bundled_models(aspect)
         camera_model = bundled_models.get(camera_model.name, camera_model)
         scaling_remarks = camera_model.describe_scaling((height, width))
@@ -636,13 +641,12 @@ def make_renderer(
             where that changes no image.
         sampler: "multijitter" or "independent".
         differentiated: whether images are differentiated by the coordinates. If not,
-            the measurement of how fast each coordinate moves outlines is skipped. It
-            takes a third of the time that it takes to load a scene and render a few
-            small images.
+            the measurement of how fast each coordinate moves outlines is skipped. This
+            saves a third of the time to load a scene and render a few small images.
 
     Raises:
-        InputError: the scene has no light, or its cameras differ in time and nothing
-            that they show does.
+        InputError: the scene has no light; or its cameras take their images at
+            different times, and nothing in the scene moves.
     """
     size = _height_and_width(resolution)
     # a control may have changed the scene, as one that chooses the photograph does
@@ -750,11 +754,13 @@ def choose_moments(
     n_for_motion = math.ceil(MOMENTS_PER_PIXEL * max_pixels_moved)
     n_for_flashes = math.ceil(MOMENTS_PER_FLASH * n_flashes)
     n_moments = min(max(MIN_MOMENTS, n_for_motion, n_for_flashes), MAX_MOMENTS)
-    # time of each moment, the rows that are exposed at it, and the fraction of samples,
-    # which is equal for all moments
-    offsets, rows, samples = divide_exposure(shutter, rolling, height, n_moments)
+    # Time of each moment, and the rows that are exposed at it. The fraction of samples
+    # is the same for all moments.
+    offsets, rows, sample_fraction = divide_exposure(
+        shutter, rolling, height, n_moments
+    )
     return tuple(
-        Moment(space.advance_time(float(offset)), rows_of_moment, samples)
+        Moment(space.advance_time(float(offset)), rows_of_moment, sample_fraction)
         for offset, rows_of_moment in zip(offsets, rows, strict=True)
     )
 
@@ -784,8 +790,8 @@ def _measure_max_motion(
     configurations = torch.rand(
         N_MOTION_SAMPLES,
         len(moving_space.start),
-        # A fixed seed, as the number of moments, which follows from the result, must
-        # not differ between two runs.
+        # The seed is fixed: the number of moments of an exposure (`choose_moments`)
+        # follows from the result, and must not differ between two runs.
         generator=torch.Generator().manual_seed(0),
     )
     max_moved = 0.0
@@ -812,8 +818,8 @@ def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
     # an instance or the stated settings, which are empty for a bare name
     control_by_name = normalize_controls(controls)
     if not isinstance(controls, Mapping):
-        # This only checks the controls, e.g. for an unknown name. Settings of a mapping
-        # are checked later, when its controls are made.
+        # Only to raise an error, e.g. for an unknown name. With a mapping this is done
+        # later, when its controls are made.
         make_controls(control_by_name)
     settings_of_control = {}
     for name, control in control_by_name.items():
@@ -848,7 +854,8 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
     for name in instances:
         # An instance was entered with empty settings. If there are some now, a name has
         # stated them.
-        if settings_by_control[name]:
+        has_settings = bool(settings_by_control[name])
+        if has_settings:
             raise InputError(
                 f"controls: {name} is given twice, by an instance and by "
                 "name; state all of it in one"
@@ -878,8 +885,8 @@ def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, o
         for name, control in control_by_name.items()
         if isinstance(control, Control)
     }
-    # Settings are checked. An instance is replaced by None, which means no settings,
-    # and put back afterwards. So the order of the controls stays.
+    # Only settings are checked. To keep the order of the controls, an instance is
+    # replaced by None (no settings) for this check, and put back afterwards.
     without_instances = {**control_by_name, **dict.fromkeys(instances)}
     all_settings = check_control_settings(without_instances)
     return {
@@ -909,7 +916,7 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             )
         if isinstance(control, Control):
             control_by_name[name] = control
-        elif _is_settings_of_control(control):
+        elif _is_settings_of_control(control):  # and not of one parameter
             control_by_name[name] = {
                 key: distribution_to_setting(value) for key, value in control.items()
             }
@@ -983,7 +990,8 @@ def list_session_only_controls(controls: Controls) -> list[str]:
     for name, control_settings in controls_to_settings(controls).items():
         for parameter, value in control_settings.items():
             if isinstance(value, PythonQuantiles):
-                # the name of a control, or already "control.parameter"
+                # A control of a single parameter may have the name
+                # "control.parameter" already.
                 full_name = name if "." in name else f"{name}.{parameter}"
                 session_only.append(f"{full_name} (drawn by {value['name']})")
     return session_only

@@ -56,12 +56,13 @@ def load_configured_scene(
 
     Args:
         config: the configuration.
-        name: object of the scene; None for the object of the configuration. If a Python
-            caller passed a loaded scene in place of that, it is returned as it is.
+        name: object of the scene; None for the object of the configuration. This may be
+            a loaded scene that a Python caller passed, which is returned as it is.
         environment: environment for `name`. Without a name, the environment of the
             configuration is used.
     """
     if name is None:
+        # None if the object was stated by its name
         scene: Scene | None = config.get_python_object(SCENE, config.object)
         if scene is not None:
             return scene
@@ -144,7 +145,7 @@ def load_models(
                 model,
                 task_of_model,
                 config,
-                # an `EnsembleTask` has other tasks as its parts
+                # True for a single task; the parts of an `EnsembleTask` are other tasks
                 is_only_task=task_of_model is task,
             )
             for model, task_of_model in zip(models, tasks, strict=True)
@@ -178,7 +179,8 @@ def _load_for_task(
     single_image_task = task.single_image_task
     labels = None
     prompt = None
-    # A task may have classes, whose names may have another source.
+    # A task with classes needs their names from the user, unless it takes them from
+    # another source.
     needs_names = single_image_task.labelled and not single_image_task.names_source
     if is_only_task or needs_names:
         labels = config.labels
@@ -226,7 +228,10 @@ def _check_task_of_rig(task: Task, camera: str, n_cameras: int) -> None:
 
 
 def _check_n_images(model: Model) -> None:
-    """Raise InputError if a model takes more or fewer images than there are cameras."""
+    """Raise InputError if a model takes more or fewer images than there are cameras.
+
+    Only a module that takes the images of all cameras at once has a fixed number.
+    """
     module = model.module
     if isinstance(module, AllAtOnce) and module.cameras != model.cameras:
         verb = "is" if model.cameras == 1 else "are"
@@ -286,12 +291,14 @@ def check_distinct(names: Sequence[str], setting: str) -> Sequence[str]:
     Raises:
         InputError: there are none, or one comes twice.
     """
-    duplicates = [name for name in names if names.count(name) > 1]
-    if duplicates or not names:
-        raise InputError(
-            f"{setting}: expected different names, got {','.join(names)!r}; leave "
-            f"{', '.join(duplicates[:1])} out"
-        )
+    if not names:
+        raise InputError(f"{setting}: expected at least one name, got none")
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"{setting}: expected different names, got {','.join(names)!r}; leave "
+                f"{name} out"
+            )
     return names
 
 
@@ -322,9 +329,10 @@ def check_no_scene_settings(settings: Mapping[str, object]) -> None:
 
 
 def check_no_worker_settings(settings: Mapping[str, object]) -> None:
-    """Raise InputError for settings of workers if the run has loaded objects.
+    """Raise InputError if there are settings of workers; for a run with loaded objects.
 
-    Workers are other processes, which can only load objects by name.
+    Workers are other processes, which can only load objects by name. The caller knows
+    that some were passed as loaded objects.
     """
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
@@ -388,8 +396,8 @@ def make_configured_controls(
         if not isinstance(control, Control):
             control = config.get_python_object(CONTROL, name) or control
         control_by_name[name] = control
-    # This only checks the controls: an unknown one is rejected before settings are
-    # read.
+    # Only to raise an error for an unknown control before settings are read. The
+    # instances are made at the end, with all settings.
     make_controls(control_by_name)
     completed: dict[str, Control | Mapping[str, object]] = {}
     for name, control in control_by_name.items():
@@ -451,7 +459,7 @@ def _select_settings(
 def select_run_settings(
     config: SceneConfig, qualified_name: str, control_settings: Mapping[str, object]
 ) -> dict[str, Any]:
-    """Return the run's settings for a run over a single one of its controls.
+    """Return the settings of a run, for another run over only one of its controls.
 
     Args:
         config: configuration of the run over all controls.
@@ -470,6 +478,7 @@ def select_run_settings(
         if isinstance(value, Mapping):
             is_named = instance_name in value
             value = {instance_name: value[instance_name]} if is_named else None
+        # also if it is stated, since it may be for other controls of the run
         if not takes_setting(qualified_name, control_settings, setting):
             value = None
         run_settings[setting] = value
@@ -489,8 +498,9 @@ def check_run_settings(config: SceneConfig) -> None:
     for setting, value in collect_run_settings(config).items():
         random_controls: Mapping[str, Any] = {}
         if setting not in SETTINGS_OF_SEARCHES:
-            # only some commands have controls that vary by chance
+            # `over` has the controls that vary by chance; only some commands have it
             random_controls = getattr(config, "over", {})
+        # several names may state parameters of one control
         controls = merge_control_settings({**config.controls, **random_controls})
         # kind of each control that does not take the setting, by its name
         rejecting_kinds = {}
@@ -557,8 +567,11 @@ def takes_setting(
         control_settings: settings that the user stated for the control.
         setting: name of a setting of the run, such as "epsilon".
     """
+    # settings of the control that are not searched; None for a control of unknown kind
     choices = _list_choices(qualified_name, control_settings)
-    return choices is None or setting in {choice.run_setting for choice in choices}
+    if choices is None:
+        return True
+    return setting in {choice.run_setting for choice in choices}
 
 
 def _list_choices(
@@ -602,8 +615,9 @@ def _list_active_choices(
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
-    # names of parameters with a default range, or with a range that is set; names of
-    # choices are among these as well, but no choice bounds a choice
+    # Names of parameters with a default range, or with a range that is set. Names of
+    # choices that are set are among these as well. They do no harm, as `Choice.bounds`
+    # is never the name of a choice.
     searched = {
         parameter.name for parameter in kind.parameters if parameter.search is not None
     }
@@ -626,8 +640,9 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
     """
     if setting == "epsilon":
         choices = CONTROLS[kind].choices if kind in CONTROLS else ()
-        # Some controls take an epsilon for a parameter (`Choice.bounds`), but only if
-        # it is searched. The first such parameter is suggested.
+        # Some controls take an epsilon for one of their parameters, but only if it is
+        # searched. `Choice.bounds` is the name of the parameter. The first is
+        # suggested.
         bounded_parameters = [
             choice.bounds
             for choice in choices
@@ -652,8 +667,8 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
 
 
 _PROCESS_LOCK = threading.RLock()
-"""Lock that is held by the running experiment. The number of threads of torch and Dr.Jit
-and the recording of warnings are shared by the process.
+"""Lock that is held by the running experiment. The number of threads of torch and
+Dr.Jit and the recording of warnings are shared by the process.
 """
 
 

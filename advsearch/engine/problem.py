@@ -80,8 +80,8 @@ from few that are exact.
 """
 
 MAX_CACHED_COORDINATES = 64
-"""The truth of a configuration is cached if it has at most this many coordinates besides
-base colors.
+"""The truth of a configuration is cached if it has at most this many coordinates
+besides base colors.
 """
 
 MAX_CACHED_TRUTHS = 512
@@ -126,8 +126,8 @@ class Problem:
         n_searched: number of controls that are searched; None for all. The others are
             the conditions: every image has new ones from their full range.
         steps: number of renders of a search.
-        conditions_per_evaluation: number of conditions of an evaluation, whose objective is the mean over
-            them; 1 without conditions.
+        conditions_per_evaluation: number of conditions of an evaluation, whose
+            objective is the mean over them; 1 without conditions.
         search_depth: segments of the longest light path in a search; None for that of
             the scene.
         aovs: names of the layers of ground truth that are stored for the clean and the
@@ -176,8 +176,9 @@ class Problem:
         domain states the cost of a gradient, which depends on the plan.
         """
         controls = self.space.controls
-        # None means that all are searched
-        n_searched = len(controls) if self.n_searched is None else self.n_searched
+        n_searched = self.n_searched
+        if n_searched is None:  # all are searched
+            n_searched = len(controls)
         searched = controls[:n_searched]
         conditions = controls[n_searched:]
         condition_names = {control.name for control in conditions}
@@ -256,15 +257,16 @@ class Problem:
 
         Args:
             u: (d,) the configuration.
-            seed: seed of the noise and, if they are drawn, of the conditions.
-            search_spp: samples per pixel.
-            with_conditions: whether conditions are drawn; else they leave the scene
+            seed: seed of the noise, and of the conditions if these are sampled.
+            spp: samples per pixel.
+            with_conditions: whether conditions are sampled; else they leave the scene
                 unchanged.
 
         Returns:
             (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
         """
         full_u = self.make_full_configuration(u, seed if with_conditions else None)
+        # Light paths that are the same in all trials of this seed are traced once.
         with torch.no_grad(), self.renderer.share_paths(self.shared_paths):
             return round_to_8_bit(self.renderer(full_u, seed=seed, spp=spp))
 
@@ -280,7 +282,8 @@ class Problem:
             The judgement. It has the value of the objective, if there is one.
         """
         if self.objective is None:
-            # `{}`: no stated values in place of the configuration's
+            # Without an objective, `judge_images` does all that is needed. `{}`: no
+            # stated values in place of the configuration's.
             return self.judge_images(image[None], [full_u], [{}])[0]
         with torch.no_grad():
             output = self.model(image)
@@ -300,8 +303,8 @@ class Problem:
     ) -> list[Judgement]:
         """Judge images that the model gets in one batch.
 
-        The judgements have no objective. If a margin is infinite or NaN, the judgement
-        is that of a model that returned NaN.
+        The judgements have no value of the objective. If a margin is infinite or NaN,
+        the judgement is that of a model that returned NaN.
 
         Args:
             images: (N, H, W, 3) sRGB in [0, 1].
@@ -354,14 +357,15 @@ class Problem:
             output: the model's output for all N images.
             pictures: (N, H, W, 3) sRGB in [0, 1].
             truths: N truths, or one that holds for all images.
-            full_configurations: N full configurations (d,).
+            full_configurations: N full configurations (d,), one for each image.
         """
         judged = list(judge_images(self.task, output, pictures, truths, self.metrics))
         has_other_things = self.space.scene is not None and self.space.scene.things
         if not has_other_things:
             return judged
         for index, full_u in enumerate(full_configurations):
-            key = full_u.detach()[self._is_geometric].numpy().tobytes()
+            # coordinates that may change what is visible
+            key = full_u.detach()[self._changes_more_than_colors].numpy().tobytes()
             if key not in self._things:
                 things = find_visible_things(self.renderer, full_u)
                 _add_to_cache(self._things, key, things)
@@ -387,9 +391,10 @@ class Problem:
             predict: function from a full configuration to an image (H, W, 3).
             full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise of the traced images.
-            search_spp: samples per pixel of a rendered image.
+            spp: samples per pixel of a rendered image.
             is_random: (d,) bool, which searched coordinates of `full_u` were set to
-                random values for this comparison. They are no change by the search.
+                random values for this comparison, to test predictions wherever the
+                search may go. They are no change by the search.
             renderer: traces the images; None for that of the problem.
         """
         dim = self.domain.dim
@@ -460,7 +465,7 @@ class Problem:
         # So it is cached by the other coordinates, if these are few. A truth is not
         # cached if exact values were stated, or if the task has read values of the
         # configuration (`Facts.numbers`), which may include colors.
-        geometric_u = full_u.detach()[self._is_geometric]
+        geometric_u = full_u.detach()[self._changes_more_than_colors]
         key = geometric_u.numpy().tobytes()
         if not stated_values and key in self._truths:
             return self._truths[key]
@@ -484,6 +489,7 @@ class Problem:
         """
 
         def describe() -> dict[str, Value]:
+            """Return the values of all parameters, with the stated ones."""
             values = self.space.describe(full_u)
             return {
                 name: stated_values.get(name, value) for name, value in values.items()
@@ -502,9 +508,10 @@ class Problem:
         """What is true at the start, and always if the task's truth does not vary."""
         start = self.make_full_configuration(self.domain.start)
         if self.task.varies:
-            # with a configuration, `find_truth` does not come back here
+            # `find_truth` only reads this property for a truth that does not vary, or
+            # without a configuration.
             return self.find_truth(start)
-        # functions, since a task may need neither
+        # Both are functions, which are only called if the task needs their result.
         facts = self.make_facts(
             lambda: self.space.describe(start),
             lambda: self.renderer.find_surfaces(start),
@@ -512,22 +519,22 @@ class Problem:
         return self.task.truth(facts)
 
     @cached_property
-    def _is_geometric(self) -> Tensor:
+    def _changes_more_than_colors(self) -> Tensor:
         """Whether each coordinate changes more than the colors of surfaces, (d,) bool.
 
         Coordinates that change the finished image, such as a blur, count as well.
         """
         # names of the inputs in which an image is linear, which are base colors
         color_inputs = find_linear_inputs(self.renderer)
-        is_geometric = torch.ones(len(self.space.start), dtype=torch.bool)
+        changes_more = torch.ones(len(self.space.start), dtype=torch.bool)
         for group in self.space.groups:
             # Names of the scene inputs that the group changes; None for a group that
             # only changes the finished image.
             changed_inputs = self.renderer.inputs_by_group.get(group.name)
             if changed_inputs:
                 only_colors = changed_inputs <= color_inputs  # a subset
-                is_geometric[group.coordinates] = not only_colors
-        return is_geometric
+                changes_more[group.coordinates] = not only_colors
+        return changes_more
 
     def make_objective_inputs(
         self, *full_configurations: Tensor
@@ -568,7 +575,7 @@ class Problem:
         the center of the range. The result is (None, "") if the group has several
         coordinates, has no step, or has a value that is no number.
         """
-        # a group without finite differences has no reason for a step
+        # A group with finite differences has a step, and a reason for its size.
         has_step = bool(group.step_reason)
         if not has_step or group.size != 1:
             return None, ""
@@ -643,8 +650,8 @@ class Problem:
             evaluation, _ = self.evaluate_full(query, query.u, query.seed)
         else:
             evaluation = self._evaluate_over_conditions(query)
-        # The renderer counts over all renders of the query, also those of light and
-        # images, for which the evaluation has no count yet.
+        # The count of the renderer is over all renders of the query, those of light and
+        # of images included. It replaces the count of the evaluation.
         n_non_finite = self.renderer.n_non_finite - non_finite_before
         if n_non_finite:
             return replace(evaluation, n_non_finite=n_non_finite)
@@ -670,10 +677,10 @@ class Problem:
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search by its mean over sampled conditions.
 
-        Each of the `conditions_per_evaluation` conditions is rendered once. The noise of its image has
-        the same seed as the condition. If the query requests an image, it is rendered
-        under conditions that leave the scene unchanged, as no sampled one represents
-        all of them.
+        Each of the `conditions_per_evaluation` conditions is rendered once. The noise
+        of its image has the same seed as the condition. If the query requests an image,
+        it is rendered under conditions that leave the scene unchanged, as no sampled
+        one represents all of them.
         """
         condition_seeds = [
             seeds.derive_seed(query.seed, "draw", index)
@@ -728,7 +735,7 @@ class Problem:
         Args:
             full_u: the full configuration: searched coordinates, then conditions.
             seed: seed of the noise.
-            search_spp: samples per pixel.
+            spp: samples per pixel.
             collected_light: light that an earlier call collected at `full_u`; None to
                 collect it now.
         """
@@ -752,7 +759,8 @@ class Problem:
                 full_u,
                 seed,
                 spp=spp,
-                quick=True,  # one is made for each of many conditions
+                # less exact and smaller, as one is made for each of many conditions
+                quick=True,
                 names=input_names,
                 collected=collected_light,
             )
@@ -778,7 +786,7 @@ class Problem:
         """
         renderer = self.renderer if renderer is None else renderer
         non_finite_before = renderer.n_non_finite
-        renders_before = renderer.n_renders
+        renders_before = renderer.n_renders  # without regard to their samples
         truth = self.find_truth(full_u)
         variable_u = full_u.detach().clone().requires_grad_(bool(query.gradient))
         inputs = self.make_objective_inputs(variable_u)
@@ -805,6 +813,7 @@ class Problem:
         gradient = None
         with self._limit_search_depth(renderer):
             if query.gradient:
+                # a "free" gradient leaves out derivatives that cost renders
                 value, gradient = renderer.gradient(
                     loss, full_u, seed, spp, free=query.gradient == "free"
                 )
@@ -813,7 +822,7 @@ class Problem:
             else:
                 with torch.no_grad():
                     value = loss(renderer(full_u, seed=seed, spp=spp))
-        image, output = calls[0]
+        image, output = calls[0]  # at u itself
         (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
         # at least 1, since a renderer that predicts counts no renders
         n_renders = max(1, renderer.n_renders - renders_before)
@@ -850,14 +859,14 @@ class Problem:
             render: function from u (d,) to images (N, H, W, 3), with a graph.
             full_configurations: N full configurations, which differ in conditions only.
             u: (d,) the searched coordinates, equal in all of them.
-            gradient: whether a derivative is computed.
+            gradient: which derivative is requested. "free" counts as all of it, as
+                predicted images are differentiated at no cost.
 
         Returns:
             First, for each image, an evaluation without derivative and the model's
-            output. Second, the derivative (d,) by u of the sum of the objectives, each
-            weighted by `compute_condition_weights`; None if no gradient is requested.
+            output. Second, the derivative (d,) by u of a weighted sum of the objectives
+            (`compute_condition_weights`); None if no gradient is requested.
         """
-        # "free" counts as a request: predicted images are differentiated at no cost
         needs_gradient = bool(gradient)
         variable_u = u.detach().clone().requires_grad_(needs_gradient)
         with torch.set_grad_enabled(needs_gradient):
@@ -871,30 +880,42 @@ class Problem:
                 torch.cat([variable_u, full_u[len(variable_u) :]])
                 for full_u in full_configurations
             ]
-            if self.task.varies:
-                values = self._compute_objective_of_each(
-                    outputs_of_images, images, truths, variable_configurations
-                )
-            else:  # one truth holds for all images
-                inputs = self.make_objective_inputs(*variable_configurations)
-                values = self._compute_objective(outputs, images, truths[0], inputs)
-            derivative = torch.zeros_like(u) if needs_gradient else None
-            # Without a graph, the objectives do not depend on u.
-            if values.requires_grad:
-                weights = compute_condition_weights(values)
-                weighted_sum = (values * weights).sum()
-                (derivative,) = torch.autograd.grad(weighted_sum, variable_u)
-        judgements = self._judge_outputs(outputs, images, truths, full_configurations)
-        evaluations = []
-        for value, judgement in zip(values.detach(), judgements, strict=True):
-            evaluation = Evaluation(
-                objective=float(value),
-                gradient=None,
-                success=judgement.success,
-                judgement=judgement,
+            values = self._compute_objectives_of_batch(
+                outputs, images, truths, variable_configurations
             )
-            evaluations.append(evaluation)
+            derivative = None
+            if needs_gradient:
+                derivative = _differentiate_weighted_sum(values, variable_u)
+        judgements = self._judge_outputs(outputs, images, truths, full_configurations)
+        evaluations = [
+            Evaluation(float(value), None, judgement.success, judgement=judgement)
+            for value, judgement in zip(values.detach(), judgements, strict=True)
+        ]
         return list(zip(evaluations, outputs_of_images, strict=True)), derivative
+
+    def _compute_objectives_of_batch(
+        self,
+        outputs: Output,
+        images: Tensor,
+        truths: Sequence[Truth],
+        full_configurations: Sequence[Tensor],
+    ) -> Tensor:
+        """Return the objectives (N,) of a batch of images, with a graph.
+
+        Args:
+            outputs: the model's output for all N images.
+            images: (N, H, W, 3) sRGB in [0, 1].
+            truths: what is true of each image; all are equal if the truth of the task
+                does not vary.
+            full_configurations: N full configurations, which an objective may read.
+        """
+        if self.task.varies:
+            outputs_of_images = _split_batch(outputs, len(truths))
+            return self._compute_objective_of_each(
+                outputs_of_images, images, truths, full_configurations
+            )
+        inputs = self.make_objective_inputs(*full_configurations)
+        return self._compute_objective(outputs, images, truths[0], inputs)
 
     def _compute_objective_of_each(
         self,
@@ -936,14 +957,15 @@ class Problem:
                 (N, H, W, 3), with a graph.
             full_configurations: full configuration of each condition.
             u: (d,) the searched coordinates.
-            gradient: whether a derivative is computed.
+            gradient: which derivative is requested. "free" counts as all of it.
             batch_size: images in a batch of the model.
         """
         evaluated = []
-        # sum over the conditions; None without a gradient
+        # derivative of the sum of all objectives; None without a gradient
         total_derivative = None
         for begin in range(0, len(full_configurations), batch_size):
             batch = slice(begin, begin + batch_size)
+            # `derivative` is that of the sum over the batch
             batch_evaluated, derivative = self.evaluate_batch(
                 partial(render, batch), full_configurations[batch], u, gradient
             )
@@ -1028,7 +1050,10 @@ class Problem:
             return self.task.judge(output, self.find_truth())[0]
 
     def compute_loss(self, image: Tensor) -> Tensor:
-        """Return the objective of an image (H, W, 3) near the start, with a graph."""
+        """Return the objective of an image (H, W, 3) near the start, with a graph.
+
+        Truth and inputs of the objective are those of the start.
+        """
         inputs = self.make_objective_inputs(
             self.make_full_configuration(self.domain.start)
         )
@@ -1058,6 +1083,19 @@ def _differentiate_by_inputs(objective: Tensor, variable_u: Tensor) -> Tensor:
         if gradient is not None:
             return gradient
     return torch.zeros(())
+
+
+def _differentiate_weighted_sum(values: Tensor, u: Tensor) -> Tensor:
+    """Return the derivative (d,) by u of objectives (n,) of conditions, weighted.
+
+    The weights are those of `compute_condition_weights`. Objectives without a graph do
+    not depend on u: then the derivative is 0.
+    """
+    if not values.requires_grad:
+        return torch.zeros_like(u, requires_grad=False)
+    weighted_sum = (values * compute_condition_weights(values)).sum()
+    (derivative,) = torch.autograd.grad(weighted_sum, u)
+    return derivative
 
 
 def compute_condition_weights(values: Tensor) -> Tensor:

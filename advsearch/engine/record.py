@@ -35,15 +35,16 @@ class RunState:
     """The results of a run so far. A result that was not reached is None or empty.
 
     Attributes:
-        first_look_trials: renders of the clean configuration at the search's sample count.
+        first_look_trials: renders of the clean configuration at the search's sample
+            count.
         search_result: result of the search by the policy; a claim.
         random_search_result: result of the random search.
         sample_count: how the sample count of the verification was chosen.
         clean_trials: trials of the control group.
         verification: verification of the adversarial configuration of the run.
         baseline_verification: verification of the result of the random search.
-        result_without_print_terms: result of a search by the policy without print terms, if the search
-            of the run has them.
+        result_without_print_terms: result of a search by the policy without print
+            terms, if the search of the run has them.
         unprinted_verification: verification of that result.
         outdone_verification: verification of the policy's result, if the random search
             found a scene that is worse for the model. Then that scene is the
@@ -56,8 +57,8 @@ class RunState:
         smallest_change_bracket: the smallest change that makes the model fail.
         trial_images: images of the first trials, (H, W, 3) with 8-bit values in [0, 1],
             by kind and number. A resumed run only has those that it rendered itself.
-        search_frames: images of the search in its order, numpy (H, W, 3) with 8-bit values in
-            [0, 1].
+        search_frames: images of the search in its order, numpy (H, W, 3) with 8-bit
+            values in [0, 1].
         interrupted: whether the run was interrupted.
         predictor: predictor of the images of the searches; None if they were rendered.
         predictor_refusal: why images were not predicted, or only cropped.
@@ -110,8 +111,8 @@ class RunState:
             crop = str(self.crop_refusal) if self.crop_refusal else None
             return LinearTransport(used=False, reason=reason, crop=crop)
         summary = self.predictor.summarize()
-        # why a better method was not used: matrices for a crop, or light on surfaces
-        # for matrices
+        # Why a better method was not used. Matrices are better than a crop, and light
+        # on surfaces is better than matrices.
         better_method_refusal = self.predictor_refusal or self.surface_light_refusal
         # If the predictor was given up, its summary has that as the reason, which
         # stays.
@@ -131,7 +132,8 @@ def make_lost_remarks(n_lost: int) -> list[str]:
         return []
     verb, pronoun = ("has", "it") if n_lost == 1 else ("have", "them")
     return [
-        f"{format_count(n_lost, 'picture')} {verb} no answer, which counts as not right: "
+        f"{format_count(n_lost, 'picture')} {verb} no answer, which counts as not "
+        "right: "
         f"every worker that took {pronoun} died."
     ]
 
@@ -199,7 +201,7 @@ def read_judgement(row: Row) -> Judgement:
     """Return the judgement of a row, the inverse of `add_judgement`.
 
     A None in the row means NaN in the judgement. In a row without a label, the output
-    of the model was NaN.
+    of the model was NaN. The objective is a column of the row of its own.
     """
     prediction = Prediction(row.label or NOT_A_NUMBER, row.label_index, row.probability)
     return Judgement(
@@ -218,7 +220,7 @@ def make_verified_rate(verification: Verification) -> VerifiedRate:
     rate = make_rate(
         counts=verification.adversarial_counts,
         trials=verification.valid_trials,
-        successes=verification.successful_trials,
+        successes=verification.successful_trials,  # for their labels and outcomes
     )
     return rate.model_copy(update={"stopped": verification.stop_reason})
 
@@ -235,8 +237,8 @@ def make_rate(
         successes: judgements of the successes, whose labels and outcomes are counted.
     """
     labels = Counter(trial.prediction.label for trial in successes)
-    # The score is the margin with the opposite sign. In floating point -x is -0 for a
-    # mean score of 0, but 0.0 - x is 0.
+    # The mean margin is that of minus the score, as scores and margins have opposite
+    # signs. In floating point -x is -0 for a mean score of 0, but 0.0 - x is 0.
     mean_margin = 0.0 - mean_number(trial.score for trial in trials)
     return VerifiedRate(
         successes=counts.n_successes,
@@ -256,7 +258,7 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
         trials: judgements of the trials.
         spp: samples per pixel of their images.
     """
-    right = count_right(trials, spp)
+    right = count_right(trials, spp)  # counts, with the samples per pixel
     outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
     return ControlGroup(
         correct=right.n_successes, outcomes=outcomes, **_rate_fields(right, trials)
@@ -264,7 +266,11 @@ def make_control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
 
 
 def _rate_fields(counts: TrialCounts, trials: Sequence[Judgement]) -> dict[str, Any]:
-    """Return the fields that all rates of a result have, from counts and trials."""
+    """Return the fields that all rates of a result have, from counts and trials.
+
+    They are the number of trials, the rate with its interval, and the number of trials
+    in which the model returned NaN.
+    """
     n_not_a_number = sum(trial.is_non_finite for trial in trials)
     return {
         "trials": counts.n_trials,

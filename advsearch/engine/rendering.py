@@ -126,7 +126,7 @@ class Rendering:
             if file.suffix.lower() == ".exr":
                 # a single view, as was checked
                 write_exr(file, self.views[0].linear)
-                return self.formation.resolution
+                return self.formation.resolution  # (height, width)
             write_png(file, self._png_pixels)
         height, width = self._png_pixels.shape[:2]
         return height, width
@@ -408,9 +408,9 @@ def render(
 def _list_view_warnings(rendered_views: Sequence[_RenderedView]) -> list[str]:
     """Return the task's warnings about the views, as sentences.
 
-    One states why the truth could not be drawn into a view, if that happened. The
-    others are the task's remarks on the first view that has any, since those on further
-    views say the same.
+    One states why the truth could not be drawn into a view, if that happened; of
+    several views, the last one. The others are the task's remarks on the first view
+    that has any, since those on further views say the same.
     """
     sentences = list[str]()
     truth_errors = [
@@ -461,29 +461,25 @@ def _render_view(
         settings.seed,
         sampler=settings.sampler,
     )
-    formation = renderer.formation
     u = _choose_configuration(space, settings.at)
     with torch.no_grad():
-        radiance = renderer.radiance(
-            u, seeds.derive_seed(settings.seed, "pictures"), settings.spp
-        )
-        image = round_to_8_bit(
-            space.apply_to_image(u, formation.map_to_display(radiance))
-        )
+        radiance, image = _render_image(renderer, u, settings)
         output = model(image)
         truth = None
         truth_error = ""
         if task.varies:
             facts = _make_view_facts(description, space, renderer, u, settings)
+            # None and a message if the truth cannot be found
             truth, truth_error = _find_truth(task, facts)
         # From here on the predictions are read as the calibrated task does.
         task = task.after_calibration(output, truth)
+        # [0]: the batch has one image
         predictions = task.predictions(output, MAX_PREDICTIONS)[0]
         marks = () if truth is None else tuple(task.marks(output, truth)[0])
     view = View(
         azimuth=description.get_number("camera.azimuth"),
         picture=image,
-        linear=radiance * formation.gain,
+        linear=radiance * renderer.formation.gain,
         predictions=predictions,
         marks=marks,
         surfaces=renderer.find_surfaces(u) if settings.with_surfaces else None,
@@ -491,7 +487,19 @@ def _render_view(
         truth=truth,
         things=find_visible_things(renderer, u),
     )
-    return _RenderedView(view, task, space, formation, truth_error)
+    return _RenderedView(view, task, space, renderer.formation, truth_error)
+
+
+def _render_image(
+    renderer: Renderer, u: Tensor, settings: _ViewSettings
+) -> tuple[Tensor, Tensor]:
+    """Return the radiance of a configuration u (d,), and its image of 8-bit values."""
+    noise_seed = seeds.derive_seed(settings.seed, "pictures")
+    radiance = renderer.radiance(u, noise_seed, settings.spp)
+    displayed = renderer.formation.map_to_display(radiance)
+    # with what controls change in the finished image, such as a blur
+    image = renderer.space.apply_to_image(u, displayed)
+    return radiance, round_to_8_bit(image)
 
 
 def _find_truth(task: Task, facts: Facts) -> tuple[Any, str]:
@@ -522,7 +530,7 @@ def _make_view_facts(
 ) -> Facts:
     """Return the facts of a configuration by which a task judges the view.
 
-    If the scene has a rig of several cameras, the field `views` has the facts of each.
+    If the scene has a rig of several cameras, `facts_of_views` has the facts of each.
 
     Args:
         description: the scene.
@@ -636,12 +644,13 @@ def make_facts(
     labelled_mesh = OBJECT if judge == ALL_THINGS else judge
 
     def make_thing_facts(mesh: str) -> Facts:
-        """Return the facts of a single thing, the object or another one."""
+        """Return the facts of a single thing by its mesh, the object or another one."""
         # without a stated label (None), the own label of the thing is right
         stated_label = label if mesh == labelled_mesh else None
         # a function, so that a task that does not need it does not render
         look = None
         if cached_render is not None:
+            # The unit of length of the scene is the size of the object, for all things.
             metres = description.object.size_in_metres
             look = partial(_look_at, cached_render, mesh, metres=metres)
         # The object has the name that the caller states. Another thing has the name of
@@ -652,6 +661,7 @@ def make_facts(
         own_label = description.things[mesh].label
         return Facts(mesh, stated_label, own_label, collect_numbers, look)
 
+    # each with the facts of all others
     facts_by_mesh = _add_others(
         {mesh: make_thing_facts(mesh) for mesh in (OBJECT, *description.things)}
     )
@@ -667,7 +677,8 @@ def _collect_numbers(
 
     Args:
         description: the scene, which has a value for every parameter.
-        describe: returns the values of the configuration, which replace those.
+        describe: returns the values of a configuration, such as {"camera.azimuth":
+            {"value": 30.0, "unit": "degrees"}}. They replace those of the scene.
     """
     configuration = {key: value["value"] for key, value in describe().items()}
     all_values = {**description.values, **configuration}
@@ -704,8 +715,8 @@ def make_sight(
     Args:
         surfaces: what each pixel shows.
         mesh: name of the mesh.
-        metres: size of the object in metres, which is the unit of length of the scene;
-            None if it is not known.
+        metres: length of a unit of the scene in metres, to convert depths; None if it
+            is not known. The unit is the size of the object, whatever `mesh` is.
     """
     return Sight(surfaces.visible_mask(mesh), surfaces.depth, surfaces.z_depth, metres)
 
@@ -724,7 +735,7 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         An entry for the object and for each other thing; None if the scene has only
         the object.
     """
-    description = renderer.scene.description_and_filter[0]
+    description, _filter = renderer.scene.description_and_filter
     if not description.things:
         return None
     names = (OBJECT, *description.things)
@@ -743,13 +754,14 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
         for name in names
     }
     for thing in find_visible_meshes(renderer, u, names):
+        visible_fraction = thing.visible_fraction
+        if visible_fraction is not None:  # it is None if it is not known
+            visible_fraction = round(visible_fraction, 4)
         things[thing.name] = {
             "label": labels[thing.name],
             "box": [*thing.box],
             "pixels": int(thing.mask.sum()),
-            "share": None
-            if thing.visible_fraction is None
-            else round(thing.visible_fraction, 4),
+            "share": visible_fraction,
             "truncated": thing.is_truncated,
             "distance": round(thing.distance, 3),
         }

@@ -1,4 +1,4 @@
-"""Find whether trials of one seed may share light paths that meet no searched surface."""
+"""Find whether trials of a seed may share light paths that meet no searched surface."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def find_shared_paths(problem: Problem) -> SharedPaths | None:
     is_composed = bool(renderer.composition_reason)
     if has_conditions or is_composed or not can_share_paths(renderer.scene):
         return None
-    # lights and moving things change paths everywhere
+    # not if lights or moving things are searched, which change paths everywhere
     if find_searched_refusal(problem) is not None:
         return None
     input_names = find_searched_inputs(problem)

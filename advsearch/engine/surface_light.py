@@ -18,6 +18,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
+from advsearch.controls import Space
 from advsearch.engine.acceptance import N_VIEWS, ComparedView, Deviation
 from advsearch.engine.bank import sample_condition
 from advsearch.engine.problem import Problem
@@ -53,9 +54,9 @@ N_LIGHTS = 64
 COMPARISON_INTERVAL = 100
 BATCH_SIZE = 8  # images in a batch of the model
 N_CONDITION_SETS = 4
-"""Number of sets of conditions of a random search, which are used in turn. Such a search
-can't adapt to them, since it does not learn from evaluations. So the views of the
-cameras can be stored, and are traced only once for each set.
+"""Number of sets of conditions of a random search, which are used in turn. Such a
+search can't adapt to them, since it does not learn from evaluations. So the views of
+the cameras can be stored, and are traced only once for each set.
 """
 
 
@@ -74,7 +75,7 @@ def find_surface_light_refusal(
             setting of this name).
     """
     if not specialise:
-        return Refusal("nothing is left out")  # as the setting requests it
+        return Refusal("nothing is left out")  # which the user has set
     # why the image is composed of several; "" if it is not
     if problem.renderer.composition_reason:
         return Refusal(problem.renderer.composition_reason)
@@ -112,7 +113,7 @@ class SurfaceLight(PredictedSearch):
         light_u: (d,) configuration whose light is computed; None for the start.
         moving_coordinates: indices of the coordinates of u that move; None for those of
             cameras and environments.
-        _moving: (d,) bool, which searched coordinates move a camera or change the
+        _is_moving: (d,) bool, which searched coordinates move a camera or change the
             environment.
         _has_moving: whether there is such a coordinate.
         _searches_colors: whether a searched coordinate changes base colors.
@@ -145,6 +146,7 @@ class SurfaceLight(PredictedSearch):
         """
         problem = self.problem
         space = problem.space
+        # number of searched coordinates
         n_searched = problem.domain.dim
         self._inputs_of_control = {
             control.name: surface_renderer.find_changed_inputs(
@@ -152,26 +154,42 @@ class SurfaceLight(PredictedSearch):
             )
             for control in space.controls
         }
-        # the searched coordinates come first, those of the conditions after them
-        is_moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})
-        self._moving = is_moving[:n_searched]
-        if self.moving_coordinates is not None:
-            self._moving = torch.zeros(n_searched, dtype=torch.bool).index_fill_(
-                0, self.moving_coordinates, True
-            )
-        self._has_moving = bool(self._moving.any())
+        self._is_moving = self._find_moving_coordinates()
+        self._has_moving = bool(self._is_moving.any())
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
         self._searches_colors = bool(is_coloring.any())
         self.draws_conditions = problem.conditions is not None and self._searches_colors
-        # Base colors are applied separately. So if nothing that is searched moves, only
-        # the inputs of the conditions, whose controls come last, have to be computed.
-        self._input_space = space
-        if not self._has_moving:
-            # `problem.n_searched` is None without conditions: then all controls count
-            n_searched_controls = problem.n_searched or 0
-            condition_controls = space.controls[n_searched_controls:]
-            self._input_space = replace(space, controls=condition_controls)
-        self._needs_new_light = self._find_light_conditions()[n_searched:]
+        self._input_space = self._select_input_space()
+        # coordinates of the conditions only, which follow the searched ones
+        self._needs_new_light = self._find_coordinates_of_light()[n_searched:]
+
+    def _find_moving_coordinates(self) -> Tensor:
+        """Return which searched coordinates move something, (d,) bool.
+
+        These are the stated `moving_coordinates`, or else those that move a camera or
+        change the environment.
+        """
+        n_searched = self.problem.domain.dim
+        if self.moving_coordinates is not None:
+            return torch.zeros(n_searched, dtype=torch.bool).index_fill_(
+                0, self.moving_coordinates, True
+            )
+        is_moving = self._find_coordinates(CAMERA_INPUTS | {ENVIRONMENT_INPUT})
+        # the searched coordinates come first, those of the conditions after them
+        return is_moving[:n_searched]
+
+    def _select_input_space(self) -> Space:
+        """Return the space of the controls whose scene inputs have to be computed.
+
+        Base colors are applied separately. So if nothing that is searched moves, these
+        are only the controls of the conditions, which come last.
+        """
+        space = self.problem.space
+        if self._has_moving:
+            return space
+        # `problem.n_searched` is None without conditions: then all controls count
+        n_searched_controls = self.problem.n_searched or 0
+        return replace(space, controls=space.controls[n_searched_controls:])
 
     def _find_coordinates(self, inputs: frozenset[str]) -> Tensor:
         """Return which coordinates of the full space change given inputs, (d,) bool.
@@ -190,7 +208,7 @@ class SurfaceLight(PredictedSearch):
             )
         return changes_inputs
 
-    def _find_light_conditions(self) -> Tensor:
+    def _find_coordinates_of_light(self) -> Tensor:
         """Return which coordinates of the full space need new light, (d,) bool.
 
         These are the coordinates that change the environment. If conditions vary, the
@@ -214,14 +232,15 @@ class SurfaceLight(PredictedSearch):
         """
         start = self.problem.make_full_configuration(self.problem.domain.start)
         fingerprints = []
-        # Any two different values in (0, 1) would do. 0 and 1 might switch the
-        # environment off.
+        # Any two different values in (0, 1) would do. At a bound of the range the
+        # environment might be black.
         for value in (0.3, 0.8):
             full_u = start.clone()
             full_u[group.coordinates] = value
             environment = self._compute_inputs(full_u)[ENVIRONMENT_INPUT]
             fingerprints.append(MapFingerprint.compute(environment))
         first_map, second_map = fingerprints
+        # the ratio is None if neither map is a multiple of the other
         return first_map.compute_map_ratio(second_map) is not None
 
     @property
@@ -252,9 +271,10 @@ class SurfaceLight(PredictedSearch):
             kind: kind of the search.
             evaluations: how many evaluations it has had.
         """
-        # The search "search" is the first. If it has given predictions up, all later
-        # ones are traced from their first evaluation on.
-        if "search" in self.first_traced and kind != "search":
+        # The search of kind "search" comes first. If it has given predictions up,
+        # images of all later ones are traced.
+        search_failed = "search" in self.first_traced
+        if search_failed and kind != "search":
             return 0
         return super().count_predicted(kind, evaluations)
 
@@ -280,9 +300,8 @@ class SurfaceLight(PredictedSearch):
             self._bank_conditions = self._sample_bank_conditions()
             for condition in self._bank_conditions:
                 inputs = self._compute_inputs(torch.cat([u, condition]))
-                self._renderer.get_light_and_factor(
-                    inputs
-                )  # computes it, and stores it
+                # only called to compute and store the light
+                self._renderer.get_light_and_factor(inputs)
                 # `N_LIGHTS` is the length of the progress bar (`n_samples`), also if
                 # there is a single condition
                 tick(N_LIGHTS // len(self._bank_conditions))
@@ -301,7 +320,7 @@ class SurfaceLight(PredictedSearch):
         if problem.conditions is None:
             return [torch.empty(0)]
         seed = seeds.derive_seed(problem.seed, "bank")
-        # If no coordinate of the conditions needs new light, one light serves all.
+        # If no coordinate of the conditions changes the light, one light serves all.
         n_conditions = N_LIGHTS if bool(self._needs_new_light.any()) else 1
         return [
             sample_condition(problem.conditions, index, seed)
@@ -327,14 +346,15 @@ class SurfaceLight(PredictedSearch):
 
         Args:
             queries: the queries.
-            trace: renders. From the first query that cannot be predicted on, it
-                evaluates all.
+            trace: evaluates queries by rendered images. It gets the first query that
+                cannot be predicted, and all that follow it.
         """
         # images of the latest batch, by the position of the query in `queries`
         predicted_images: dict[int, Tensor] = {}
         can_batch = self.problem.conditions is None and not self._searches_colors
         for position, query in enumerate(queries):
-            self.replay(query)  # compares predictions first, if that is due
+            # Compares predictions if that is due; they may be given up by this.
+            self.replay(query)
             if self._must_trace(query):
                 yield from trace(queries[position:])
                 return
@@ -352,8 +372,9 @@ class SurfaceLight(PredictedSearch):
         It has to if predictions were given up before it, or if its gradient takes
         differences of rendered images. A "free" gradient takes none.
         """
-        takes_differences = self.problem.domain.gradient_cost > 0
-        if query.gradient is True and takes_differences:
+        requests_all = query.gradient is True  # and not "free"
+        costs_renders = self.problem.domain.gradient_cost > 0
+        if requests_all and costs_renders:
             return True
         # number of predicted evaluations among the first ones, up to this query
         n_predicted = self.count_predicted(query.kind, query.row_index + 1)
@@ -361,10 +382,13 @@ class SurfaceLight(PredictedSearch):
         return not is_predicted
 
     def evaluate(self, query: Query, image: Tensor | None = None) -> Evaluation:
-        """Evaluate a query, with its image (H, W, 3) if that is predicted already.
+        """Evaluate a query by predicted images.
 
-        Without an image, a query of a search is evaluated by its mean over conditions.
-        If there are no conditions, that is a mean over a single image.
+        Args:
+            query: the query.
+            image: (H, W, 3) image of the query that is predicted already. Without it, a
+                query of a search is evaluated by its mean over conditions; if there are
+                no conditions, over a single image.
         """
         # a query of a search has a phase, "search" or "ranking"
         is_trial = query.phase is None
@@ -385,7 +409,9 @@ class SurfaceLight(PredictedSearch):
         """
         full_u = self.problem.make_full_configuration(query.u)
         with torch.no_grad():
-            rounded = round_to_8_bit(self.renderer(full_u) if image is None else image)
+            if image is None:
+                image = self.renderer(full_u)
+            rounded = round_to_8_bit(image)
         return Evaluation.from_judgement(
             self.problem.judge(rounded, full_u),
             cost=0,  # nothing is rendered
@@ -413,8 +439,8 @@ class SurfaceLight(PredictedSearch):
     def _evaluate_over_conditions(self, query: Query) -> Evaluation:
         """Evaluate a query of a search by its mean over conditions.
 
-        An image is predicted under each of the problem's `n_draws` conditions. An
-        image that the query requests shows the scene without random conditions.
+        An image is predicted under each of the `conditions_per_evaluation` conditions.
+        An image that the query requests shows the scene without random conditions.
         """
         problem = self.problem
         set_index = query.row_index
@@ -478,6 +504,7 @@ class SurfaceLight(PredictedSearch):
         conditions = []
         for position, new_condition in zip(positions, new_conditions, strict=True):
             stored_condition = self._bank_conditions[position]
+            # both are (k,), as `_needs_new_light` is
             condition = torch.where(
                 self._needs_new_light, stored_condition, new_condition
             )
@@ -487,11 +514,12 @@ class SurfaceLight(PredictedSearch):
     def _compute_inputs(self, full_u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a full configuration.
 
-        If no searched control moves anything, `_input_space` has only the controls of
-        the conditions. Then only their inputs are computed, without base colors.
+        `_input_space` has all controls. But if no searched control moves anything, it
+        has only those of the conditions. Then only their inputs are computed: those of
+        searched controls, which are base colors, are left out.
         """
         with torch.no_grad():
-            # the last coordinates of `full_u`, which may be all of them
+            # The coordinates of the conditions are the last ones of `full_u`.
             first = len(full_u) - len(self._input_space.start)
             inputs = self._input_space.inputs(full_u[first:])
             # completed by the inputs that nothing changes
@@ -515,7 +543,8 @@ class SurfaceLight(PredictedSearch):
         """
         # base colors, with a graph from u
         color = self.renderer.get_color(self.problem.searched_space.inputs(u))
-        # the same configurations, with a graph from u
+        # The same configurations with a graph from u, for controls that change the
+        # finished image, such as a blur.
         variable_configurations = [
             torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
         ]
@@ -547,7 +576,8 @@ class SurfaceLight(PredictedSearch):
         Args:
             query: the query that is evaluated next.
         """
-        # Other kinds, such as "baseline", and the ranking use what this search left.
+        # Other kinds, such as "baseline", and the ranking take the predictor as the
+        # search has left it.
         is_of_search = query.kind == "search" and query.phase == "search"
         predictions_failed = self.tracing_reason is not None
         next_comparison = self._next_comparison or COMPARISON_INTERVAL
@@ -564,6 +594,7 @@ class SurfaceLight(PredictedSearch):
         self._next_comparison = query.row_index + interval
         if is_accurate:
             return
+        # Without searched colors, nothing is done after a first failure.
         if not was_accurate:
             self.stop_predicting("search", query.row_index)
         elif self._searches_colors:
@@ -592,20 +623,20 @@ class SurfaceLight(PredictedSearch):
             generator = torch.Generator().manual_seed(seed)
             random_configurations = problem.domain.sample(generator, N_VIEWS)
             # (N_VIEWS, d): random in the moving coordinates, else u
-            configurations = torch.where(self._moving, random_configurations, u)
+            configurations = torch.where(self._is_moving, random_configurations, u)
             configurations[0] = u  # the first view is that of u itself
             conditions = self._choose_conditions(kind, index, N_VIEWS)
             full_configurations = [
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
             ]
-            # The margin may be off by a fraction of the change that the search has
-            # made. Random coordinates are no such change. If colors are not searched,
-            # only cameras and environments are, so that all coordinates count as
+            # The allowed error of the margin grows with the change that the search has
+            # made (`Problem.compare_view`). Random coordinates are no such change. If
+            # no colors are searched, all coordinates move something, and count as
             # random.
-            is_random = self._moving
+            is_random = self._is_moving
             if not self._searches_colors:
-                is_random = torch.ones_like(self._moving)
+                is_random = torch.ones_like(self._is_moving)
 
         def compare_view(number: int) -> ComparedView:
             """Compare the predicted image of a view with traced ones."""

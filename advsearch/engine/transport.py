@@ -47,8 +47,8 @@ from advsearch.scene.transport.matrix import ProgressCallback
 from advsearch.scene.window import Window
 
 MIN_STEPS = 16
-"""Smallest number of evaluations of a search for which the matrix pays. It costs as much
-as about 6 rendered evaluations with gradients (`benchmarks/transport.py`).
+"""Smallest number of evaluations of a search for which the matrix pays. It costs as
+much as about 6 rendered evaluations with gradients (`benchmarks/transport.py`).
 """
 # Smallest number of evaluations for each light for which basis images pay. A basis
 # image shows the scene under a single light; images under all lights are weighted sums.
@@ -81,7 +81,8 @@ def find_matrix_refusal(
             setting of this name).
     """
     if not specialise:
-        return Refusal("nothing is left out")
+        return Refusal("nothing is left out")  # which the user has set
+    # why the image is composed of several; "" if it is not
     if problem.renderer.composition_reason:
         return Refusal(problem.renderer.composition_reason)
     if steps is not None and steps < MIN_STEPS:
@@ -96,8 +97,9 @@ def find_matrix_refusal(
     refusal = find_refusal(problem.renderer, condition_names)
     if refusal is not None:
         return refusal
-    # What remains is whether basis images of lights pay. They are not used under
-    # conditions, and they pay if any number of steps may follow.
+    # If lights are searched, an image of each light (basis image) takes the place of a
+    # matrix. It remains to check whether these pay. They are not used under conditions,
+    # and they pay if any number of steps may follow.
     if problem.conditions is not None or steps is None:
         return None
     # an image is rendered for each light before the first prediction
@@ -203,7 +205,10 @@ class PredictedSearch(ABC):
     ) -> Iterator[Evaluation]:
         """Evaluate queries of a search lazily.
 
-        `trace` evaluates queries whose images can't be predicted.
+        Args:
+            queries: the queries.
+            trace: evaluates queries by rendered images. A subclass may use it for those
+                that it can't predict; here `evaluate` renders their images itself.
         """
         return map(self.evaluate, queries)
 
@@ -239,8 +244,8 @@ class PredictedSearch(ABC):
 
     @abstractmethod
     def count_entries_and_bytes(self) -> tuple[int, int]:
-        """Return the number of entries of the matrices, for one color channel, and their
-        size in bytes.
+        """Return the number of entries of the matrices, for one color channel, and
+        their size in bytes.
         """
 
     def summarize_conditions(self) -> BankOfConditions | None:
@@ -302,7 +307,7 @@ class PredictedSearch(ABC):
         self.seconds += time.perf_counter() - started
 
     def summarize(self) -> LinearTransport:
-        """Return the summary of the predictor that a result stores.
+        """Return the summary of the predictor, of any method, that a result stores.
 
         A predictor was used even if predictions were given up later; `reason` then says
         why.
@@ -376,7 +381,8 @@ class Transport(PredictedSearch):
                 self._full_images["start"] = windowing.start_image
                 self.n_traced += N_WINDOW_IMAGES  # those of `find_window`
             self._is_prepared = True
-        # `clean_matrix` may be shared with another search that has computed it.
+        # `clean_matrix` has predictors by window (None for full images). It may be
+        # shared with another search, which has computed this one.
         if self.window not in self.clean_matrix.predictors:
             predictor = self._make_predictor(
                 self.problem.domain.start,
@@ -411,7 +417,8 @@ class Transport(PredictedSearch):
             u: (d,) the configuration.
             kind: kind of the search.
             number: index of its query, for the seed.
-            tick: called with the samples that were traced.
+            tick: called with the samples that were traced for the predictor, without
+                those of the surroundings.
         """
         with self.measure_seconds():
             seed = seeds.derive_seed(self.problem.seed, f"transport {kind}", number)
@@ -431,7 +438,8 @@ class Transport(PredictedSearch):
 
         None if there is no window, or the search ended with full images.
         """
-        if self.window is None or kind in self.first_traced:
+        ended_with_full_images = kind in self.first_traced
+        if self.window is None or ended_with_full_images:
             return None
         predictor = self._current.get(kind, self.clean_predictor)
         return self.problem.renderer.copy_with(crop=predictor.path_renderer.crop)
@@ -445,7 +453,7 @@ class Transport(PredictedSearch):
         It is traced if predictions were given up, and in the ranking after the search.
         """
         predictor = self._update_predictor(query)
-        if predictor is None:
+        if predictor is None:  # its image has to be traced
             return self.problem.evaluate(query)
         evaluation, _ = self.problem.evaluate_full(
             query, query.u, query.seed, predictor.renderer
@@ -474,7 +482,8 @@ class Transport(PredictedSearch):
         if not is_due or not kind.startswith("search"):
             return predictor
         deviation = self._compare_predictor(predictor, query)
-        # also if the predictor is rejected: the full image is needed for the next one
+        # Also compared if the predictor is rejected, since the next one needs the full
+        # image.
         has_same_surroundings, full_image = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
@@ -499,6 +508,7 @@ class Transport(PredictedSearch):
         seed = seeds.derive_seed(self.problem.seed, "transport check", query.row_index)
         renderer = self.problem.renderer
         if self.window is not None:
+            # the window, with the surroundings into which the predictor pastes it
             renderer = renderer.copy_with(crop=predictor.path_renderer.crop)
         return self.compare(
             lambda view: self.problem.compare_view(

@@ -132,7 +132,7 @@ class Verifier:
         evaluate = None
         if predictor is not None:
             evaluate = partial(predictor.evaluate_all, trace=self.journal.evaluator)
-        if not self.has_success:
+        if not self.has_success:  # then no row has a success
             queries = [replace(query, has_success=False) for query in queries]
         evaluations = self.journal.evaluate_all(queries, evaluate)
         for query, evaluation in zip(queries, evaluations, strict=True):
@@ -173,7 +173,7 @@ class Verifier:
         if has_conditions:
             choose: Callable[..., SampleCount] = choose_rate_spp
             if not is_set_by_user:
-                ladder = self._condition_ladder(len(candidates), search_samples)
+                ladder = self._list_affordable_counts(len(candidates), search_samples)
             max_samples = N_CONDITIONS * len(candidates) * sum(ladder)
         else:
             choose = partial(choose_spp, trials=n_trials_of_first_look)
@@ -212,7 +212,7 @@ class Verifier:
             at_most=True,
         )
 
-    def _condition_ladder(
+    def _list_affordable_counts(
         self, n_candidates: int, search_samples: int | None
     ) -> Sequence[int]:
         """Return the sample counts to choose from if conditions vary.
@@ -236,11 +236,12 @@ class Verifier:
         They have the same seeds as those of the adversarial configuration. If they were
         run at this sample count already, nothing is done.
 
-        They may be run twice. If the model seems to be wrong about the clean scene, a
-        first group is run before the search, to confirm that. If it was not wrong, the
-        sample count is chosen again after the search, and may differ. Then a second
-        group is run. The rows of both have different kinds.
+        There may be two groups. If the model seems to be wrong about the clean scene, a
+        first group is run before the search, to confirm that. If this shows that the
+        model is right, the search is run. After it the sample count is chosen again. If
+        it differs, a second group is run. The rows of both have different kinds.
         """
+        # at this sample count
         if self.has_clean_trials:
             return
         self._clean_spp = self.run_state.spp
@@ -294,7 +295,7 @@ class Verifier:
             claim=result.ending,  # an ending of FOUND claims a failure
             spp=self.run_state.spp,
             seed=self.problem.seed,
-            trials=self.look_sizes,
+            trials=self.look_sizes,  # numbers of trials after which there is a look
             clean=clean_trials,
             rule=self.problem.verification_rule,
             kind=kind,
@@ -374,7 +375,7 @@ class Verifier:
             )
 
     def try_random(self, n_trials: int) -> None:
-        """Try random configurations, to measure how often the model is wrong.
+        """Try random configurations: how often is the model wrong on average?
 
         Each is sampled at random from the domain of the search.
         """
@@ -489,6 +490,7 @@ class Retrials:
             )
             for condition in conditions
         }
+        # clean trials by the name of their condition
         self._clean: dict[str, tuple[Judgement, ...]] = {}
         # Cached images and radiances. A key is (`image_key` or `radiance_key`, seed,
         # samples per pixel).
@@ -496,7 +498,8 @@ class Retrials:
         self._radiances: dict[tuple[Hashable, int, int], Tensor] = {}
         # kind of the trials whose images and radiances are cached
         self._cached_kind = ""
-        # number of conditions by `radiance_key`; a radiance is shared if it is over 1
+        # Number of conditions by `radiance_key`. If there are several, they share the
+        # radiance.
         self._n_conditions_of_radiance = Counter(
             condition.radiance_key
             for condition in conditions
@@ -522,8 +525,8 @@ class Retrials:
         """Try a configuration under one condition, compared with the clean scene.
 
         The search was run under other conditions, so that it claims nothing about this
-        one: its ending is passed on as NOT_VERIFIED. Only success rates are compared.
-        The rows have the kind "KIND under CONDITION".
+        one. So NOT_VERIFIED stands for the ending of the search, and only success rates
+        are compared. The rows have the kind "KIND under CONDITION".
 
         Args:
             kind: kind of the trials, such as "verification".
@@ -579,6 +582,7 @@ class Retrials:
             self._images.clear()
             self._radiances.clear()
             self._cached_kind = kind
+        # In the cache of one kind, a seed belongs to one configuration.
         keys = [(condition.image_key, query.seed, condition.spp) for query in queries]
         missing = [
             replace(query, requested_output="picture")
@@ -591,11 +595,12 @@ class Retrials:
             machine = None  # name of the worker's machine, if one rendered the image
             if key not in self._images:
                 rendered = next(from_workers, None)
-                if rendered is None or rendered.picture is None:
+                if rendered is None or rendered.picture is None:  # not by a worker
                     self._images[key] = self._render(condition, query.u, query.seed)
                 else:
                     self._images[key] = rendered.picture
                     machine = rendered.machine
+            # with the change of the image that belongs to the condition
             judgement = self._judge_changed(condition, self._images[key], query)
             yield Evaluation.from_judgement(judgement, machine=machine)
 
@@ -614,8 +619,9 @@ class Retrials:
     ) -> Iterator[Evaluation]:
         """Return an iterator over images of queries, rendered by workers.
 
-        It is empty without workers, and for a single query: its image is rendered in
-        this process, where conditions can share its radiance.
+        It is empty if the caller has to render the images in this process. That is the
+        case without workers, and for a single query, whose radiance may be cached here
+        for other conditions (`_render`).
 
         Args:
             condition: condition of the trials.
@@ -638,7 +644,7 @@ class Retrials:
             seed: seed of the noise and of random conditions.
         """
         problem = condition.problem
-        # The count of a key of None is 0.
+        # 0 if the key is None, as these are not counted
         n_conditions = self._n_conditions_of_radiance[condition.radiance_key]
         is_radiance_shared = n_conditions >= 2
         if not is_radiance_shared:

@@ -36,8 +36,8 @@ from advsearch.scene.window import Window
 MIN_STEPS = 16  # smallest number of evaluations of a search for which a crop pays
 MAX_AREA = 0.3  # area of the largest window that pays, as a fraction of the image
 MAX_LEVELS = 0.1
-"""Allowed difference outside of the window, in levels of 255. It is the root mean square
-of the mean differences over squares of `SQUARE` pixels.
+"""Allowed difference outside of the window, in levels of 255. It is the root mean
+square of the mean differences over squares of `SQUARE` pixels.
 """
 SQUARE = 8  # side of these squares in pixels
 MARGINS = (8, 16, 24, 32, 48, 64, 96, 128)  # pixels around the box, smallest first
@@ -86,7 +86,8 @@ class Windowing:
 def find_window(problem: Problem) -> Windowing | Refusal:
     """Return the smallest window outside of which a search changes little.
 
-    The box around what is searched is grown by each of `MARGINS` in turn. A window is
+    The box around what is searched is grown by each of `MARGINS`, in pixels, in turn. A
+    window is
     accepted if the images of three configurations look alike outside of it: the start,
     and the smallest and the largest allowed values of all coordinates. These are
     `N_WINDOW_IMAGES` full images of few samples.
@@ -119,7 +120,7 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         deviation = measure_outside(problem, window, start, extremes)
         if deviation.is_accepted:
             return Windowing(window, start, deviation)
-    return Refusal(f"its surroundings change with it: {_describe(deviation)}")
+    return Refusal(f"its surroundings change with it: {_describe_excess(deviation)}")
 
 
 def find_crop_refusal(problem: Problem) -> Refusal | None:
@@ -140,10 +141,11 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
         )
     if renderer.scene.is_volumetric:
         return HAZE
-    definition, *_ = renderer.scene.description_and_filter
-    if definition.camera_model is not None:
+    description, _filter = renderer.scene.description_and_filter
+    if description.camera_model is not None:
         return Refusal("the camera has a lens of its own")
-    if renderer.formation.denoiser != "oidn":
+    is_denoised = renderer.formation.denoiser == "oidn"
+    if not is_denoised:
         return NOISE
     return find_searched_refusal(problem)
 
@@ -153,8 +155,8 @@ def find_searched_refusal(problem: Problem) -> Refusal | None:
 
     It does not if surfaces of meshes are searched, such as a texture, and the meshes
     stay where they are. Then the image changes where the meshes are visible. Lights
-    and moving things change it elsewhere. If nothing is searched that needs rays, as a
-    blur of the finished image, there is no part to trace, which is a refusal as well.
+    and moving things change it elsewhere. If all that is searched changes the finished
+    image, such as a blur, no part has to be traced, which is a refusal as well.
     """
     light_inputs = find_light_inputs(problem.renderer)
     input_names = find_searched_inputs(problem)  # such as "mug.bsdf.reflectance"
@@ -167,7 +169,8 @@ def find_searched_refusal(problem: Problem) -> Refusal | None:
             return Refusal(f"{part} is light, which shows everywhere")
         if name.endswith(MOVING_SUFFIXES):
             return Refusal(f"{part} moves")
-        if part not in mesh_names:
+        is_mesh = part in mesh_names  # only a mesh has a place in the image
+        if not is_mesh:
             return Refusal(f"{part} shows in more than a part of the picture")
     return None
 
@@ -179,7 +182,7 @@ def find_searched_inputs(problem: Problem) -> frozenset[str]:
 
 
 def _find_box(problem: Problem) -> Window | None:
-    """Return the box around all searched meshes at the start; None if none is visible."""
+    """Return the box of all searched meshes at the start; None if none is visible."""
     surfaces = problem.renderer.find_surfaces(problem.domain.start)
     mask = torch.zeros(problem.renderer.formation.resolution, dtype=torch.bool)
     for name in find_searched_inputs(problem):
@@ -190,8 +193,8 @@ def _find_box(problem: Problem) -> Window | None:
 def render_full(problem: Problem, u: Tensor) -> FullImage:
     """Render the full image of a configuration, to compare it with that of another.
 
-    It is traced twice with independent noise (`halves`); `radiance` is the denoised
-    mean of both. The two seeds are the same for every u, so that most of the noise
+    It is traced twice with independent noise (the two halves), and the mean of both is
+    denoised. The two seeds are the same for every u, so that most of the noise
     cancels in the difference of two images.
 
     Args:
@@ -208,7 +211,7 @@ def render_full(problem: Problem, u: Tensor) -> FullImage:
         halves, radiance = renderer.trace_independent_radiances(
             _compute_inputs(problem, u), noise_seed, PROBE_SPP
         )
-    return FullImage(u.detach().clone(), halves, radiance)
+    return FullImage(u.detach().clone(), independent_renders=halves, radiance=radiance)
 
 
 def _compute_inputs(problem: Problem, u: Tensor) -> dict[str, Tensor]:
@@ -232,6 +235,7 @@ def measure_outside(
     margin_changes = []
     for image in others:
         squared_differences.append(_measure_square(problem, window, before, image))
+        # error of the margin by pasting, and change of the margin by the search
         bias, change = _measure_margin(problem, window, before, image)
         margin_biases.append(bias)
         margin_changes.append(change)
@@ -243,7 +247,7 @@ def measure_outside(
         levels=math.sqrt(max(0.0, sum(squared_differences) / count)),
         margin_bias=sum(margin_biases) / count,  # mean error of the margin
         allowed_levels=MAX_LEVELS,
-        n_traced=count,
+        n_traced=count,  # full images
         allowed_margin_bias=allowed_bias,
     )
 
@@ -284,7 +288,8 @@ def _measure_square(
         difference_sums.append(_sum_over_squares(levels))
     # number of pixels outside of the window in each square, (1, 1, h, w)
     n_pixels = _sum_over_squares(outside)
-    # mean * mean * n_pixels in each square; the sums are each n_pixels times a mean
+    # A sum over a square is n_pixels times a mean. The product of both means is
+    # weighted by the number of pixels: mean * mean * n_pixels = sum * sum / n_pixels.
     first_sum, second_sum = difference_sums
     products = first_sum * second_sum / n_pixels.clamp_min(1.0)
     n_channels = 3.0
@@ -311,12 +316,13 @@ def _compute_slope(problem: Problem, image: FullImage) -> Tensor:
     displayed pixel depends on its own radiance, so that the gradient of the sum has the
     derivative of each pixel.
     """
-    radiance = image.radiance.clone()
+    radiance = image.radiance.clone()  # (H, W, 3), or 4 with coverage
     inputs = _compute_inputs(problem, image.u)
     renderer = problem.renderer
     with torch.enable_grad():
         radiance.requires_grad_()
-        # the two steps of displaying an image, without rounding
+        # The two steps of displaying an image, without rounding. First exposure and
+        # backdrop are applied, then the tone curve.
         linear = renderer.finish_image(radiance, inputs, image.u, display=False)
         displayed = renderer.formation.map_to_display(linear)
         (slope,) = torch.autograd.grad(displayed.sum(), radiance)
@@ -353,7 +359,7 @@ def _compute_margin(problem: Problem, radiance: Tensor, u: Tensor) -> float:
         return problem.judge(image, u).margin
 
 
-def _describe(deviation: Deviation) -> str:
+def _describe_excess(deviation: Deviation) -> str:
     """Return by how much a rejected deviation exceeds its limit, for a sentence."""
     has_accepted_levels = deviation.levels_fraction <= ACCEPTED_FRACTION
     if not has_accepted_levels:

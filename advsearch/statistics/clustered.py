@@ -227,7 +227,8 @@ def _paired_p_value(unit_advantage: FloatArray) -> float:
 def _compare_independent_rows(
     first: npt.NDArray[np.bool_], second: npt.NDArray[np.bool_]
 ) -> tuple[float, tuple[float, float], float]:
-    """Compare two outcomes of independent rows by Newcombe's interval and McNemar's test.
+    """Compare two outcomes of independent rows by Newcombe's interval and McNemar's
+    test.
 
     Args:
         first, second: (n,) bool, whether each outcome happens.
@@ -292,7 +293,7 @@ def one_sided_p_value(
             round(copies * float(right_outside.sum())),
             round(copies * float(rows_outside.sum())),
         )
-    # by unit; a unit may have predictions on both sides
+    # By unit. A unit that has predictions on both sides is cut by the rule.
     has_inside = rows_inside > 0.0
     has_outside = rows_outside > 0.0
     is_cut = bool((has_inside & has_outside).any())
@@ -305,6 +306,7 @@ def one_sided_p_value(
             n_right_inside=copies * float(right_inside.sum()),
             times=copies,
         )
+    # The bets are on wrong predictions inside, and on right ones outside.
     wrong_rate_inside = _divide_or_zero(rows_inside - right_inside, rows_inside)
     right_rate_outside = _divide_or_zero(right_outside, rows_outside)
     rates = np.stack(
@@ -395,23 +397,35 @@ def _betting_p_value(rates: FloatArray, *, is_cut: bool, times: float) -> float:
     """
     # units with equal rates are counted, and computed once
     distinct_rates, n_units = np.unique(rates, axis=0, return_counts=True)
-    # columns (distinct, 1), which broadcast with the (m,) null rates to (distinct, m)
-    wrong_inside, has_inside, right_outside, has_outside = (
-        column[:, None] for column in distinct_rates.T
-    )
-    # Gain of a stake of 1. It is 0 on average if the rate of right predictions is m,
-    # and so that of wrong ones 1 - m. A side without predictions gains 0.
-    gain_inside = wrong_inside / (1.0 - NULL_RATES) - has_inside
-    gains = gain_inside + right_outside / NULL_RATES - has_outside
+    gains = _compute_gains(distinct_rates)
     stake_fraction = 0.5 if is_cut else 1.0
     gains = stake_fraction * gains
     log_capitals = []  # (m,) for each stake
     with np.errstate(divide="ignore"):  # the logarithm of a lost capital is -inf
         for stake in STAKES:
             log_factors = np.log(np.maximum(1.0 + stake * gains, 0.0))
+            # over all units, and `times` copies of each
             log_capitals.append(times * (n_units[:, None] * log_factors).sum(axis=0))
     # (m,) the capital is the mean over stakes
     log_capital_of_rate = np.logaddexp.reduce(log_capitals, axis=0)
     log_capital_of_rate = log_capital_of_rate - np.log(len(STAKES))
     smallest_log_capital = log_capital_of_rate.min()
     return float(min(1.0, np.exp(-smallest_log_capital)))
+
+
+def _compute_gains(rates: FloatArray) -> FloatArray:
+    """Return the gains of units from a stake of 1 on each side, (n, m).
+
+    They are for each of the m `NULL_RATES`. `rates` (n, 4) is as in `_betting_p_value`.
+    """
+    # columns (n, 1), which broadcast with the (m,) null rates to (n, m)
+    wrong_inside, has_inside, right_outside, has_outside = (
+        column[:, None] for column in rates.T
+    )
+    # Gain of a stake of 1 on each side: what is won, minus the stake. It is 0 on
+    # average if the rate of right predictions is m, and so that of wrong ones 1 - m. On
+    # a side without predictions there is neither stake nor gain.
+    gain_inside = wrong_inside / (1.0 - NULL_RATES) - has_inside
+    # not by a `gain_outside`, as the order of the sum determines the last bits
+    gains: FloatArray = gain_inside + right_outside / NULL_RATES - has_outside
+    return gains

@@ -1,4 +1,4 @@
-"""Rates that fall along an axis: isotonic fit, and a test for places where they rise."""
+"""Rates that fall along an axis: isotonic fit, and a test of places where they rise."""
 
 from __future__ import annotations
 
@@ -73,8 +73,6 @@ def find_dips(
     Returns:
         At most one dip for each distance, the nearest first.
     """
-    from scipy.stats import hypergeom  # takes half a second
-
     n_distances = len(distances)
     n_comparisons = n_distances * (n_distances - 1) / 2.0
     # sums over the distances before each index
@@ -82,18 +80,13 @@ def find_dips(
     counts_before = np.concatenate([[0], np.cumsum(counts)])
     dips = []
     for near in range(n_distances - 1):
-        # Every range that begins right behind this distance, by the index after its
-        # last distance.
+        # Every range that begins right behind this distance, by its end: the index
+        # after its last distance.
         end = np.arange(near + 2, n_distances + 1)
         right_beyond = right_before[end] - right_before[near + 1]
         counts_beyond = counts_before[end] - counts_before[near + 1]
-        # the probability of as few right images here, if chance decides which of the
-        # images here and beyond are right
-        p_values = hypergeom.cdf(
-            right[near],
-            counts_beyond + counts[near],
-            right_beyond + right[near],
-            counts[near],
+        p_values = _compute_p_values(
+            right[near], counts[near], right_beyond, counts_beyond
         )
         is_dip = right[near] / counts[near] < right_beyond / counts_beyond
         if not is_dip.any():
@@ -103,9 +96,38 @@ def find_dips(
         dip = Dip(
             distance=float(distances[near]),
             counts=(int(right[near]), int(counts[near])),
+            # last distance of the range: `best` counts from the one behind `near`
             until=float(distances[near + 1 + best]),
             counts_beyond=(int(right_beyond[best]), int(counts_beyond[best])),
             p_value=min(1.0, float(p_values[best]) * n_comparisons),
         )
         dips.append(dip)
     return tuple(dips)
+
+
+def _compute_p_values(
+    n_right: np.int64,
+    n_images: np.int64,
+    right_beyond: NDArray[np.int64],
+    counts_beyond: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return the p-values (r,) of as few right images here, by Fisher's exact test.
+
+    It is the probability of as few, if chance decides which of the images here and
+    beyond are right.
+
+    Args:
+        n_right: number of images with a right prediction at a distance.
+        n_images: number of images there.
+        right_beyond: (r,) right predictions in each of r ranges of distances beyond.
+        counts_beyond: (r,) number of images in each range.
+    """
+    from scipy.stats import hypergeom  # takes half a second
+
+    p_values: NDArray[np.float64] = hypergeom.cdf(
+        n_right,
+        counts_beyond + n_images,  # images here and beyond
+        right_beyond + n_right,  # those that are right
+        n_images,
+    )
+    return p_values

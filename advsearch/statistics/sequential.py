@@ -48,7 +48,7 @@ each with one of these stakes. Large stakes decide soon if nearly all samples ag
 
 @dataclass
 class ConfidenceSequence:
-    """Samples in [0, 1], and an interval of their mean that is valid after each of them.
+    """Samples in [0, 1], and an interval of their mean that is valid after each one.
 
     So sampling may stop as soon as the interval decides a question.
 
@@ -103,11 +103,11 @@ class ConfidenceSequence:
         return sum(value * count for value, count in self._counts.items()) / self.count
 
     def is_over(self, mean: float) -> bool:
-        """Return whether the samples show that the true mean exceeds `mean`, in (0, 1)."""
+        """Return whether samples show that the true mean exceeds `mean`, in (0, 1)."""
         return self._has_won(mean, self._counts)
 
     def is_under(self, mean: float) -> bool:
-        """Return whether the samples show that the true mean is below `mean`, in (0, 1)."""
+        """Return whether samples show that the true mean is below `mean`, in (0, 1)."""
         mirrored = {1.0 - value: count for value, count in self._counts.items()}
         return self._has_won(1.0 - mean, mirrored)
 
@@ -125,7 +125,7 @@ class ConfidenceSequence:
         return lower, upper
 
     def _has_won(self, mean: float, counts: Mapping[float, int]) -> bool:
-        """Return whether bets on "more than `mean`" have gained more than chance allows.
+        """Return whether bets on "more than `mean`" gained more than chance allows.
 
         If `mean` is the true mean, the capital reaches the threshold with a probability
         of at most 1 - confidence, divided by the number of sides (Ville's inequality).

@@ -117,6 +117,7 @@ class ArchiveState:
         count, dim = samples.shape
         first, second = self._sample_parents(count)
         noise = torch.randn(count, dim, generator=rng)
+        # The noise is larger in the parameters that span the archive.
         noise[:, self.measure_indices] *= MEASURE_SIGMA_FACTOR
         # (n, 1) fraction of the way from the first parent to the second
         line_fraction = LINE_SIGMA * torch.randn(count, 1, generator=rng)
@@ -125,7 +126,8 @@ class ArchiveState:
         )
         is_resampled = torch.rand(count, dim, generator=rng) < RESAMPLED_FRACTION
         for block, part in self.domain.list_block_slices():
-            if block.n_options:
+            is_choice = block.n_options > 0
+            if is_choice:
                 offspring[:, part] = torch.where(
                     is_resampled[:, part], samples[:, part], first[:, part]
                 )
@@ -162,6 +164,7 @@ class ArchiveState:
             count: number of candidates to return.
         """
         mean, deviation = surrogate.predict(surrogate.box.from_configuration(points))
+        # objectives of the cells that have a failure, and a threshold for all others
         failed_objective_of_cell, threshold = self._find_objectives_to_beat()
         measures = points[:, self.measure_indices].double().numpy()
         cells = self.archive.index_of(measures).tolist()
@@ -261,7 +264,8 @@ def _make_candidates(
     n_any_cell = int(ANY_CELL_FRACTION * N_CANDIDATES)
     measures = state.measure_indices
     offspring[:n_any_cell, measures] = samples[:n_any_cell, measures]
-    # Points of the unit box are moved into the bounds, then converted back.
+    # `normalize` moves points into the unit box, and choices to the center of an
+    # option.
     x = box.normalize((offspring - box.low) / box.width)
     return box.to_configuration(offspring, x)
 
@@ -269,7 +273,9 @@ def _make_candidates(
 def _make_archive(
     domain: policies.Domain, measure_indices: Tensor, dims: Sequence[int], seed: int
 ) -> Any:
-    """Return an empty archive of ribs: a grid over the ranges of some parameters.
+    """Return an empty archive of the package ribs: a grid over some parameters' ranges.
+
+    ribs calls these parameters measures.
 
     Args:
         domain: domain of the search.
@@ -289,6 +295,7 @@ def _make_archive(
         solution_dtype=np.float32,
         objective_dtype=np.float64,
         measures_dtype=np.float64,
+        # each cell also has a flag: whether the model was wrong
         extra_fields={"wrong": ((), np.bool_)},
     )
 
@@ -300,7 +307,8 @@ def _make_observations(domain: policies.Domain) -> policies.Observations | None:
     """
     box = policies.find_box_coordinates(domain)
     has_norm_balls = box.count < domain.dim
-    if has_norm_balls or domain.dim > policies.MAX_SCALED_DIM:
+    has_too_many_numbers = domain.dim > policies.MAX_SCALED_DIM
+    if has_norm_balls or has_too_many_numbers:
         return None
     return policies.Observations(box, torch.empty(0, box.count), memory=MEMORY)
 
@@ -448,12 +456,12 @@ class MapElites(Policy[ArchiveState]):
         The evaluations of the current generation are counted as well, even if it is not
         complete yet.
         """
-        archive = state.add_generation().archive
+        archive = state.add_generation().archive  # with the current generation
         measure_indices = tuple(state.measure_indices.tolist())
         # one row for each cell that stores a configuration
         elites = archive.data()
         failed_rows = np.flatnonzero(elites["wrong"])
-        # Below, everything has one entry for each cell with a failure.
+        # Each array below has one entry for each cell with a failure.
         configurations = elites["solution"][failed_rows]
         objectives = elites["objective"][failed_rows].tolist()
         grid_indices = archive.int_to_grid_index(elites["index"][failed_rows])
@@ -500,7 +508,7 @@ class MapElites(Policy[ArchiveState]):
         random_points = samples[:n_random]
         observations = state.observations
         if observations is None:
-            # The other samples supply new options for choices of the offspring.
+            # Offspring may get new options for their choices from the other samples.
             offspring = [
                 domain.project(u) for u in state.make_offspring(samples[n_random:], rng)
             ]

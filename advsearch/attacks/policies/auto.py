@@ -110,10 +110,10 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
     """Divide the renders of a search among its three phases.
 
     The phases are a screen of evenly spread points, a surrogate (Gaussian process), and
-    a gradient ascent. Box coordinates are numbers and choices in no norm ball. Without
-    them there is only the ascent. With norm balls as well, there always is an ascent.
-    With box coordinates alone, there is one only if gradients are cheap enough
-    (`MIN_DERIVATIVES_PER_RENDER`).
+    a gradient ascent. Box coordinates are numbers and choices that do not belong to a
+    norm ball. Without them there is only the ascent. With norm balls as well, there
+    always is an ascent. With box coordinates alone, there is one only if gradients are
+    cheap enough (`MIN_DERIVATIVES_PER_RENDER`).
 
     Args:
         domain: domain of the search.
@@ -124,7 +124,7 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
         return BudgetPlan(steps, screen=0, ascent_start=0, gradient=True)
     has_norm_balls = box.count < domain.dim
     if has_norm_balls:
-        # Elements whose gradient costs renders can be left out of it ("free").
+        # A "free" gradient leaves out the elements whose derivatives cost renders.
         can_avoid_cost = domain.gradient_cost > 0 and domain.partial_gradients
         return BudgetPlan(
             steps,
@@ -166,9 +166,10 @@ def _plan_box_ascent(box: BoxCoordinates, steps: int) -> BudgetPlan:
     n_numbers = _count_numbers(box)
     shortening = min(1.0, LOW_DIM / max(n_numbers, 1))
     screen = math.ceil(SCREEN_FRACTION * steps * shortening)
-    ascent_start = screen
     if n_numbers <= LOW_DIM:
         ascent_start = math.ceil(ASCENT_START * steps)
+    else:
+        ascent_start = screen  # directly after the screen
     return BudgetPlan(steps, screen, ascent_start, gradient=True)
 
 
@@ -255,8 +256,9 @@ class Auto(Policy[AutoState]):
     ) -> AutoState:
         """Divide the renders among the phases, and start the first one.
 
-        That is the screen: evenly spread points of the box coordinates (numbers and
-        choices in no norm ball). Without box coordinates it is the gradient ascent.
+        That is the screen: evenly spread points of the box coordinates. These are the
+        numbers and choices that do not belong to a norm ball. Without box coordinates
+        the first phase is the gradient ascent.
 
         Args:
             domain: domain of the search.
@@ -299,8 +301,8 @@ class Auto(Policy[AutoState]):
             with limit_to_single_thread():
                 state = self._begin_ascent(state)
         if state.ascent is not None:
-            # `_make_pgd` only reads whether the domain has noise. The domain that the
-            # ascent searches is part of its own state.
+            # This domain only tells whether evaluations have noise. The ascent has its
+            # own domain, with shorter steps, in its state.
             steps, ascent = _make_pgd(state.domain).propose(state.ascent, n)
             if steps:
                 (proposal,) = steps
@@ -327,7 +329,8 @@ class Auto(Policy[AutoState]):
         points = []
         if n_observed == 0:
             points.append(state.domain.initial_point)
-        # The initial point is evaluated first, and is not one of `state.screen`.
+        # All earlier proposals are evaluated. The initial point was the first of them,
+        # and is not one of `state.screen`.
         n_screened = max(0, n_observed - 1)
         next_points = state.screen[n_screened:]
         n_requested = n - len(points)
@@ -339,9 +342,9 @@ class Auto(Policy[AutoState]):
     ) -> tuple[tuple[Proposal, ...], AutoState]:
         """Propose a step of the ascent, with the gradient of the plan.
 
-        If only the norm balls have a gradient ("free"), every second step also moves
-        the box coordinates at random. `_update_ascent` takes the move back if the
-        objective falls.
+        The plan may request a "free" gradient, that of the norm balls only. Then every
+        second step also moves the box coordinates at random. `_update_ascent` takes the
+        move back if the objective falls.
 
         Args:
             state: state of the search.
@@ -350,13 +353,13 @@ class Auto(Policy[AutoState]):
         """
         proposal = replace(proposal, gradient=state.plan.gradient)
         state = replace(state, is_climbing=True)
-        has_full_gradient = proposal.gradient is True
+        has_full_gradient = proposal.gradient is True  # not "free"
         moves_box = not has_full_gradient and count % 2 == 1  # every second step
         if not moves_box:
             return (proposal,), state
         box = state.box
         x = box.from_configuration(proposal.u)
-        # The surrogate draws with numbers below `plan.steps`, so these are new.
+        # The surrogate draws with numbers below `plan.steps`, so that this one is new.
         rng = seeded(state.seed, state.plan.steps + count)
         moved_x = box.sample_moves(x[None], rng)[0]
         u = state.domain.project(box.to_configuration(proposal.u, moved_x))
@@ -378,7 +381,8 @@ class Auto(Policy[AutoState]):
 
         If the step also moved the box coordinates at random, and the objective fell
         since the evaluation before, that move is taken back. Norm balls keep their
-        step. The next objective is compared with this one in any case.
+        step. The next step is compared with this evaluation, even if its move was taken
+        back.
         """
         ((_, evaluation),) = evaluated  # an ascent proposes one at a time
         # After this, `ascent.u` is the configuration of the next step.
@@ -437,7 +441,7 @@ class Auto(Policy[AutoState]):
         if state.observations.has_finite:
             surrogate, observations = state.observations.fit_surrogate()
             state = replace(state, observations=observations)
-            observed_points = surrogate.x
+            observed_points = surrogate.x  # those to which it was fitted
             mean, _ = surrogate.predict(observed_points)
             x = observed_points[int(mean.argmax())]
         ascent_blocks = []

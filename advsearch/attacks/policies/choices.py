@@ -53,6 +53,12 @@ class Runner:
     best_objective: float = -math.inf
     is_over: bool = False
 
+    def propose(self, limit: int) -> tuple[tuple[Proposal, ...], Runner]:
+        """Return at most `limit` proposals, and the search in the state after them."""
+        n = min(limit, self.renders_left)
+        proposals, state = self.policy.propose(self.state, n)
+        return proposals, replace(self, state=state)
+
     def charge(self, proposal: Proposal) -> Runner:
         """Return the search after it has paid for one of its proposals."""
         cost = proposal.max_cost(self.domain)
@@ -94,14 +100,15 @@ class Race:
             range(len(self.runners)), key=lambda k: self.runners[k].best_objective
         )
 
-    def begin_round(self: Racing, field: Iterable[int], number: int) -> Racing:
+    def begin_round(self: Racing, runners_left: Iterable[int], number: int) -> Racing:
         """Return the race at the beginning of a round.
 
         Args:
-            field: indices of the searches that take part; they get equal renders.
+            runners_left: indices of the searches that take part; they get equal
+                renders.
             number: index of the round.
         """
-        active_runners = tuple(field)
+        active_runners = tuple(runners_left)
         rounds_left = self.n_rounds - number
         renders_of_round = (self.steps - self.renders_spent) // rounds_left
         renders_each = max(1, renders_of_round // len(active_runners))
@@ -136,15 +143,12 @@ class Race:
             k = max(waiting, key=lambda index: runners[index].renders_left)
             proposer = runners[k]
             if k not in proposals:
-                proposals[k], state = proposer.policy.propose(
-                    proposer.state, min(max_proposals, proposer.renders_left)
-                )
-                # `charge` below stores it in `runners`. A search without a proposal
-                # stays in its state before.
-                proposer = replace(proposer, state=state)
+                # `charge` below stores the new state in `runners`. A search without a
+                # proposal stays in its state before.
+                proposals[k], proposer = proposer.propose(max_proposals)
             has_nothing_to_propose = not proposals[k]
             if has_nothing_to_propose:
-                self._retire(runners, k)
+                self._retire(runners, k)  # in place: it gets no more renders
                 waiting = self._find_waiting(runners)
                 continue
             are_used_up = n_used[k] == len(proposals[k])
@@ -205,8 +209,8 @@ class Race:
         renders_left = runner.renders_left
         has_later_round = self.round + 1 < self.n_rounds
         # `limit_cost` drops a gradient that uses up the renders, because no step could
-        # follow it. With a later round a step does follow, so one render more is
-        # stated.
+        # follow it. If there is a later round, its renders follow. Then a gradient that
+        # exactly uses up those of this round is kept, by one render more.
         if has_later_round:
             renders_left += 1
         return proposal.limit_cost(runner.domain, renders_left)
@@ -262,7 +266,7 @@ def start_race(
     if rounds is None:
         rounds = count_rounds(len(searches))
     # Every search is started with the number of renders that it gets if it is never
-    # dropped. All rounds have equally many, divided among the searches that are left.
+    # dropped: its part of each round. All rounds have equally many renders.
     planned_renders = 0.0
     n_active = len(searches)
     for _ in range(rounds):
@@ -409,11 +413,11 @@ class ChoicesState(Race):
         Args:
             numbers: (k,) elements of u that are numbers. If the domain has none, this
                 is a dummy, and ignored.
-            combination: index of the combination of options, which is that of the
-                search.
+            combination: index of the combination of options. The search of it has the
+                same index.
         """
         u = self.domain.initial_point.clone()
-        u[self.numbers] = numbers[: len(self.numbers)]
+        u[self.numbers] = numbers[: len(self.numbers)]  # nothing of a dummy
         u[self.choices] = self.combinations[combination]
         return u
 
@@ -468,11 +472,13 @@ class Choices(RacingPolicy[ChoicesState]):
             inner_domain = Domain(torch.zeros(1), (Block(1),))
         combinations = _select_combinations(
             domain.option_counts[choices].tolist(),
-            domain.initial_point[choices],
+            domain.initial_point[choices],  # its combination is searched, too
             max_combinations=_count_affordable_combinations(domain, policy, steps),
             generator=seeded(seed, 0),
         )
-        race = start_race([(policy, inner_domain)] * len(combinations), steps, seed)
+        # one search for each combination, all of the same numbers
+        searches = [(policy, inner_domain)] * len(combinations)
+        race = start_race(searches, steps, seed)
         return ChoicesState(
             **vars(race),  # all fields of `Race`, which `ChoicesState` inherits
             domain=domain,
@@ -560,7 +566,7 @@ def _count_affordable_combinations(
 ) -> int:
     """Return how many combinations of options can be searched in `steps` renders."""
     n_combinations = math.prod(domain.option_counts[domain.option_counts > 0].tolist())
-    # two may take part, however large a configuration is
+    # Each search stores configurations of `dim` numbers. There may be two in any case.
     max_in_memory = max(2, MAX_NUMBERS // domain.dim)
     limit = min(MAX_COMBINATIONS, n_combinations, max_in_memory)
     renders_per_evaluation = 1
@@ -588,7 +594,8 @@ def _select_combinations(
         generator: generator of random numbers; it advances.
 
     Returns:
-        (n, c) elements of u, at the centers of the options.
+        (n, c) elements of u: those of the initial point as they are, then others at the
+        centers of the options.
     """
     sizes = torch.tensor(n_options)
     # index of the option of each choice; u = 1 belongs to the last

@@ -222,13 +222,14 @@ class NES(Policy[NESState]):
         if len(state.values) < state.population:
             return state
         d = state.domain.dim
+        # the sums over w_k s_k and w_k s_k^2
         mean_gradient, square_sum = state.sum_weighted_noise()
         # the rate of Wierstra et al. 2014
         rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
         # The sum over w_k (s_k^2 - 1) is that over w_k s_k^2, as the weights sum to 0.
         growth = square_sum.mul_(rate / 2.0).exp_()
         deviation = (state.deviation * growth).clamp_(MIN_STEP_SIZE, MAX_STEP_SIZE)
-        # the deviation is in half ranges, the mean in u
+        # with the deviation of this generation, which is in half ranges
         mean = state.domain.project(
             state.mean + state.half_widths * state.deviation * mean_gradient
         )
@@ -485,6 +486,7 @@ class CMAES(Policy[CMAESState]):
         """
         values = [evaluation.objective for _, evaluation in evaluated]
         evaluated_points = state.points[len(state.values) :][: len(values)]
+        # `project` returns a configuration, and how far x lies out of the domain
         violations = [state.project(x)[1] for x in evaluated_points]
         best = max(state.best, *values)
         state = replace(
@@ -533,7 +535,7 @@ class CMAES(Policy[CMAESState]):
         }
         # no files, and nothing printed
         options |= {"signals_filename": "", "verbose": -9, "verb_log": 0}
-        with _isolate_numpy_random(seed, 0):
+        with _isolate_numpy_random(seed, generation=0):
             # imported here: it takes most of a second, and warns without matplotlib
             import cma
 

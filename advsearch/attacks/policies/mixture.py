@@ -174,8 +174,8 @@ class Components:
         cdf = torch.lerp(lower_cdf, upper_cdf, uniform)
         x = mean + std * torch.special.ndtri(cdf)
         wrapped = torch.remainder(x, 1.0)
-        # The inverse is infinite at 0 and 1, and NaN where rounding goes beyond them:
-        # then the center of the range is taken.
+        # `ndtri` is infinite at 0 and 1: x is clipped to a bound. Where rounding goes
+        # beyond 0 or 1 it is NaN: the center of the range is taken.
         clipped = x.nan_to_num(0.5).clamp(0.0, 1.0)
         x = torch.where(ranges.is_periodic, wrapped, clipped)
         option = torch.multinomial(self.option_probs[k], 1, generator=generator)[:, 0]
@@ -197,18 +197,18 @@ class Components:
             ranges: kinds of the d elements.
             uniform_probs: (k, d, m) uniform probabilities of options, the prior.
         """
-        # E step: (n, k) probability that a sample comes from a component, weighted
+        # E step: (n, k) probability that a sample comes from a component, times the
+        # weight of the sample
         log_densities = self.compute_log_densities(x, ranges)
         responsibility = log_densities.softmax(dim=1) * weights[:, None]
         counts = responsibility.sum(dim=0)  # (k,) number of samples of each component
         # M step. (k, n) weights of the samples in each component, with the sum 1;
         # clamped, since a component may have no samples at all.
         sample_weights = (responsibility / counts.clamp(min=1e-12)).T
-        # Means are computed from offsets to the old means, in which angles do not wrap.
+        # Means are computed from offsets x - old mean, in which angles do not wrap.
         offset = ranges.compute_offset(x[:, None], self.means)  # (n, k, d)
-        mean_offset = torch.einsum("kn,nkd->kd", sample_weights, offset)
-        squared_residual = (offset - mean_offset).square()
-        variance = torch.einsum("kn,nkd->kd", sample_weights, squared_residual)
+        mean_offset, variance = _compute_moments(offset, sample_weights)
+        # of the normal distributions before they are truncated to the ranges
         means, stds = _correct_truncation(
             self.means + mean_offset, variance, counts[:, None], ranges
         )
@@ -220,6 +220,19 @@ class Components:
         new_weights = (1.0 - UNIFORM_WEIGHT) * fraction
         new_weights += UNIFORM_WEIGHT / len(fraction)
         return Components(new_weights, means, stds, option_probs)
+
+
+def _compute_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean and variance of values by component, (k, d) each.
+
+    Args:
+        values: (n, k, d) values of n samples.
+        weights: (k, n) weights of the samples in each component, with the sum 1.
+    """
+    mean = torch.einsum("kn,nkd->kd", weights, values)
+    squared_residual = (values - mean).square()
+    variance = torch.einsum("kn,nkd->kd", weights, squared_residual)
+    return mean, variance
 
 
 def _correct_truncation(
@@ -244,7 +257,8 @@ def _correct_truncation(
     """
     uniform_mean = 0.5
     uniform_variance = UNIFORM_STD**2
-    # The variance is averaged with that of the prior, which is uniform.
+    # The prior is the uniform distribution, which counts as `PRIOR_COUNT` samples: its
+    # variance is averaged with that of the samples.
     pooled_variance = (counts * variance + PRIOR_COUNT * uniform_variance) / (
         counts + PRIOR_COUNT
     )
@@ -386,6 +400,7 @@ class MixtureState:
         It is None if it is too wide to be distinctive. It is also None for an angle
         whose range goes through 0, which two ascending bounds can't express.
         """
+        # clearly less spread than the uniform distribution
         is_distinctive = std < DISTINCTIVE_FRACTION * UNIFORM_STD
         lower = mean - 2.0 * std
         upper = mean + 2.0 * std
@@ -518,17 +533,19 @@ class Mixture(Policy[MixtureState]):
             evaluated_points=torch.cat([state.evaluated_points, points]),
             n_evaluated=state.n_evaluated + len(evaluated),
         )
+        # samples of this generation that are evaluated
         is_complete = state.n_evaluated >= self.population
         if not is_complete:
             return state
-        return self._begin_generation(state, self._fit(state))
+        next_mixture = self._fit(state)
+        return self._begin_generation(state, next_mixture)
 
     def failures(self, state: MixtureState) -> policies.Failures:
         """Return the worst failure of each component, and the estimated failure rate.
 
         The mixture has no cells, so samples are counted instead. With an l2 ball no
-        rate is estimated: points are projected onto the ball, so that they are not
-        uniform in it.
+        rate is estimated: samples are projected onto the ball, so that they are not
+        uniform in it, and their weights are wrong.
         """
         has_failed = state.log[:, FAILED_COLUMN] > 0
         is_unknown = state.log[:, UNKNOWN_COLUMN] > 0
@@ -558,6 +575,7 @@ class Mixture(Policy[MixtureState]):
         """
         log = state.window_log
         mixture = state.mixtures[-1]
+        # a sample that could not be evaluated ("unknown") is no failure
         is_failure = log[:, FAILED_COLUMN].bool() & ~log[:, UNKNOWN_COLUMN].bool()
         points = state.evaluated_points[is_failure]
         objectives = log[is_failure, OBJECTIVE_COLUMN]
@@ -644,20 +662,21 @@ class Mixture(Policy[MixtureState]):
         """
         if mixture is None:
             return torch.ones(len(x), dtype=torch.float64)
-        mixture_density = (
-            mixture.compute_log_densities(x, ranges).logsumexp(dim=1).exp()
-        )
+        # (n, k), with the weights of the components
+        log_densities = mixture.compute_log_densities(x, ranges)
+        mixture_density = log_densities.logsumexp(dim=1).exp()
         return self.even + (1.0 - self.even) * mixture_density
 
     def _fit(self, state: MixtureState) -> Components | None:
-        """Fit a mixture to the failures among the latest samples, by EM.
+        """Fit a mixture to the worst of the latest samples, by EM.
 
         Samples are weighted by the uniform density divided by the mean density of all
-        generations in the window. The components begin at failures that differ most
-        from each other. The result is None if nothing could be evaluated.
+        generations in the window. The components begin at samples that are far from
+        each other. The result is None if nothing could be evaluated.
         """
         log = state.window_log
         ranges = state.ranges
+        # the failures; if they are few, also the samples with the largest objectives
         is_elite = self._find_elite(log)
         points = state.evaluated_points[is_elite]
         if not len(points):
@@ -666,8 +685,8 @@ class Mixture(Policy[MixtureState]):
             densities = [
                 self._density(mixture, points, ranges) for mixture in state.mixtures
             ]
-            # The logged weights are those of a sample's own generation. Here the mean
-            # density of all generations is used instead.
+            # `WEIGHT_COLUMN` of the log has a sample's weight by the density of its own
+            # generation. Here the mean density of all generations is used instead.
             weights = 1.0 / torch.stack(densities).mean(dim=0)
             # Scaled so that their sum is the effective sample size, (sum w)^2 / sum
             # w^2. It is compared with the `PRIOR_COUNT` samples of the prior.
@@ -680,7 +699,7 @@ class Mixture(Policy[MixtureState]):
                 limit=self.components,
             )
             mixture = self._make_initial_components(points[center_index], ranges)
-            uniform_probs = mixture.option_probs
+            uniform_probs = mixture.option_probs  # the initial ones are uniform
             for _ in range(N_FIT_ROUNDS):
                 mixture = mixture.maximize(points, weights, ranges, uniform_probs)
         return mixture

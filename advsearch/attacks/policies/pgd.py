@@ -49,7 +49,7 @@ def clip_gradient(
       of gradients but no single step. In an l2 ball it is `CLIP_L2`.
     - Then a gradient that is longer than `CLIP` times the median of the last `MEMORY`
       lengths, this one included, is scaled down to that length.
-    - If the domain is `exact` or `draws_conditions`, images are predicted and not
+    - If the domain `is_noise_free` or `draws_conditions`, images are predicted and not
       rendered. So gradients have no noise, and nothing is clipped.
 
     Args:
@@ -61,8 +61,8 @@ def clip_gradient(
         The clipped gradient; the lengths, with this one's before it was scaled down;
         and the counts of outliers.
     """
-    # Without noise, large elements are real.
-    if domain.is_noise_free or domain.draws_conditions:
+    are_images_predicted = domain.is_noise_free or domain.draws_conditions
+    if are_images_predicted:
         return gradient, lengths, NO_COUNTS
     clipped_gradient = gradient.clone()
     has_outliers = False
@@ -73,7 +73,7 @@ def clip_gradient(
             clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(clipped_gradient))
     lengths = (*lengths, length)[-MEMORY:]
-    # of an even number, the larger of the two in the middle
+    # if their number is even, the larger of the two in the middle
     median_length = sorted(lengths)[len(lengths) // 2]
     max_length = CLIP * median_length
     # with a median of 0 there is no usual length to compare with
@@ -183,11 +183,11 @@ class StepWindow:
         has_no_new_best = not self.was_halved and best <= self.reference_best
         return has_improved_seldom or has_no_new_best
 
-    def lags(self, best: float) -> bool:
-        """Return whether `best`, the best objective of the search, beats the mean of
-        this window by more than noise explains.
+    def is_behind(self, best: float) -> bool:
+        """Return whether the window is clearly behind the best objective of the search.
 
-        That is by more than two standard deviations of the window's objectives.
+        Its mean is then lower than `best` by more than noise explains: by more than two
+        standard deviations of its objectives.
         """
         mean = sum(self.values) / len(self.values)
         squared_deviations = sum((value - mean) ** 2 for value in self.values)
@@ -204,11 +204,10 @@ class StepWindow:
         """
         decrease = max(1, round(WINDOW_DECREASE * steps))
         min_length = max(MIN_WINDOW, round(MIN_WINDOW_FRACTION * steps))
+        last_value = self.values[-1]
         return StepWindow(
             length=max(min_length, self.length - decrease),
-            previous=self.values[
-                -1
-            ],  # the first of the next window is compared with it
+            previous=last_value,  # the first of the next window is compared with it
             reference_best=best,
             was_halved=halved,
         )
@@ -282,9 +281,10 @@ class AscentPolicy(Policy[Ascent]):
         has_no_gain = state.n_idle_windows >= MAX_IDLE_WINDOWS
         if has_no_gradient or has_no_gain:
             return (), state
-        # The search logs the step size; it does not move u.
         proposal = Proposal(
-            state.u, gradient=True, step_size=self.compute_step_size(state)
+            state.u,
+            gradient=True,
+            step_size=self.compute_step_size(state),  # only for the log
         )
         return (proposal,), state
 
@@ -309,7 +309,7 @@ class AscentPolicy(Policy[Ascent]):
         if evaluation.gradient is not None:
             state = self._accumulate(state, evaluation.gradient)
         if state.peak is None or evaluation.objective > state.peak.objective:
-            # the direction includes the gradient at u already
+            # the direction with the gradient at u, for a later step from this peak
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
         return self.take_step(state, u, evaluation.objective)
 
@@ -319,6 +319,7 @@ class AscentPolicy(Policy[Ascent]):
         A gradient of zero ("flat") is not accumulated; such gradients are counted as
         long as they follow each other.
         """
+        # `lengths` are those of the latest gradients, now with this one's
         clipped_gradient, lengths, outlier_counts = clip_gradient(
             state.domain, gradient, state.lengths
         )
@@ -347,7 +348,7 @@ class AscentPolicy(Policy[Ascent]):
 
     @abstractmethod
     def accumulate_gradient(self, state: Ascent, gradient: Tensor) -> Ascent:
-        """Return the state after accumulating a gradient (d,), which is not all zero."""
+        """Return the state with a gradient (d,), not all zero, accumulated."""
 
     @abstractmethod
     def take_step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
@@ -377,12 +378,12 @@ class AscentPolicy(Policy[Ascent]):
 class PGD(AscentPolicy):
     """Projected gradient ascent (Madry et al. 2018) for a noisy objective.
 
-    One step, with P the projection onto the domain and `compute_steepest_step` the sign of a vector
-    in an l-infinity block and the vector over its norm in an l2 or box block, scaled by
-    the block's radius:
+    One step, with P the projection onto the domain and `compute_steepest_step` the sign
+    of a vector in an l-infinity block and the vector over its norm in an l2 or box
+    block, scaled by the block's radius:
 
-        m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq. 6)
-        u <- P(u + step_size * steepest(m))
+        m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq.
+        6) u <- P(u + step_size * steepest(m))
 
     g is clipped first (see `clip_gradient`). Accumulating gradients before the sign is
     taken matters here: each comes from another seed, and the sign of one noisy gradient
@@ -395,8 +396,8 @@ class PGD(AscentPolicy):
     to it only if the last window lags behind it by two standard deviations of the
     window.
 
-    In a domain without noise (`Domain.is_noise_free`) no gradient is clipped, and the step size
-    falls linearly over the planned steps. This reached larger objectives than
+    In a domain without noise (`Domain.is_noise_free`) no gradient is clipped, and the
+    step size falls linearly over the planned steps. This reached larger objectives than
     Auto-PGD's rule at every budget that was tried (docs/policies/pgd.md). In addition
     it is halved after a window that gained less than `MIN_WINDOW_GAIN` of the gain of
     the search. After `MAX_IDLE_WINDOWS` of these in a row there is nothing more to
@@ -555,9 +556,9 @@ class PGD(AscentPolicy):
         peak = state.peak
         best = peak.objective if peak else -math.inf
         is_stalled = window.stalled(best)
-        if is_stalled:
+        if is_stalled:  # the smaller step size stays, also for a step from the peak
             state = replace(state, step_size=state.step_size / 2)
-        if peak is not None and is_stalled and window.lags(best):
+        if peak is not None and is_stalled and window.is_behind(best):
             u = peak.u
             state = replace(
                 state,
@@ -642,7 +643,7 @@ class Adam(AscentPolicy):
         return state.decay_step_size(state.n_evaluations)
 
     def retreat(self, state: Ascent) -> Ascent:
-        """Go back to the best configuration, or to the initial point if there is none.
+        """Go back to the best configuration (`peak`), or to the initial point if none.
 
         The accumulated gradients are set to zero.
         """
@@ -651,7 +652,7 @@ class Adam(AscentPolicy):
             state,
             u=u,
             direction=torch.zeros_like(u),
-            mean_square=NO_SQUARES,  # broadcast to (d,) with the next gradient
+            mean_square=NO_SQUARES,  # a zero; the next gradient makes it (d,)
             n_updates=0,
         )
 
@@ -676,6 +677,8 @@ class Adam(AscentPolicy):
     def take_step(self, state: Ascent, u: Tensor, objective: float) -> Ascent:
         """Take a step along the mean gradient divided by its root mean square.
 
+        As long as there is no gradient, each element goes up or down at random.
+
         Args:
             state: state of the ascent.
             u: (d,) the latest configuration.
@@ -687,13 +690,13 @@ class Adam(AscentPolicy):
             mean = state.direction / (1.0 - self.beta1**state.n_updates)
             mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
             direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
-        else:  # random signs
+        else:
             noise = torch.randn(
                 u.numel(), generator=seeded(state.seed, state.n_evaluations)
             )
             direction = noise.sign_()
-        # the index of the latest evaluation, which `count` includes already
-        rate = state.decay_step_size(state.n_evaluations - 1)
+        latest_index = state.n_evaluations - 1  # index of the latest evaluation
+        rate = state.decay_step_size(latest_index)
         half_widths = compute_half_widths(state.domain)
         u = torch.addcmul(u, half_widths, direction, value=rate)
         return replace(state, u=state.domain.project(u))

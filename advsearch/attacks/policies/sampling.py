@@ -47,7 +47,7 @@ class PointsState:
     def propose(
         self, configurations: Iterable[Tensor]
     ) -> tuple[tuple[Proposal, ...], PointsState]:
-        """Return proposals of configurations, and the state in which they are counted."""
+        """Return proposals of configurations, and the state that counts them."""
         proposals = tuple(map(Proposal, configurations))
         return proposals, replace(self, n_proposed=self.n_proposed + len(proposals))
 
@@ -230,8 +230,8 @@ class Grid(NonAdaptivePolicy):
         """Start with all points of the grid, sorted from coarse to fine."""
         counts = _count_values(domain, steps, self.points)
         points = torch.cartesian_prod(*_make_axes(domain, counts))
-        points = points.reshape(-1, domain.dim)
-        order = _order_coarse_to_fine(_list_blocks(domain), counts)
+        points = points.reshape(-1, domain.dim)  # of a single axis it would be (n,)
+        order = _order_coarse_to_fine(_list_block_of_elements(domain), counts)
         return PointsState(domain, points=points[order])
 
     def propose(
@@ -241,7 +241,7 @@ class Grid(NonAdaptivePolicy):
         return state.propose(map(state.domain.project, next_points))
 
 
-def _list_blocks(domain: Domain) -> list[Block]:
+def _list_block_of_elements(domain: Domain) -> list[Block]:
     """Return the block of each element of u."""
     return [block for block in domain.blocks for _ in range(block.size)]
 
@@ -263,12 +263,16 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
             upper[part] = upper[part].minimum(domain.start[part] + block.epsilon)
     axes = []
     for block, count, low, high in zip(
-        _list_blocks(domain), counts, lower.tolist(), upper.tolist(), strict=True
+        _list_block_of_elements(domain),
+        counts,
+        lower.tolist(),
+        upper.tolist(),
+        strict=True,
     ):
         is_choice = block.n_options > 0
         if is_choice:  # the center of each option's part of [0, 1]
             axes.append((torch.arange(count) + 0.5) / count)
-        elif block.periodic:  # the upper bound is the lower one, and comes once
+        elif block.periodic:  # both bounds are the same angle: only one is listed
             axes.append(low + (high - low) * torch.arange(count) / count)
         else:
             axes.append(torch.linspace(low, high, count))

@@ -29,7 +29,7 @@ MAX_MOVE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class BoxCoordinates:
-    """The k coordinates of the unit box: u[indices] = low + width * x for x in [0, 1]^k.
+    """The k coordinates of the unit box: u[indices] = low + width * x, x in [0, 1]^k.
 
     Attributes:
         indices: (k,) of the elements of u.
@@ -75,7 +75,8 @@ class BoxCoordinates:
     def sample_screen(self, seed: int, n: int) -> Tensor:
         """Return evenly spread points (n, k), of a scrambled Sobol sequence.
 
-        With very many coordinates they are independent points instead.
+        With very many coordinates they are independent points instead. `normalize`
+        moves their choices to the centers of options.
         """
         if n == 0:
             return torch.empty(0, self.count)
@@ -293,10 +294,11 @@ class Observations:
         is_finite = torch.isfinite(values)
         values = torch.where(is_finite, values, values[is_finite].min())
         scales = self.scales
-        n_fitted = self.n_fitted
+        n_fitted = self.n_fitted  # number of points when the scales were fitted
         refit_interval = max(REFIT_INTERVAL, n_fitted // 10)
         if scales is None or n_points - n_fitted >= refit_interval:
-            # the `MEMORY` best and the `MEMORY` latest points, whatever `self.memory`
+            # As fitting scales is slow, it uses `MEMORY` of the best and of the latest
+            # points, even if `self.memory`, for the predictions below, is larger.
             scale_points = _select_best_and_latest(values, MEMORY)
             scales = _find_best_scales(
                 self.box, self.points[scale_points], values[scale_points]

@@ -140,15 +140,16 @@ class Bench:
             if label is None:
                 measurement = measure()
             else:
+                # measured, or read from the store
                 measurement = self.store(f"{label} gradient {index}", measure)
-            # base64 of float32, the groups' derivatives one after the other, as
-            # `_measure_gradient` writes them; frombuffer wants writable memory
+            # `_measure_gradient` writes the derivatives of all groups, one group after
+            # the other, as float32 in base64. `frombuffer` needs writable memory.
             buffer = bytearray(base64.b64decode(measurement["numbers"]))
             derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
             for coordinates, values in zip(slices, derivatives, strict=True):
                 gradients[index, coordinates] = values
             seconds.append(measurement["seconds"])
-            # gradients that are not stored are counted by the caller
+            # For gradients that are not stored, the caller reports the progress.
             if label is not None:
                 self.tick(self.spp)
         return gradients, statistics.median(seconds)

@@ -31,7 +31,7 @@ MIN_SIZE_FRACTION = 0.1
 MAX_SINGLE_PROBES = 8
 # Up to this size of a group, the planned step for one coordinate is also that of the
 # mixed probe. Larger groups have the step `MIXED_STEP` there.
-MAX_COMMON_STEP_SIZE = 64
+MAX_SIZE_OF_PLANNED_STEP = 64
 MIXED_STEP = 0.03
 # allowed relative error of the mean of an estimator, besides that by noise
 MAX_BIAS = 0.05
@@ -111,8 +111,9 @@ def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     """Return a linear loss with smooth weights, a few random waves in each channel.
 
     The waves are about as long as the image, and fall to zero at its edge (a Hann
-    window). With a hard edge the loss would be as rough as whatever moves across it, a
-    photographed interior above all, and its differences would depend on the step.
+    window). With a hard edge, the loss would be as rough as the details of the image
+    that move across it, such as those of a photographed interior. Then finite
+    differences of the loss would depend on their step.
     """
     generator = torch.Generator().manual_seed(seeds.derive_seed(seed, "smooth loss"))
     height, width = resolution
@@ -217,7 +218,8 @@ def compare_with_reference(
         status=_rate_estimate(estimate, reference, size, doubt),
         error=_divide_by_size(single_error, size),
         bias=_divide_by_size(difference, size),
-        # If the derivative is zero, all of it is noise, and there is no doubt.
+        # If all references are exactly zero, a relative error is infinite, and it is
+        # not in doubt that the estimate is only noise.
         doubt=0.0 if is_zero else _divide_by_size(doubt, size),
         noise=math.inf if is_zero else _divide_by_size(estimate.noise, size),
         value=estimate.value,
@@ -227,7 +229,7 @@ def compare_with_reference(
 
 
 def _divide_by_size(value: float, size: float) -> float:
-    """Return a value divided by a size; if that is 0, infinity, or 0 for a value of 0."""
+    """Return a value divided by a size; if that is 0, infinity (but 0 for 0 / 0)."""
     if size > 0.0:
         return value / size
     return math.inf if value else 0.0
@@ -241,11 +243,11 @@ def list_planned(group: Group) -> list[tuple[str, float]]:
 def list_attempts(group: Group) -> list[tuple[str, float]]:
     """Return the estimators to measure on a group, each with a factor on its step.
 
-    First come the estimators that are worth comparing, with the planned step; if the
-    user has forced an estimator, only that one. Then an estimator that takes
-    differences is tried with the other `FACTORS` on the step. There are two of these:
-    differences of the loss ("differences") and of the image ("secant"). One is enough,
-    as the loss is linear here (`make_smooth_loss`), so that both agree.
+    First come the estimators that are worth comparing (`select_compared`), with the
+    planned step; if the user has forced an estimator, only that one. Then an estimator
+    that takes differences is tried with the other `FACTORS` on the step. There are two
+    of these: differences of the loss ("differences") and of the image ("secant"). One
+    is enough, as the loss is linear here (`make_smooth_loss`), so that both agree.
     """
     if group.is_forced:
         attempts = list_planned(group)
@@ -285,8 +287,8 @@ def find_probes(bench: Bench) -> list[Probe]:
             probes += _make_single_probes(bench, group)
             continue
         # The planned step is for one coordinate. If very many change at once, it does
-        # not fit.
-        step = group.step if group.size <= MAX_COMMON_STEP_SIZE else MIXED_STEP
+        # not fit, and `MIXED_STEP` is taken.
+        step = group.step if group.size <= MAX_SIZE_OF_PLANNED_STEP else MIXED_STEP
         direction = _make_mixed_direction(bench, group)
         probes.append(Probe(group, group.name, direction, step))
     return probes
@@ -396,9 +398,11 @@ def _measure_pair(
 
     `number` is the index of the pair, from which its seed follows.
     """
-    # A wider step is limited to the largest one; the planned step is not changed.
+    # The planned step is never changed. With a factor, it is limited to the largest
+    # one.
     _, max_step = STEP_RANGE
     step = probe.step if factor == 1.0 else min(max_step, factor * probe.step)
+    # both differences have the same noise
     noise_seed = seeds.derive_seed(bench.seed, "reference", number)
     return DifferencePair(
         coarse=_compute_difference(bench, probe, step, noise_seed),
@@ -419,9 +423,13 @@ def _compute_standard_error(pairs: Sequence[DifferencePair]) -> float:
 def _extrapolate(pairs: Sequence[DifferencePair], factor: float) -> Reference:
     """Return the reference that is the mean of pairs, extrapolated to a step of 0.
 
-    Its noise is the standard error of that mean, together with a quarter of the
-    difference between both steps, for what the extrapolation leaves of their error.
-    `factor` is that on the probe's step.
+    Its noise is the standard error of that mean, together with an estimate of the error
+    that the extrapolation leaves: a quarter of the difference between the derivatives
+    by the coarse and by the fine step.
+
+    Args:
+        pairs: pairs of differences with a coarse and a fine step.
+        factor: factor by which the probe's step was multiplied.
     """
     coarse_mean = statistics.fmean(pair.coarse for pair in pairs)
     fine_mean = statistics.fmean(pair.fine for pair in pairs)
@@ -449,7 +457,7 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
         below = (bench.u - change).clamp(0.0, 1.0)
         changes_single_coordinate = probe.group.size <= MAX_SINGLE_PROBES
         if changes_single_coordinate:
-            # less than two steps if a bound of the range has cut one off
+            # less than two steps if one of them was clipped at a bound of the range
             width = float((above - below) @ probe.direction)
     with torch.no_grad():
         loss_above, loss_below = (
@@ -485,9 +493,9 @@ def measure_estimates(
         estimate = GradientEstimate(
             estimator,
             value=statistics.fmean(derivatives),
-            noise=statistics.stdev(derivatives),
+            noise=statistics.stdev(derivatives),  # of a single gradient
             repeats=repeats,
-            seconds=seconds,
+            seconds=seconds,  # of a gradient, which is shared by all probes
             factor=factor,
         )
         estimates.append(estimate)
@@ -519,13 +527,14 @@ def measure_derivatives(
         list_tries: returns the estimators to try on a group, each with a factor on the
             planned step (`list_planned` or `list_attempts`). Factors other than 1 are
             only tried on probes whose status is not "ok" yet.
-        repeats: number of gradients by an estimator with the planned step, and with
-            another factor; the latter has to be measured more accurately.
+        repeats: number of gradients by an estimator with the planned step, and number
+            with another step, whose estimates have to be more accurate.
         stage: called at the beginning of a stage, with its name and number of steps.
     """
     measure = partial(
         measure_reference, repeats=reference_repeats, factors=reference_factors
     )
+    # probes of one control follow one another
     for control, control_probes in groupby(
         find_probes(bench), lambda probe: probe.group.control
     ):
@@ -563,11 +572,13 @@ def _load_reference(
         measure: measures a reference.
     """
     # The estimator "image" is for controls that change the finished image, such as a
-    # blur. They clip values, so that the mean image depends on the noise. So estimate
-    # and reference need the same sample count.
+    # blur. They clip the values of pixels. With more noise, more values are clipped, so
+    # that the mean image depends on the noise. So estimate and reference need the same
+    # sample count.
     acts_on_image = probe.group.estimator == "image"
     reference_spp = bench.spp if acts_on_image else max(bench.spp, spp)
     reference_bench = replace(bench, spp=reference_spp)
+    # measured now, or by an earlier run; as JSON
     fields = bench.store(
         f"reference {probe.name}", lambda: measure(reference_bench, probe)._asdict()
     )
@@ -606,11 +617,11 @@ def _try_estimators(
             break
         probe_names = ",".join(probe.name for probe in tried_probes)
         # measured now, or by an earlier run; as JSON
-        stored = bench.store(
+        stored_estimates = bench.store(
             f"{estimator} x {factor:g} {probe_names}",
             partial(_estimates_as_json, bench, estimator, tried_probes, count, factor),
         )
-        for probe, estimate in zip(tried_probes, stored, strict=True):
+        for probe, estimate in zip(tried_probes, stored_estimates, strict=True):
             row = compare_with_reference(
                 GradientEstimate(**estimate),
                 references[probe.name],

@@ -114,9 +114,9 @@ def list_contested(
     Args:
         plan: plan with the groups.
         with_all: whether all groups count. Otherwise only those count whose preferred
-            estimator is the interior adjoint. For the others a comparison is not worth
-            its time: for poses no estimator is best, as the loss of a model is too
-            rough; for shapes the material form always has the least noise.
+            estimator is "adjoint". For the others a comparison is not worth its time:
+            for poses no estimator is best, as the loss of a model is too rough; for
+            shapes one estimator, the material form, always has the least noise.
 
     Returns:
         The sets, each with its estimators.
@@ -190,6 +190,16 @@ def choose_estimators(
     return plan
 
 
+def _count_renders(plan: GradientPlan, estimator: str) -> float:
+    """Return the renders that a gradient by one estimator takes.
+
+    They are the image itself, the renders of the differences, and the adjoint, which
+    takes as much time as `ADJOINT_RENDERS` renders.
+    """
+    is_adjoint = estimator in ADJOINT_ESTIMATORS
+    return 1.0 + plan.renders + (ADJOINT_RENDERS if is_adjoint else 0.0)
+
+
 def _score_estimators(
     bench: Bench,
     plan: GradientPlan,
@@ -213,14 +223,14 @@ def _score_estimators(
     for estimator in estimators:
         single_plan = restrict_plan(plan, group_names, estimator)
         gradients, seconds = bench.compute_gradients(
-            single_plan, "plan", repeats, f"{groups[0].name} by {estimator}"
+            single_plan,
+            stream="plan",
+            repeats=repeats,
+            label=f"{groups[0].name} by {estimator}",
         )
         cost = seconds
         if counts_renders:
-            is_adjoint = estimator in ADJOINT_ESTIMATORS
-            adjoint_renders = ADJOINT_RENDERS if is_adjoint else 0.0
-            # the image itself, the renders of the differences, and the adjoint
-            cost = 1.0 + single_plan.renders + adjoint_renders
+            cost = _count_renders(single_plan, estimator)
         residual = gradients - gradients.mean(dim=0)  # (repeats, d)
         gradients_of[estimator] = gradients
         cost_of[estimator] = cost
@@ -301,7 +311,11 @@ def count_cosine_samples(
 
 
 def _list_controls(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float]]]:
-    """Return the differentiated groups of each control, and the step factors to try."""
+    """Return the differentiated groups of each control, and the factors to try.
+
+    The steps of its finite differences are multiplied by a factor. A control without
+    finite differences has only the first one, which is 1.
+    """
     groups_of_control: dict[str, list[Group]] = {}
     for group in plan.groups:
         if group.estimator != "none":
@@ -318,10 +332,10 @@ def measure_cosines(
 ) -> Iterator[Measured]:
     """Measure the cosine of working gradients with the converged one, for each control.
 
-    The width of differences is multiplied by each of `FACTORS`, in the working
-    gradients and in the converged ones. At each width the sample counts are tried in
-    order, until one reaches the goal; then the next width follows. The last width is a
-    fallback: it is only tried if no other has reached the goal. A control without
+    The steps of differences are multiplied by each of `FACTORS`, in the working
+    gradients and in the converged ones. With each factor the sample counts are tried in
+    order, until one reaches the goal; then the next factor follows. The last factor is
+    a fallback: it is only tried if no other has reached the goal. A control without
     finite differences has only the factor 1, and no fallback.
 
     Args:
@@ -329,7 +343,7 @@ def measure_cosines(
         counts: samples per pixel, ascending.
 
     Yields:
-        A row for each control, width and sample count that was measured.
+        A row for each control, factor and sample count that was measured.
     """
     base_plan = bench.renderer.plan
     for groups, factors in _list_controls(base_plan):
@@ -341,8 +355,7 @@ def measure_cosines(
             if is_fallback and is_reached:
                 break
             plan = restrict_plan(base_plan.scale_steps(factor), group_names)
-            # Widths have an upper limit, so that a larger factor can give the same
-            # plan.
+            # Steps have an upper limit, so that a larger factor can give the same plan.
             if plan in tried_plans:
                 continue
             tried_plans.append(plan)
@@ -358,11 +371,18 @@ def _measure_cosines(
     factor: float,
     counts: Sequence[int],
 ) -> Iterator[Measured]:
-    """Measure the cosine of one control's gradients at one width of its differences.
+    """Measure the cosine of one control's gradients with the converged gradient.
 
     Sample counts are tried in turn, until the cosine reaches the goal. The converged
     gradient is computed again with more samples, but only once, if its repeats do not
-    agree well enough or if a working gradient has more samples than it.
+    agree well enough or if a working gradient, as a search uses it, has more samples.
+
+    Args:
+        bench: computes the gradients.
+        plan: plan with the groups of the control, whose steps have the factor already.
+        groups: groups of the control.
+        factor: factor on the steps of differences, for the rows.
+        counts: samples per pixel of working gradients, ascending.
     """
     control = groups[0].control
     estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
@@ -378,7 +398,7 @@ def _measure_cosines(
                 bench, plan, label, converged_spp
             )
         gradients, seconds = replace(bench, spp=spp).compute_gradients(
-            plan, "working", REPEATS, f"{label} {spp}"
+            plan, stream="working", repeats=REPEATS, label=f"{label} {spp}"
         )
         cosine = statistics.fmean(
             _cosine(gradient, converged) for gradient in gradients
@@ -431,11 +451,11 @@ def choose_steps(
 ) -> tuple[GradientPlan, int | None]:
     """Choose each control's step of differences from measured cosines.
 
-    A setting is a step and a sample count. All settings need the same number of
-    renders, so that the cheapest has the fewest samples. For each control the cheapest
-    setting that reaches `GOAL_COSINE` is chosen; of equally cheap ones, that with the
-    largest cosine. If none reaches the goal, the one with the largest cosine is chosen,
-    and the reason of the group says so.
+    A setting is a step and a sample count. A gradient takes equally many renders with
+    every setting, so that the cheapest one has the fewest samples per pixel. For each
+    control the cheapest setting that reaches `GOAL_COSINE` is chosen; of equally cheap
+    ones, that with the largest cosine. If none reaches the goal, the one with the
+    largest cosine is chosen, and the reason of the group says so.
 
     Args:
         plan: plan with the steps.
@@ -503,6 +523,8 @@ def _describe_shortfall(row: Measured) -> str:
     """Return a remark if a setting does not reach the goal, otherwise "".
 
     It follows "cosine 0.80 with the converged gradient at 64 samples and 3 x the step".
+    If converged gradients do not agree with each other, the cosine says little. Else
+    the setting is only the best that was found.
     """
     if row.status == "ok":
         return ""
@@ -562,6 +584,7 @@ def measure_path_length(
         lost_light = 0.0
         changed_levels = 0.0
         for u, full in zip(configurations, full_renderings, strict=True):
+            # fraction of the light that is lost, and change of the image in levels
             light, levels = _compare_depths(full, render_twice(u, depth))
             lost_light = max(lost_light, light)
             # `max` would drop NaN, of an image that is not finite
@@ -594,7 +617,9 @@ def _render_with_depth(
     with torch.no_grad(), renderer.scene.limit_depth(depth):
         radiance = renderer.radiance(u, seed, spp)
         displayed = renderer.formation.map_to_display(radiance)
-        return _Rendering(radiance, renderer.space.apply_to_image(u, displayed))
+        # with what controls change in the finished image, such as a blur
+        image = renderer.space.apply_to_image(u, displayed)
+        return _Rendering(radiance, image)
 
 
 def _compare_depths(
@@ -622,7 +647,8 @@ def _compare_depths(
 def _explain_depth(cuts: Sequence[PathCut], depth: int, full_depth: int) -> str:
     """Return why light paths of `depth` segments were chosen, as a clause.
 
-    It states the light that they leave out, and that of the next shorter paths.
+    It states the light that they leave out, and that of the next shorter paths. Longer
+    paths, which were tried before, are not mentioned.
     """
     texts = []
     for cut in cuts:
