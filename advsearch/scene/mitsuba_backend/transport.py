@@ -365,15 +365,16 @@ class Bounce:
     next_weight: Any = 1.0
 
     def compute_slopes(self) -> tuple[Any, Any]:
-        """Return the derivatives of both BSDF values by the base color.
+        """Return the derivatives by the base color of what a bounce reflects.
 
-        The caller has made the base color larger by `COLOR_STEP`, after the bounce was
-        sampled.
+        They are differences: the caller has made the base color larger by `COLOR_STEP`,
+        after the bounce was sampled.
 
         Returns:
-            The derivative of `bsdf_value_em`, and that of the BSDF in the path's
-            direction over the direction's density.
+            The derivative of `bsdf_value_em`, for the light that was sampled, and that
+            of `bsdf_weight`, for the direction in which the path goes on.
         """
+        # The weight is the value over the density. The difference is that of the value.
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
         slope_em = self._compute_slope(self.wo_em, self.bsdf_value_em, self.active_em)
         slope_bsdf = self._compute_slope(
@@ -400,6 +401,9 @@ class Bounce:
 
     def eval_projector(self, scene: Any, projector: Any) -> tuple[Any, Any]:
         """Return how a projector lights the vertex with a white image.
+
+        With a white image, the light is the derivative by the texel of the image that
+        falls there.
 
         Returns:
             The position in the projector's image, and the light that the vertex
@@ -504,9 +508,10 @@ def _trace_paths(
         is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
-        # Russian roulette, which leaves out the last bounce: a path ends after it in
-        # any case.
-        if roulette_depth <= segment + 1 < depth - 1:
+        # Russian roulette. There is none at the last bounce, after which a path has only
+        # one more segment.
+        n_bounces = segment + 1
+        if roulette_depth <= n_bounces < depth - 1:
             survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
             active &= noise.next_1d(active) < survival
             bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
@@ -615,8 +620,10 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
     count = height * width
     ray, weight = _sample_center_rays(sensor, resolution)
     to_world = sensor.world_transform()
-    eye = to_world @ mi.Point3f(0.0)  # rays begin at the near clipping plane
+    # Depths count from here, not from the rays' origins on the near clipping plane.
+    eye = to_world @ mi.Point3f(0.0)
     forward = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
+    # The weight may be one number for all rays; `full` makes one entry for each.
     active = dr.any(mi.Spectrum(weight) > 0.0) & dr.full(mi.Bool, True, count)
     layers = _SurfaceLayers(scene.shapes(), count)
     while dr.any(active):
