@@ -171,8 +171,8 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     """
     normals: Float64Array = normalize_vectors(soup.compute_area_vectors())
     count = len(normals)
-    # The two faces of each shared edge. `find_shared_edges` returns corners, of which
-    # each face has three.
+    # The two faces of each shared edge. `find_shared_edges` returns corners, and the
+    # corners 3 f to 3 f + 2 are those of face f.
     left_corner, right_corner, _ = find_shared_edges(soup.faces)
     face = left_corner // 3
     neighbour = right_corner // 3
@@ -181,14 +181,16 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     patch = np.zeros(count, dtype=np.int64)
     # whether both faces of an edge stay in one patch
     is_same = np.ones(len(face), np.bool_)
-    if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
+    is_large = count > _FACES_PER_ATLAS
+    is_curved = not _are_straight(normals, plane)
+    if is_large or is_curved:
         direction = _find_directions(normals, face, neighbour)
         is_same = direction[face] == direction[neighbour]
         patch = find_components(count, face[is_same], neighbour[is_same])
-    cell = _find_cells(soup, patch)
-    if cell is None:
+    piece = _find_pieces(soup, patch)
+    if piece is None:
         return patch
-    is_same &= cell[face] == cell[neighbour]
+    is_same &= piece[face] == piece[neighbour]
     return find_components(count, face[is_same], neighbour[is_same])
 
 
@@ -198,19 +200,29 @@ def _find_directions(
     """Return the index (F,) of the cutting direction nearest to each face's normal.
 
     The directions are the 14 of `_make_cut_directions`. The normals are smoothed
-    before; the arguments are those of `_smooth_normals`.
+    before.
+
+    Args:
+        normals: (F, 3) unit normals of the faces.
+        face: (E,) index of one face of each shared edge.
+        neighbour: (E,) index of the other face.
     """
     smoothed = _smooth_normals(normals, face, neighbour)
     return np.asarray((smoothed @ _make_cut_directions().T).argmax(axis=1))
 
 
-def _find_cells(soup: TriangleSoup, patch: IntArray) -> IntArray | None:
-    """Return the piece (F,) of each face, if patches (F,) are cut for speed.
+def _find_pieces(soup: TriangleSoup, patch: IntArray) -> IntArray | None:
+    """Cut the patches of a large mesh into pieces, since xatlas is slow for large ones.
 
-    xatlas takes long for large patches. The result is None if the mesh is too small to
-    need that.
+    Args:
+        soup: the faces.
+        patch: (F,) number of the patch that each face is in.
+
+    Returns:
+        (F,) the piece of each face; None if the mesh is too small to need that.
     """
-    # from the largest meshes to smaller ones
+    # The largest meshes come first. A mesh with more than `min_faces` faces gets pieces
+    # of at most `max_faces`.
     for min_faces, max_faces in _CELL_FACES:
         if len(patch) > min_faces:
             centers = soup.points[soup.faces].mean(axis=1)
@@ -262,9 +274,9 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
     Returns:
         (F,) the piece of each face, numbered from 0.
     """
-    cell = np.zeros(len(patch), dtype=np.int64)
-    count = 0
-    remaining = group_indices(patch)
+    piece_of_face = np.zeros(len(patch), dtype=np.int64)
+    n_pieces = 0
+    remaining = group_indices(patch)  # groups of faces that may be too large
     while remaining:
         group = remaining.pop()
         if len(group) > max_faces:
@@ -273,9 +285,9 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
             middle = len(order) // 2
             remaining += [order[:middle], order[middle:]]
         else:
-            cell[group] = count
-            count += 1
-    return cell
+            piece_of_face[group] = n_pieces
+            n_pieces += 1
+    return piece_of_face
 
 
 MAP_SIZE = 64  # cells along each side of the map
@@ -359,20 +371,22 @@ class SurfaceParts:
         outside of the map count as on its border.
 
         Args:
-            face_of_part: (n,) index of the face.
+            face: (n,) index of the face.
             uv: (n, 2) the mesh's own texture coordinates.
         """
         if self.is_unwrapped:
-            # The arguments are in the order of rows and columns: v, then u.
-            weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
-            # In a face without area the weights are NaN or infinite. Then the middle of
-            # the face is used.
+            u, v = uv.T
+            # `compute_barycentric` takes the position in the order of row and column.
+            weights = compute_barycentric(self._mesh_uvs[face], v, u)
+            # In a face without area the weights are NaN or infinite. A weight of 1/3
+            # for each corner is the middle of the face.
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
             uv = np.einsum("nk,nkc->nc", weights, self.face_uvs[face])
+        map_u, map_v = uv.T
         # v points up, and rows go down
-        column_and_row = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * MAP_SIZE)
+        column_and_row = np.floor(np.stack([map_u, 1 - map_v]) * MAP_SIZE)
         column, row = np.clip(column_and_row, 0, MAP_SIZE - 1).astype(np.int64)
         return np.asarray(row * MAP_SIZE + column)
 

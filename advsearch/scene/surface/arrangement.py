@@ -110,8 +110,7 @@ class SurfaceView:
         weights = fractions * samples.diffuse_weight[start:end].numpy()[:, None]
         # The samples are sorted by pixel, and each has four entries. So the entries of
         # row p begin at 4 times the number of samples in the pixels before p.
-        first_samples = np.searchsorted(pixel.numpy(), np.arange(height * width + 1))
-        row_starts = first_samples * 4
+        row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
         self.matrix = scipy.sparse.csr_matrix(
             (weights.ravel(), columns.ravel(), row_starts.astype(np.int32)),
             (height * width, sides * n_cells),

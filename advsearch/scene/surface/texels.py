@@ -588,9 +588,8 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     row = texel // n_columns
     column = texel % n_columns
     # The steps of the lattice are taken modulo its size, and scaled to [0, 1].
-    row_step, column_step = HOT_LATTICE
-    row_offset = _to_tent((index * row_step % HOT_RAYS + 0.5) / HOT_RAYS)
-    column_offset = _to_tent((index * column_step % HOT_RAYS + 0.5) / HOT_RAYS)
+    row_offset = _to_tent((index * HOT_LATTICE[0] % HOT_RAYS + 0.5) / HOT_RAYS)
+    column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
     # The first and last row are centered at the poles: row i has the polar angle
     # i pi / (n_rows - 1). A row begins at azimuth 0 with the left edge of its first
     # texel, whose center is 0.5 columns further.
