@@ -109,9 +109,9 @@ def _compare_outline(
     x = outline.left + (column + 0.5) * outline.step
     y = outline.top + (row + 0.5) * outline.step
     is_inside = (x > 0) & (x < width) & (y > 0) & (y < height)
-    # Visible pixels over the pixels of the full outline, also those beyond the image. A
-    # cell of the outline is `step` pixels wide and high.
-    fraction = float(mask.sum()) / (len(row) * outline.step**2)
+    # of the full outline, also beyond the image; a cell is `step` pixels wide and high
+    n_outline_pixels = len(row) * outline.step**2
+    fraction = float(mask.sum()) / n_outline_pixels
     is_truncated = bool((~is_inside).any())
     return min(1.0, fraction), is_truncated
 

@@ -181,9 +181,8 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     patch = np.zeros(count, dtype=np.int64)
     # whether both faces of an edge stay in one patch
     is_same = np.ones(len(face), np.bool_)
-    is_large = count > _FACES_PER_ATLAS
-    is_curved = not _are_straight(normals, plane)
-    if is_large or is_curved:
+    # a large mesh, or a curved surface that would count as one plane
+    if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
         direction = _find_directions(normals, face, neighbour)
         is_same = direction[face] == direction[neighbour]
         patch = find_components(count, face[is_same], neighbour[is_same])
