@@ -53,8 +53,11 @@ def is_against_traffic(scene: SceneData, camera: Float64Array) -> bool:
         scene: the scene.
         camera: (4, 4) pose of the camera.
     """
-    if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
+    # The camera is mounted in a car in the object's lane, or the place has lanes.
+    has_traffic = scene.is_in_lane or has_lanes(scene)
+    if not (scene.object.drives and has_traffic):
         return False
+    # along x and y, since the object faces +x
     distance_ahead, distance_aside = (
         camera[:2, 3] - compute_center(scene)[:2]
     ) * scene.size_in_metres

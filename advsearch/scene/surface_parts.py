@@ -78,16 +78,18 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
         # patches are cut further where the group changes
         patch_and_group = patch * (int(chart_group.max()) + 1) + chart_group
         patch = np.unique(patch_and_group, return_inverse=True)[1].reshape(-1)
-    if int(patch.max()) >= _MAX_PATCHES:
+    has_too_many_patches = int(patch.max()) >= _MAX_PATCHES  # counted from 0
+    if has_too_many_patches:
         return replace(soup, uvs=_make_grid_uvs(len(soup.faces)))
     groups = group_indices(patch)
     atlas = _generate_atlas(soup, groups)
     uvs = np.empty((len(soup.faces), 3, 2))
     for index, group in enumerate(groups):
-        _, corners, atlas_uvs = atlas[index]
+        _vertices, corners, atlas_uvs = atlas[index]
         uvs[group] = np.asarray(atlas_uvs, dtype=np.float64)[np.asarray(corners)]
-    # A look-up near the border also reads the opposite one, and xatlas leaves no gap
-    # there: the charts are shrunk by half a gap on each side.
+    # An interpolated look-up near a border of the square also reads texels at the
+    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by half
+    # a gap on each side.
     margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
     return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
 

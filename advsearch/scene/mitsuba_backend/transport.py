@@ -101,8 +101,8 @@ def collect_paths(
     """Trace one pass of light paths and collect their vertices.
 
     It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel. The
-    parameter `key` is changed in between, and has its value again at the end. Radiance
-    that is not finite is replaced by zero.
+    texture is changed on the way, and restored. Radiance that is not finite is replaced
+    by zero.
 
     Args:
         scene: Mitsuba's scene.
@@ -114,16 +114,17 @@ def collect_paths(
         depth: maximum length of a path in segments.
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
-        unseen: Mitsuba's shape that is black to camera rays, with everything behind
-            it; None if there is none.
+        unseen: Mitsuba's shape whose pixels are black: camera rays that meet it first
+            are not traced. None if there is none.
         roulette_depth: bounces from which on Russian roulette may end a path; None if
             it never does.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     if unseen is not None:
         weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
+    # From the bounce `depth` on there is no roulette, since paths end before.
     first_hit_channels, emitted, bounces = _trace_paths(
-        scene, ray, weight, noise, depth, roulette_depth or depth
+        scene, ray, weight, noise, depth, roulette_depth=roulette_depth or depth
     )
 
     if projector is None:
@@ -131,7 +132,7 @@ def collect_paths(
         reflected, vertices = _accumulate_radiance(bounces, emitted, slopes)
     else:
         vertices = _light_by_projector(scene, parameters, key, projector, bounces)
-        # Only the radiance is used here: the weights are those of projected light.
+        # Only the radiance is used here. The vertices are those of the projector above.
         no_slopes = [(0.0, 0.0)] * len(bounces)
         reflected, _ = _accumulate_radiance(bounces, emitted, no_slopes)
     reflected = dr.select(dr.isfinite(reflected), reflected, 0.0)
@@ -144,9 +145,10 @@ def collect_paths(
 def _compute_slopes(
     parameters: Any, key: str, bounces: Sequence[Bounce]
 ) -> list[tuple[Any, Any]]:
-    """Return for each bounce the derivatives of both BSDF values by the base color.
+    """Return for each bounce the derivatives by the base color of what it reflects.
 
-    The BSDFs are evaluated once more with all texels larger by `COLOR_STEP`.
+    There are two, see `Bounce.compute_slopes`. They are differences: the BSDFs are
+    evaluated once more with all texels larger by `COLOR_STEP`.
 
     Args:
         parameters: what `mi.traverse` returns for the scene.
@@ -162,6 +164,9 @@ def _light_by_projector(
     scene: Any, parameters: Any, key: str, projector: Any, bounces: Sequence[Bounce]
 ) -> list[tuple[Any, Any, Any]]:
     """Return the vertices of paths as a projector with a white image lights them.
+
+    Light is proportional to the image. So the light of a white image is the weight of
+    the texel that falls on the vertex.
 
     A vertex has its texture coordinates in the projector's image, its weight, and
     whether the camera sees it sharply, as from `_accumulate_radiance`. Other light does
@@ -230,7 +235,7 @@ def _accumulate_radiance(
     Args:
         bounces: bounces of the vertices but for the last, from the camera on.
         emitted: what each vertex emits; one more than bounces.
-        slopes: derivatives of both BSDF values of each bounce by the base color.
+        slopes: for each bounce the two derivatives of `Bounce.compute_slopes`.
 
     Returns:
         The radiance that leaves the first vertex, without its emission; and for each
@@ -466,7 +471,7 @@ def _trace_paths(
     is_sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
     throughput = mi.Spectrum(1.0)
     has_cut_outs = _has_cut_outs(scene)
-    # lanes whose path has gone through cut-outs only; not used without cut-outs
+    # lanes whose path has so far gone straight through cut-outs; only used with some
     passed_straight = mi.Bool(has_cut_outs)
     first_hit = _FirstHit(count)
 

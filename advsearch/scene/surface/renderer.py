@@ -208,8 +208,8 @@ class SurfaceRenderer(Predictor):
 
         Light is linear in the environment. So maps that differ only by exposure or tint
         share one stored light. Times the factor of each color channel, the light that
-        is returned is that of `inputs`. A light is computed on first use. Up to `MAX_BYTES` of lights are
-        stored; the oldest are dropped first.
+        is returned is that of `inputs`. A light is computed on first use. Up to
+        `MAX_BYTES` of lights are stored; the oldest are dropped first.
         """
         fingerprint = MapFingerprint.compute(
             inputs.get(
