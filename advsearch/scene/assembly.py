@@ -93,9 +93,9 @@ class MovingMesh:
         """Return the unit normals (V, 3) that follow from the faces, weighted by area.
 
         At a UV seam there are several vertices at one position with one normal. They
-        form a group (`_faces_and_groups`), and share the mean over all faces of the group.
-        Vertices at one position with different normals do not, so that creases stay
-        sharp.
+        form a group (`_faces_and_groups`), and share the mean over all faces of the
+        group. Vertices at one position with different normals do not, so that creases
+        stay sharp.
 
         Args:
             vertices: (V, 3) positions of the mesh's vertices.

@@ -445,8 +445,8 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
     """
     lower = mesh.vertices.min(axis=0)
     extent = max(float((mesh.vertices.max(axis=0) - lower).max()), 1e-12)
-    # Cells are centered at integers: the lowest point, 0, and the far end of the largest
-    # extent, grid - 1, are in the middle of a cell.
+    # Cells are centered at integers: the lowest point, 0, and the far end of the
+    # largest extent, grid - 1, are in the middle of a cell.
     scaled = (mesh.vertices - lower) / extent * (grid - 1)
     cells = np.floor(scaled + 0.5).astype(np.int64)
     _cell_codes, cluster_of = np.unique(_encode_rows(cells), return_inverse=True)

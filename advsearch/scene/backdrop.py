@@ -420,7 +420,7 @@ def make_backdrop(
 def compute_photograph_gain(
     description: SceneData, photograph: BackdropPhotograph
 ) -> float:
-    """Return the factor from a scene's radiance to a photograph's display-linear values.
+    """Return the factor from a scene's radiance to a photograph's linear values.
 
     With it a level surface of the reflectance `GREY_CARD`, lit by the environment, has
     the mean luminance of the photograph. The factor is 1 if no environment lights the
@@ -906,8 +906,8 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
 
     Raises InputError: the camera looks straight up or down.
     """
-    # Each column is an axis of the camera (right, down, ahead) in world coordinates. The
-    # opposite of "ahead" is the direction from the object to the camera.
+    # Each column is an axis of the camera (right, down, ahead) in world coordinates.
+    # The opposite of "ahead" is the direction from the object to the camera.
     right, _down, ahead = world_axes.T
     outwards = -ahead
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))

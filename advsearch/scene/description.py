@@ -285,8 +285,8 @@ class SceneDescription(SceneData):
             )
         with track_opened_files(photograph):
             pose, model = photograph_cameras.find_pose_and_model(photograph)
-        # The file's pose is for other camera axes. `AXES` maps ours (left, up, ahead) to
-        # these.
+        # The file's pose is for other camera axes. `AXES` maps ours (left, up, ahead)
+        # to these.
         to_world = pose @ AXES
         # from meters to object sizes
         to_world[:3, 3] /= self.object.size_in_metres

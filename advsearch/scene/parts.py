@@ -345,9 +345,7 @@ class PosedCamera:
 
         `aspect` is its width over its height.
         """
-        is_along_height = self.upright
-        is_wide = aspect > 1.0
-        is_along_smaller_side = is_along_height and is_wide
+        is_along_smaller_side = self.upright and aspect > 1.0
         if not is_along_smaller_side:
             return self.fov
         # from the height to the width: the tangents are in proportion to the sides

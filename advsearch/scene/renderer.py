@@ -126,8 +126,8 @@ class Renderer:
             scene renders them.
         n_renders: number of primal renders so far, those of differences included.
         n_gradients: number of adjoint renders so far.
-        n_non_finite: number of pixels and gradient entries that were NaN or infinite and
-            were set to zero.
+        n_non_finite: number of pixels and gradient entries that were NaN or infinite
+            and were set to zero.
 
     Args:
         scene: the scene inside Mitsuba, at the formation's resolution.
@@ -472,8 +472,9 @@ class Renderer:
                 _select_scene_inputs(inputs), subdivision
             )
             if "backdrop.front" in inputs:
-                # The first channel is the hidden fraction of the object. Where something
-                # in front hides most of a pixel, no surface of the scene is visible.
+                # The first channel is the hidden fraction of the object. Where
+                # something in front hides most of a pixel, no surface of the scene is
+                # visible.
                 is_hidden = inputs["backdrop.front"][..., 0] > 0.5
                 for dim in (0, 1):  # a pixel's value for all of its points
                     is_hidden = is_hidden.repeat_interleave(subdivision, dim)
@@ -671,8 +672,9 @@ class Renderer:
 
         Rows of a sensor may be read one after the other, so that each row is exposed
         during some of the moments only. `row_fractions` (H,) of a moment are its
-        fractions of the exposure of each row, which add up to 1 over the moments. The guides of the denoiser are averaged in the same manner. All moments
-        together count as one render.
+        fractions of the exposure of each row, which add up to 1 over the moments. The
+        guides of the denoiser are averaged in the same manner. All moments together
+        count as one render.
 
         Args:
             mount: the camera of a rig; None if the scene has one camera.
@@ -759,9 +761,9 @@ class Renderer:
             radiance = radiance * torch.exp2(exposure)
             coat = coat * torch.exp2(exposure)
         if "backdrop.color" in inputs:
-            # The photograph is display-linear, which is radiance times the gain, and has
-            # no exposure of ours. Nor has the change of the plane (channels 4 to 6),
-            # which is used relative to the plane's radiance.
+            # The photograph is display-linear, which is radiance times the gain, and
+            # has no exposure of ours. Nor has the change of the plane (channels 4 to
+            # 6), which is used relative to the plane's radiance.
             behind = inputs["backdrop.color"] / self.formation.gain
             coverage_and_plane = rendered[..., 3:7]
             layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
@@ -1074,8 +1076,8 @@ class _Radiance(torch.autograd.Function):
         noise_seed = seeds.derive_seed(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.replace_non_finite(cotangent)
         gradient_of_input = dict[str, Tensor]()
-        # The material form is right for more inputs. So it differentiates those that are
-        # reached by groups of both estimators.
+        # The material form is right for more inputs. So it differentiates those that
+        # are reached by groups of both estimators.
         by_material = _select_reached_inputs(renderer, "material")
         by_interior = _select_reached_inputs(renderer, "adjoint") - by_material
         material_names = [name for name in inputs if name in by_material]
@@ -1102,7 +1104,8 @@ class _Radiance(torch.autograd.Function):
             renderer.n_gradients += 1
         for name, gradient in gradient_of_input.items():
             gradient_of_input[name] = renderer.replace_non_finite(gradient)
-        # The six arguments of `forward` between `ctx` and the tensors have no gradients.
+        # The six arguments of `forward` between `ctx` and the tensors have no
+        # gradients.
         no_gradients = (None,) * 6
         return (*no_gradients, *map(gradient_of_input.get, ctx.names))
 

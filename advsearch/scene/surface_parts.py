@@ -88,8 +88,8 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
         _vertices, corners, atlas_uvs = atlas[index]
         uvs[group] = np.asarray(atlas_uvs, dtype=np.float64)[np.asarray(corners)]
     # An interpolated look-up near a border of the square also reads texels at the
-    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by half
-    # a gap on each side.
+    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by
+    # half a gap on each side.
     margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
     return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
 
@@ -317,8 +317,8 @@ class SurfaceParts:
         counts_faces: whether the faces are parts too.
         n_parts: number of parts: cells, row by row from v = 1, and then the faces.
         is_covered: (CELLS, CELLS) whether the center of a cell lies in a chart.
-        face_of_part: (count,) the face at the center of each part; of a cell outside of all
-            charts the nearest one.
+        face_of_part: (count,) the face at the center of each part; of a cell outside of
+            all charts the nearest one.
         centers: (count, 3) that center, in the mesh's coordinates.
         center_uvs: (count, 2) and its u and v.
     """

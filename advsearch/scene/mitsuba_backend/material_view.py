@@ -915,8 +915,8 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
     perpendicular = (
         torch.cos(angle) * along_second + torch.sin(angle) * edges.opening[edge_index]
     )
-    # The last random number is scaled to -2 to 2. Its sign chooses the exterior angle or
-    # the opposite one, and its magnitude minus 1 is the cosine of line and edge.
+    # The last random number is scaled to -2 to 2. Its sign chooses the exterior angle
+    # or the opposite one, and its magnitude minus 1 is the cosine of line and edge.
     signed_choice = 4.0 * random[:, 3:4] - 2.0
     perpendicular = torch.where(signed_choice < 0.0, -perpendicular, perpendicular)
     edge_cosine = signed_choice.abs() - 1.0

@@ -331,6 +331,7 @@ def _to_plain_entry(value: object) -> object:
     matrix = getattr(value, "matrix", None)  # of a transform
     if matrix is None:
         return value
-    # The reshape drops a further axis, of one lane, that some of Dr.Jit's matrices have.
+    # The reshape drops a further axis, of one lane, that some of Dr.Jit's matrices
+    # have.
     size = len(matrix)
     return np.array(matrix, dtype=np.float64).reshape(size, size)

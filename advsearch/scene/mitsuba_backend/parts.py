@@ -697,8 +697,9 @@ def _check_background(
             "leave one of the two out"
         )
     has_plain_backdrop = description.backdrop and not description.backdrop_photograph
-    # A lens has no name if its numbers are searched. Some numbers make a lens that folds
-    # (two directions fall on one point of the image), and leaves other parts black.
+    # A lens has no name if its numbers are searched. Some numbers make a lens that
+    # folds (two directions fall on one point of the image), and leaves other parts
+    # black.
     is_searched = not model.name
     may_leave_black = model.black_fraction > 0.0 or is_searched
     if has_plain_backdrop and may_leave_black:

@@ -77,8 +77,8 @@ class PathSamples:
         state, increment = mi.sample_tea_32(seed, sample)
         self.rng = mi.PCG32(initstate=state, initseq=increment)
         self.index = sample % spp
-        # All samples of a pixel have one permutation seed, made from the image's seed and
-        # the index of the pixel's first sample.
+        # All samples of a pixel have one permutation seed, made from the image's seed
+        # and the index of the pixel's first sample.
         first_sample = sample - self.index
         self.permutation, _ = mi.sample_tea_32(0, first_sample + seed)
         self.dimension = mi.UInt32(0)

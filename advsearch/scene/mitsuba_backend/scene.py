@@ -82,8 +82,10 @@ class MitsubaScene:
 
     Attributes:
         max_depth: longest light path in segments, as the argument.
-        current_max_depth: current longest light path; `limit_depth` makes it smaller for a time.
-        input_assembler: function that turns the inputs of a space into those of this scene.
+        current_max_depth: current longest light path; `limit_depth` makes it smaller
+            for a time.
+        input_assembler: function that turns the inputs of a space into those of this
+            scene.
         description_and_filter: description of the scene, and name of the filter.
         input_names: names of all inputs that can be set.
         parameters: Mitsuba's parameters of the scene, from `mi.traverse`.
@@ -272,8 +274,8 @@ class MitsubaScene:
             for name, (key, _) in self.declared_inputs.items()
             if key.endswith((POSITIONS, NORMALS))
         )
-        # Numbers that Mitsuba compiles into its kernels, as constants. They are the ones
-        # that are converted by `to_constant`.
+        # Numbers that Mitsuba compiles into its kernels, as constants. They are the
+        # ones that are converted by `to_constant`.
         self._constants = frozenset(
             name
             for name, (_, scene_input) in self.declared_inputs.items()
@@ -950,8 +952,8 @@ class MitsubaScene:
             hidden = {**adjoint, "hide_emitters": True}
             if self.plane_radiance is not None:
                 hidden["type"] = "advsearch_photograph"
-                # gloss and roughness of the plane's coat, by the names of the properties
-                # of `PhotographPath`
+                # gloss and roughness of the plane's coat, by the names of the
+                # properties of `PhotographPath`
                 hidden["reflectance"] = self.description_and_filter[0].get_number(
                     "ground.gloss"
                 )

@@ -128,8 +128,8 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
         InputError: an entry is no number, or not of the right shape.
     """
     for key, value in plugin.items():
-        # A color such as {"type": "rgb", "value": ...} is a value here, and no plugin. So
-        # is a dictionary without a type, which is rejected below as a number.
+        # A color such as {"type": "rgb", "value": ...} is a value here, and no plugin.
+        # So is a dictionary without a type, which is rejected below as a number.
         is_plugin = isinstance(value, Mapping) and value.get("type", "rgb") not in (
             "rgb",
             "spectrum",

@@ -796,8 +796,8 @@ def _parse_base_color(value: object) -> _Color | None:
     pixels = _read_pixels(value) if value["type"] == "bitmap" else None
     if pixels is None:
         return None
-    # What is left is how the image is looked up. `IMAGE_ENTRIES` also has `to_uv`, which
-    # is a field of its own.
+    # What is left is how the image is looked up. `IMAGE_ENTRIES` also has `to_uv`,
+    # which is a field of its own.
     options = {key: entry for key, entry in value.items() if key not in IMAGE_ENTRIES}
     if options.get("filter_type") == "nearest":
         pixels = _repeat_texels(pixels)  # so that its texels stay sharp

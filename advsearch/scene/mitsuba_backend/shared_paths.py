@@ -255,7 +255,8 @@ def _divide_samples(n_pixels: int, spp: int) -> Iterator[Any]:
     step = max(1, MAX_SAMPLES // spp)
     for first in range(0, n_pixels, step):
         count = min(step, n_pixels - first) * spp
-        # `opaque`: a literal would be compiled into a kernel of its own for each launch.
+        # `opaque`: a literal would be compiled into a kernel of its own for each
+        # launch.
         first_sample = dr.opaque(mi.UInt32, first * spp)
         samples = dr.arange(mi.UInt32, count) + first_sample
         dr.eval(samples)

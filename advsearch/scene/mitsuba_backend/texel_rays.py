@@ -278,7 +278,7 @@ def is_visible_from_behind(
 
 
 def _sample_outside_rays(positions: Float32Array) -> Any:
-    """Return `N_OUTSIDE_RAYS` random rays onto positions (n, 3), from outside and above."""
+    """Return `N_OUTSIDE_RAYS` random rays from above onto positions (n, 3)."""
     generator = np.random.default_rng(0)
     to_origin = generator.standard_normal((N_OUTSIDE_RAYS, 3))
     to_origin /= np.linalg.norm(to_origin, axis=1, keepdims=True)
@@ -593,8 +593,9 @@ def _sample_bsdf(
     bsdf = si.bsdf()
     opacity = _eval_opacity(si)
     black = dr.mean(bsdf.eval(context, si, cosine_direction) / opacity)
-    # A black surface reflects nothing but gloss, so that samples of its BSDF are samples
-    # of the gloss. A direction below the surface (z < 0) is transmitted, and is none.
+    # A black surface reflects nothing but gloss, so that samples of its BSDF are
+    # samples of the gloss. A direction below the surface (z < 0) is transmitted, and is
+    # none.
     bsdf_sample, bsdf_weight = bsdf.sample(context, si, sample1, sample2)
     is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
     weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
@@ -657,7 +658,7 @@ def _hit_point(
 
 
 def _eval_opacity(si: Any) -> Any:
-    """Return the fraction of light that a surface stops, at least 0.001 to divide by."""
+    """Return the fraction of light that a surface stops, at least 0.001."""
     return dr.maximum(1.0 - eval_transmittance(si, True), 1e-3)
 
 

@@ -286,8 +286,8 @@ def _fetch_paths(
     """Evaluate the kernel of a pass and fetch images and vertices into torch.
 
     Args:
-        channels: channels of the radiance and of the other images of `TracedPaths`, in their
-            order, for each sample.
+        channels: channels of the radiance and of the other images of `TracedPaths`, in
+            their order, for each sample.
         vertices: for each vertex its texture coordinates, its weight, and whether the
             camera sees it sharply.
         size: height and width of the image.
@@ -463,8 +463,8 @@ def _trace_paths(
             its throughput, but at most `MAX_SURVIVAL`.
 
     Returns:
-        The images of `TracedPaths` after the radiance, in their order, channel by channel;
-        what each vertex emits; and the bounces at all vertices but the last.
+        The images of `TracedPaths` after the radiance, in their order, channel by
+        channel; what each vertex emits; and the bounces at all vertices but the last.
     """
     count = dr.width(ray.o)
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
@@ -513,8 +513,8 @@ def _trace_paths(
         is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
-        # Russian roulette. There is none at the last bounce, after which a path has only
-        # one more segment.
+        # Russian roulette. There is none at the last bounce, after which a path has
+        # only one more segment.
         n_bounces = segment + 1
         if roulette_depth <= n_bounces < depth - 1:
             survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)

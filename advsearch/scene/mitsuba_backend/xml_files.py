@@ -114,8 +114,8 @@ def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element)
     except RuntimeError as error:
         line_match = _ERROR_LINE.match(str(error))
         where = ""
-        # The lines of included files are inserted into the text that Mitsuba has parsed,
-        # so that a line is known only without any.
+        # The lines of included files are inserted into the text that Mitsuba has
+        # parsed, so that a line is known only without any.
         if line_match and not text.included:
             where = f"line {int(line_match[1]) + text.lines_before}: "
         raise FileFormatError(
@@ -284,7 +284,8 @@ class _SceneText:
                 f"{self.path}: includes {format_name(name)}, which {reason}"
             ) from None
         if root.tag != "scene":
-            # The root is the only element: it gets a parent, as elements of a scene have.
+            # The root is the only element: it gets a parent, as elements of a scene
+            # have.
             single = root
             root = ElementTree.Element("scene")
             root.append(single)

@@ -311,8 +311,8 @@ def _read_primitives(
                 continue
             _surface, uv_scale, uv_shift = fitted[piece.material_index]
             part = transform_part(_fit_uvs(piece.part, uv_scale, uv_shift), pose)
-            # The material of the variant decides about the surface, and the original one
-            # about the name of the mesh, see `_group_by_material`.
+            # The material of the variant decides about the surface, and the original
+            # one about the name of the mesh, see `_group_by_material`.
             primitives.append(
                 PosedPrimitive(
                     primitive.material, variant_material=piece.material_index, part=part

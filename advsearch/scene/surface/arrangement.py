@@ -94,9 +94,9 @@ class SurfaceView:
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
-        # Rays are numbered camera after camera, and `samples.ray_index`, the ray of each
-        # sample, is ascending. So this camera's samples lie between those of its first
-        # ray and of the next camera's first ray.
+        # Rays are numbered camera after camera, and `samples.ray_index`, the ray of
+        # each sample, is ascending. So this camera's samples lie between those of its
+        # first ray and of the next camera's first ray.
         n_rays = height * width * RAYS_PER_PIXEL
         first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
         start, end = torch.searchsorted(samples.ray_index, first_rays).tolist()
@@ -205,7 +205,7 @@ class Arrangement:
     Args:
         renderer: renderer of the scene.
         inputs: assembled inputs of the scene, without `FREE_INPUTS`.
-        texture: rows and columns of the base color.
+        texture_shape: rows and columns of the base color.
         seed: seed of the rays.
 
     Attributes:
@@ -450,7 +450,7 @@ class Arrangement:
         )
 
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
-        """Find where the blurred maps show the ground, as seen from the object's center.
+        """Find where the blurred maps, seen from the object's center, show the ground.
 
         A photographed ground takes its color from the environment's map. The color of a
         point is that in its direction from the camera that took the photograph, which

@@ -153,7 +153,8 @@ def make_ground_texels(
     Args:
         name: name of the ground.
         height: height of the plane, in object sizes.
-        half_width: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no texels.
+        half_width: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no
+            texels.
         center: x and y of the object's center.
     """
     half_width = min(half_width, MAX_GROUND_REACH)

@@ -145,7 +145,7 @@ def find_light_groups(renderer: Renderer) -> LightGroups:
 
 
 class _Effect(NamedTuple):
-    """Effect of a group of coordinates that changes only light or the finished image."""
+    """Effect of a group of coordinates on light or on the finished image."""
 
     changed: frozenset[str]  # names of the inputs that it changes
     is_harmonic: bool  # whether it adds spherical harmonics to the environment
@@ -495,7 +495,7 @@ class BasisRenderer(Predictor):
         changing: result of `find_light_groups`, which is called if this is None.
 
     Attributes:
-        non_finite: how many numbers were not finite, and were replaced by 0.
+        n_non_finite: how many numbers were not finite, and were replaced by 0.
     """
 
     def __init__(

@@ -122,8 +122,8 @@ class ColoredRows:
         # Until `finish`: the sums of what was added. They are released then.
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         self._colors: Float32Array = np.zeros((rows, 3), dtype=np.float32)
-        # After `finish`: the fractions, packed if small (then there is no pair), and else
-        # as a matrix and its transpose; and the colors.
+        # After `finish`: the fractions, packed if small (then there is no pair), and
+        # else as a matrix and its transpose; and the colors.
         self._packed: _PackedRows | None = None
         self._csr_pair: tuple[Tensor, Tensor] | None = None
         self._stored_colors = PackedImage(torch.zeros(0))
@@ -575,7 +575,7 @@ class LinearRenderer(Predictor):
     Attributes:
         linearized_at: values of the inputs with a matrix, at which the image is
             linearized, by name.
-        non_finite: how many numbers were not finite, and were replaced by 0.
+        n_non_finite: how many numbers were not finite, and were replaced by 0.
 
     Raises:
         TransportTooLargeError: the matrices would take more than `MAX_BYTES`.
