@@ -260,7 +260,8 @@ class InputAssembler:
         if PHOTOGRAPH_INPUT in parameters:
             photograph_index = int(parameters.pop(PHOTOGRAPH_INPUT))
         parameters |= self._get_image_inputs(photograph_index)
-        # Lamps move with the car that carries them, whose pose is among the inputs.
+        # Lamps move with the car that carries them, whose pose is in `inputs`. From
+        # `parameters` it is removed below.
         for part in self._carried:
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():

@@ -185,9 +185,12 @@ class SceneDescription(SceneData):
         values = dict(self.values)
         if "ground.size" not in self.requested:
             values["ground.size"] = PLANE_SIZE
+        # `backdrop` says that something is behind the object instead of the
+        # environment.
         scene = replace(
             self, backdrop=True, backdrop_photograph=photograph, values=values
         )
+        # A scene in a photograph has no road or place: those of `self` are removed.
         return with_requested_ground(scene)
 
     def _check_backdrop(self, photograph: BackdropPhotograph) -> None:

@@ -252,13 +252,7 @@ def _make_lamps(
         weight: how often the renderer samples each beam, relative to the environment.
     """
     if carrier == CAMERA:
-        # in the coordinates of the camera's car, see `compute_car_pose`
-        left_position = np.array(EGO_LAMP_POSITION)
-        right_position = left_position * [1.0, -1.0, 1.0]  # mirrored to the other side
-        positions = [
-            position / scene.size_in_metres
-            for position in (left_position, right_position)
-        ]
+        positions = _compute_ego_beam_positions(scene)
     else:
         part = scene.meshes[carrier]
         units_per_metre = _compute_units_per_metre(scene, part)
@@ -282,6 +276,39 @@ def _make_lamps(
             power=rear_power,
         )
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
+    yield from _make_beams(scene, carrier, kind, positions, radiance_unit, weight)
+
+
+def _compute_ego_beam_positions(scene: SceneData) -> list[Float64Array]:
+    """Return where the left and the right beam of the camera's own car start.
+
+    They are in object sizes, in the coordinates of that car, see `compute_car_pose`.
+    """
+    left_position = np.array(EGO_LAMP_POSITION)
+    right_position = left_position * [1.0, -1.0, 1.0]  # mirrored to the other side
+    return [
+        position / scene.size_in_metres for position in (left_position, right_position)
+    ]
+
+
+def _make_beams(
+    scene: SceneData,
+    carrier: str,
+    kind: str,
+    positions: Sequence[Float64Array],
+    radiance_unit: float,
+    weight: float,
+) -> Iterable[ScenePart]:
+    """Yield the left and the right beam of a car.
+
+    Args:
+        scene: scene in which they shine.
+        carrier: the mesh that carries them, or `CAMERA`.
+        kind: beam, "low" or "high".
+        positions: where they start, in the car's coordinates.
+        radiance_unit: luminance in cd/m2 of a radiance of 1 in the scene.
+        weight: how often the renderer samples each beam, relative to the environment.
+    """
     # A beam has its table in candela. This is its color, times the factor from candela
     # to the scene's unit, which is radiance times squared object size.
     beam_color = WHITE / (radiance_unit * scene.size_in_metres**2)

@@ -357,9 +357,10 @@ class Renderer:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two images of a configuration with independent noise.
 
-        The tone curve is concave, so that it makes noisy images darker on average. The
-        two images therefore go through the curve's tangent at the third, denoised
-        image, and may leave [0, 1]. There is no graph, and the renders are not counted.
+        The tone curve is concave, so that it makes noisy images darker on average. So
+        the two images are not mapped by the curve, but by a straight line: its tangent
+        at the third, denoised image. They may leave [0, 1]. There is no graph, and the
+        renders are not counted.
 
         Args:
             u: (d,) configuration in [0, 1].
@@ -514,7 +515,7 @@ class Renderer:
             The loss without graph, and (d,) float32.
         """
         # During the call below, `_select_difference_groups` leaves these out: "secant"
-        # in any case, since the loop at the end adds it.
+        # in any case, since its differences are written at the end.
         self._skipped_estimators = (
             DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
         )
@@ -529,8 +530,30 @@ class Renderer:
             self._skipped_estimators = frozenset()
         # A loss that does not depend on u has no graph, and no gradient.
         derivative = torch.zeros_like(leaf) if gradient is None else gradient
-        if free:
-            return value.detach(), derivative
+        if not free:
+            self._write_secant_differences(loss, u.detach(), seed, spp, derivative)
+        return value.detach(), derivative
+
+    @torch.no_grad()
+    def _write_secant_differences(
+        self,
+        loss: Callable[[Tensor], Tensor],
+        u: Tensor,
+        seed: int,
+        spp: int,
+        derivative: Tensor,
+    ) -> None:
+        """Write differences of a loss into a derivative (d,), in place.
+
+        Only the coordinates with the estimator "secant" are written.
+
+        Args:
+            loss: function from an image (H, W, 3) sRGB to a scalar.
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel, unless the plan has its own number.
+            derivative: (d,) tensor that is changed.
+        """
         noise_seed = seeds.derive_seed(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
 
@@ -538,11 +561,8 @@ class Renderer:
             image = self._render_image(configuration, noise_seed, difference_spp)
             return loss(image)
 
-        with torch.no_grad():
-            for group in self.plan.select_groups("secant"):
-                # writes the entries of the group into `derivative`
-                write_central_differences(compute_loss, group, u.detach(), derivative)
-        return value.detach(), derivative
+        for group in self.plan.select_groups("secant"):
+            write_central_differences(compute_loss, group, u, derivative)
 
     # ---- from u to the image
 

@@ -155,7 +155,8 @@ def _parse_thing(part: str) -> RequestedThing:
     size = None
     if "size" in options:
         size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
-    # what is behind a # names a part of a file, as in scene.glb#chair
+    # Without `name=` the file's name counts, without what is behind a #, which names a
+    # part of the file, as in scene.glb#chair.
     name = make_safe_name(Path(options.get("name") or object_spec.partition("#")[0]))
     return RequestedThing(
         object_spec=object_spec,

@@ -173,7 +173,8 @@ class FilmView:
                 mesh = _make_mesh(shape, parameters, positions, normals)
                 dr.enable_grad(mesh.positions, mesh.normals)
                 moving_meshes[vertices_name] = mesh
-            # A rectangle, which has two faces, is left out, such as the ground.
+            # all other meshes but single rectangles, which have two faces, such as the
+            # ground; the normals of still meshes are not used
             elif shape.is_mesh() and shape.face_count() > 2:
                 buffer = parameters[f"{shape.id()}.{POSITIONS}"]
                 positions = buffer.torch().reshape(-1, 3).clone()

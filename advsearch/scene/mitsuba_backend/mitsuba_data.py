@@ -110,7 +110,11 @@ def _find_numbers(
             continue
         estimators = _find_valid_estimators(scene.parameters.flags(key))
         numbers[key] = PluginNumber(
-            key, values, input_of_key.get(key, ""), estimators, is_plain
+            key,
+            values,
+            input=input_of_key.get(key, ""),
+            valid=estimators,
+            plain=is_plain,
         )
     return numbers, other_types
 

@@ -671,8 +671,9 @@ class _PlaneHits:
     ) -> tuple[Any, Any]:
         """Choose whether a path goes on from the matt ground or from its coat.
 
-        This sets `weights`. In each lane only the weight of the chosen bounce is not 0;
-        it is divided by the probability of the choice.
+        This sets `weights`, one for each quantity of the class. In each lane only the
+        weight of the chosen bounce is not 0. It is divided by the probability of the
+        choice.
 
         Args:
             coat: coat of the plane.
@@ -691,7 +692,8 @@ class _PlaneHits:
         self.weights = [
             dr.select(leaves_coat, 0.0, matt_weight),
             mi.Color3f(dr.select(leaves_coat, coat_weight, 0.0)),
-            # The environment in the coat has no light that other surfaces send.
+            # The environment in the coat is that without objects: no light that other
+            # surfaces send is in it.
             mi.Color3f(0.0),
         ]
         direction = dr.select(leaves_coat, reflected, matt_direction)
@@ -824,9 +826,10 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
     ) -> Any:
         """Sample paths of light, or in the adjoint modes replay them.
 
-        A path that meets the plane first goes on from there; `prb` traces that rest.
-        Its radiance is part of the change of the plane's radiance, which is returned in
-        the further channels, while the color is 0. See `_PlaneHits`.
+        Most work is done by the `sample` of the base class, `prb`. It traces a camera
+        ray that does not meet the plane first. If a ray does, it traces the path that
+        goes on from the plane. The radiance of that path is part of the further
+        channels, see `_PlaneHits.list_changes`, and the color of the ray is 0.
 
         Args:
             mode: primal (trace the image) or an adjoint mode of Dr.Jit.
@@ -845,11 +848,11 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         camera_ray = mi.Ray3f(dr.detach(ray))
         plane = _PlaneHits(scene, sampler, camera_ray, mi.Bool(active), self.coat)
         if mode != dr.ADMode.Primal:
-            # A ray that meets the plane has color 0. Its rest, which `prb` traces,
-            # counts by the further channels only.
+            # Where the plane is hit, the radiance that `prb` traces affects the further
+            # channels only, whose cotangents are those of `δaovs`.
             path_cotangent = plane.backpropagate(scene, δaovs)
             δL = dr.select(plane.is_hit, path_cotangent, δL)
-        L, valid, _, state_out = super().sample(
+        L, valid, _channels, state_out = super().sample(
             mode=mode,
             scene=scene,
             sampler=sampler,
@@ -1175,7 +1178,9 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def _bend_by_drops(self, direction: Any, sample: Any) -> tuple[Any, Any]:
         """Refract the rays that pass through a raindrop on the sheet before the camera.
 
-        `sample` chooses the point of the aperture: drops are near, and so out of focus.
+        A ray passes the sheet at the distance of a point of the aperture from where it
+        would pass for a pinhole; `sample` chooses the point. So drops, which are near,
+        are out of focus. The directions of rays stay, since the scene is far.
 
         Returns:
             The unit directions, and the fraction of the light that passes: 1 without a

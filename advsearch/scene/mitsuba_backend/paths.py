@@ -339,7 +339,8 @@ class LightPath:
         Each has nine channels: radiance, albedo and normal.
         """
         guides = [*self.albedo, *self.normal]
-        # Without a changed surface, `radiance` is all of the radiance.
+        # A path that has met no changed surface has all its light in `radiance`, and
+        # nothing in `radiance_before`.
         unchanged = [
             *dr.select(self.has_met, self.radiance_before, self.radiance),
             *(dr.select(self.has_met_first, 0.0, channel) for channel in guides),

@@ -374,7 +374,7 @@ class MitsubaScene:
     def get_base_value(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh tensor of the input's shape.
 
-        All inputs of the scene are reset to their base values.
+        To read it, all inputs of the scene are reset to their base values.
         """
         key, scene_input = self.declared_inputs[name]
         self._set_inputs_exactly({})  # Mitsuba's parameter then has the base value
@@ -453,7 +453,8 @@ class MitsubaScene:
                 )
                 image = drjit_image.torch().clone()
                 if method == "guides":
-                    # the last six channels are albedo and normal
+                    # The last six channels are albedo and normal; "aov" also has a
+                    # color.
                     image = image[..., -6:]
                     image[..., :3].clamp_(0.0, 1.0)
                 images.append(image)
@@ -896,7 +897,8 @@ class MitsubaScene:
                 )
         is_buffer = name in self._buffers
         if name not in self._base_values:
-            # A buffer is copied, since it is overwritten in place below.
+            # The memory of a buffer is copied, since it is overwritten in place below.
+            # Other values are replaced.
             base = current.torch().clone() if is_buffer else current
             self._base_values[name] = type(current)(base)
         if tensor is None:
@@ -1017,8 +1019,8 @@ def _to_repeating(
         size: rows and columns of the texture.
     """
     if surface is None:
-        # Clamp to the centers of the outer texels: beyond them Mitsuba's look-up stays
-        # constant, but one that repeats would blend with the other side.
+        # a projector's image. Beyond the centers of the outer texels Mitsuba's look-up
+        # stays constant, but one that repeats would blend with the other side.
         half_texel = 0.5 / torch.tensor(size[::-1])
         return uv.clamp(half_texel, 1.0 - half_texel)
     options = next(

@@ -234,8 +234,9 @@ class ViewTracer:
             # without a lens a single 0, since the kernel's argument cannot be empty
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
             lane = dr.arange(mi.UInt32, count * height * width * RAYS_PER_PIXEL)
-            # A recording takes its size from its evaluated arguments. If the lanes were
-            # not evaluated, it would take that of the environment's map.
+            # A recording has as many lanes as its evaluated arguments have entries. If
+            # the indices of the lanes were not evaluated, these would be the entries of
+            # the environment's map.
             dr.eval(lane)
             channels = recording(
                 self._scene._scene,
@@ -614,8 +615,9 @@ class ViewTracer:
     ) -> Any:
         """Return the diffuse radiance of what was hit.
 
-        On a photographed ground the texels hold fractions; they are multiplied by the
-        photograph in the direction from the point where it was taken.
+        On a photographed ground the texels hold factors instead of radiance. They are
+        multiplied by the photograph, in the direction from the point where it was
+        taken.
 
         Args:
             si: the hit.

@@ -312,7 +312,8 @@ def _make_surface(part: parts.MeshPart, part_inputs: Plugin) -> Plugin:
         part_inputs: its inputs by names such as "roughness"; those that are set here
             are removed.
     """
-    # The caller has put the base color into `part` already.
+    # The caller has put the base color into `part` already. A surface of the user's has
+    # no other inputs of ours.
     if part.surface is not None:
         base_color = part.base_color
         return fill_base_color(

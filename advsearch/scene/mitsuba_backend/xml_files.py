@@ -246,7 +246,7 @@ class _SceneText:
         place.
 
         A `<default name="x" value="1"/>` gives `$x` its value in everything that comes
-        after it, in included files too.
+        after it, in included files too. If there are several, the first one counts.
         """
         children: list[ElementTree.Element] = []
         for child in element:

@@ -185,6 +185,7 @@ def read_place_meshes(
     variant_index = None if variant is None else _find_variant(path, header, variant)
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
+    # what no import of glTF reads, and what only a place leaves out
     note_skipped_contents(_drop_supported_extensions(header), notes)
     _note_omissions(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))

@@ -269,9 +269,38 @@ class Arrangement:
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
         )
-        # For each side of the object: the matrix that takes the light on its texels to
-        # the fine grid. The back has the same texels, but the opposite normals.
-        self._to_fine = [
+        self._to_fine = self._make_lookup_matrices(
+            surfaces, charts, vertices, normals, met_cells
+        )
+        if self._has_ground:
+            ground_texels = surfaces[-1]
+            self._smooth = self._make_ground_smoothing(ground_texels, met_cells)
+        # both sides of the object have the same gloss, and the ground has none
+        self.lobes = [self._measure_object_lobes()] * self.n_sides
+        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
+        self.world_to_map = torch.tensor(get_world_to_map(scene), dtype=torch.float32)
+        self._ground_below = self._find_ground_below(object_center)
+        self._views = self._make_view_tracer(object_center)
+
+    def _make_lookup_matrices(
+        self,
+        surfaces: Sequence[texels.LitTexels],
+        charts: Charts,
+        vertices: Float32Array,
+        normals: Float32Array,
+        met_cells: Ints,
+    ) -> list[Tensor]:
+        """Return for each side of the object a matrix from texels to the fine grid.
+
+        Args:
+            surfaces: texels of each surface; the sides of the object come first.
+            charts: rasterized texture coordinates of the object.
+            vertices: (V, 3) in world space.
+            normals: (V, 3) in world space.
+            met_cells: (texels, rays) cells that rays from all texels met.
+        """
+        # The back has the same texels as the front, but the opposite normals.
+        return [
             texels.make_lookup_matrix(
                 surfaces[side],
                 charts,
@@ -282,15 +311,6 @@ class Arrangement:
             )
             for side in range(self.n_sides)
         ]
-        if self._has_ground:
-            ground_texels = surfaces[-1]
-            self._smooth = self._make_ground_smoothing(ground_texels, met_cells)
-        # both sides of the object have the same gloss, and the ground has none
-        self.lobes = [self._measure_object_lobes()] * self.n_sides
-        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
-        self.world_to_map = torch.tensor(get_world_to_map(scene), dtype=torch.float32)
-        self._ground_below = self._find_ground_below(object_center)
-        self._views = self._make_view_tracer(object_center)
 
     def _make_ground_texels(self, object_center: Float32Array) -> texels.LitTexels:
         """Return the texels of the ground, which goes on from below the object (3,)."""

@@ -186,10 +186,10 @@ class SurfaceRenderer(Predictor):
     def n_bytes(self) -> int:
         """Memory of the arrangement and the stored lights.
 
-        A renderer with a fixed light shares the arrangement with another renderer, so
-        that only its light counts.
+        A renderer with a fixed light was made by `with_fixed_light`. It shares the
+        arrangement with the original, so that only its light counts.
         """
-        if self.fixed_light is not None:  # the rest is shared
+        if self.fixed_light is not None:
             return self.fixed_light.n_bytes
         lights = sum(light.n_bytes for light in self.stored_lights.values())
         return self.arrangement.n_bytes + lights

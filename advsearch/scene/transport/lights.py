@@ -159,7 +159,8 @@ def _measure_effect(
     """Return the effect of a group of coordinates; None if it changes more than light.
 
     Several configurations, which differ from `reference` in this group only, are
-    compared with `base_inputs`, the scene inputs at `reference`.
+    compared with `base_inputs`, the scene inputs at `reference`. The kinds of changes
+    are those of `_Change`.
     """
     changed: set[str] = set()
     is_harmonic = False
@@ -216,7 +217,7 @@ class _Change(Enum):
 
     NONE = "not at all"
     POWER = "in power and color"
-    HARMONICS = "by spherical harmonics"
+    HARMONICS = "by spherical harmonics"  # smooth patterns over all directions
     OTHER = "in more than light"
 
 
@@ -554,7 +555,8 @@ class BasisRenderer(Predictor):
         }
         renderers = []
         for index, light_inputs in enumerate(self._lights.inputs_of_light):
-            # `LightBasis` has put all projectors into the first light.
+            # All projectors are in the first light of `LightBasis`, so that only there
+            # their patterns have an effect, and need a matrix.
             has_projectors = index == 0
             renderers.append(
                 LinearRenderer(
@@ -652,6 +654,7 @@ def _find_group_refusal(
     changed_inputs = renderer.inputs_by_group.get(group.name, frozenset())
     parts = renderer.scene.description_and_filter[0].parts
     haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
+    # whether it changes haze and nothing else
     is_haze = bool(changed_inputs) and all(
         name.startswith(haze_prefixes) for name in changed_inputs
     )

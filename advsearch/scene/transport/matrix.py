@@ -235,9 +235,9 @@ class ColoredRows:
         """
         if self._small:
             self._packed = _PackedRows(
-                fractions.astype(np.float16),
-                like.indices.astype(self._column_type),
-                like.indptr,
+                fractions=fractions.astype(np.float16),
+                columns=like.indices.astype(self._column_type),
+                row_starts=like.indptr,
             )
             return
         matrix = scipy.sparse.csr_matrix(
