@@ -84,8 +84,8 @@ FAULTS = (
     Fault(
         "scene: gradients have the noise of the picture",
         "advsearch/scene/renderer.py",
-        'seeds.stream(renderer.root_seed, "gradient", ctx.seed)',
-        'seeds.stream(renderer.root_seed, "primal", ctx.seed)',
+        'seeds.derive_seed(renderer.root_seed, "gradient", ctx.seed)',
+        'seeds.derive_seed(renderer.root_seed, "primal", ctx.seed)',
         ("tests/scene/test_renderer.py",),
     ),
     Fault(

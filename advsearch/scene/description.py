@@ -532,7 +532,7 @@ class SceneDescription(SceneData):
         front_remarks: tuple[str, ...] = ()
         stands_on_road = self.is_in_lane or has_lanes(self)
         if front is not None and stands_on_road:
-            # how the front was found: on a road it is seen if that is wrong
+            # how the front was found, which matters on a road
             front_remarks = (front.reason,)
         traffic_remarks: tuple[str, ...] = ()
         if self._drives_against_traffic:

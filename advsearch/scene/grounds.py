@@ -185,7 +185,7 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
         return replace(scene, parts=other_parts)
     environment = scene.environment
     radiance_unit = None if environment is None else environment.candelas
-    # Darkness is measured only for a place with lamps, since it takes some time.
+    # Nothing but lamps depends on darkness.
     is_dark = bool(place.file.lamps) and _is_dark(environment)
     place_parts = make_place_parts(
         place, scene.size_in_metres, radiance_unit, is_dark=is_dark
