@@ -1178,9 +1178,9 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def _bend_by_drops(self, direction: Any, sample: Any) -> tuple[Any, Any]:
         """Refract the rays that pass through a raindrop on the sheet before the camera.
 
-        Rays meet the sheet shifted by points of the aperture, which `sample` chooses. So
-        drops, which are near, are out of focus. The directions of rays are those of a
-        pinhole, so that the scene is sharp.
+        Rays meet the sheet shifted by points of the aperture, which `sample` chooses.
+        So drops, which are near, are out of focus. The directions of rays are those of
+        a pinhole, so that the scene is sharp.
 
         Returns:
             The unit directions, and the fraction of the light that passes: 1 without a

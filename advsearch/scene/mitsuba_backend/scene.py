@@ -453,8 +453,8 @@ class MitsubaScene:
                 )
                 image = drjit_image.torch().clone()
                 if method == "guides":
-                    # The last six channels are albedo and normal; "aov" also has a
-                    # color.
+                    # Albedo and normal are the last six channels. There may be a color
+                    # before them.
                     image = image[..., -6:]
                     image[..., :3].clamp_(0.0, 1.0)
                 images.append(image)
