@@ -66,7 +66,7 @@ class MovingMesh:
         """Return world-space vertices and unit normals, both (V, 3).
 
         Args:
-            to_world: invertible affine map (4, 4); None for the base pose.
+            to_world: invertible affine map (4, 4); None for the mesh's base pose.
             offsets: displacement (V, 3) of the vertices in mesh coordinates; None for
                 none.
         """
@@ -75,11 +75,12 @@ class MovingMesh:
         matrix = self.to_world.to(device) if to_world is None else to_world
         vertices = self.vertices.to(device)
         normals = self.normals.to(device)
-        # The file's normals need not be those of its faces (they may be smoothed). So
-        # they are not computed anew, but changed by as much as those of the faces.
+        # The file's normals may differ from those of its faces, for example if they are
+        # smoothed. So they are not replaced: the change of the faces' unit normals is
+        # added to them.
         if offsets is not None:
-            original = self._original_area_normals.to(device)
-            change = self._compute_area_normals(vertices + offsets) - original
+            original = self._original_face_normals.to(device)
+            change = self._average_face_normals(vertices + offsets) - original
             vertices = vertices + offsets
             normals = normals + change
         world_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
@@ -88,19 +89,21 @@ class MovingMesh:
         lengths = world_normals.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return world_vertices, world_normals / lengths
 
-    def _compute_area_normals(self, vertices: Tensor) -> Tensor:
+    def _average_face_normals(self, vertices: Tensor) -> Tensor:
         """Return the unit normals (V, 3) that follow from the faces, weighted by area.
 
         At a UV seam there are several vertices at one position with one normal. They
-        form a group (`_shared_groups`), and share the mean over all faces of the group.
-        Vertices at one position with different normals do not, so that creases stay
-        sharp.
+        form a group (`_faces_and_groups`), and share the mean over all faces of the
+        group. Vertices at one position with different normals do not, so that creases
+        stay sharp.
 
         Args:
             vertices: (V, 3) positions of the mesh's vertices.
         """
         # (F, 3) vertices of the faces, and (V,) the group of vertices that share a mean
-        faces, groups = (indices.to(vertices.device) for indices in self._shared_groups)
+        faces, groups = (
+            indices.to(vertices.device) for indices in self._faces_and_groups
+        )
         first, second, third = (
             vertices.index_select(0, faces[:, corner]) for corner in range(3)
         )
@@ -119,11 +122,11 @@ class MovingMesh:
         return sums / (sums.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
 
     @cached_property
-    def _original_area_normals(self) -> Tensor:
-        return self._compute_area_normals(self.vertices)
+    def _original_face_normals(self) -> Tensor:
+        return self._average_face_normals(self.vertices)
 
     @cached_property
-    def _shared_groups(self) -> tuple[Tensor, Tensor]:
+    def _faces_and_groups(self) -> tuple[Tensor, Tensor]:
         """The faces (F, 3), and the group (V,) of vertices that each vertex is in.
 
         The vertices of a group have their normal in common. They are in one group if
@@ -204,7 +207,7 @@ class InputAssembler:
         description: SceneDescription,
         resolution: tuple[int, int] | None = None,
     ) -> None:
-        """Collect the scene's meshes, its carried lamps and what its photograph adds.
+        """Collect the scene's meshes, the lamps of its cars, and its photographs.
 
         Args:
             description: the scene.
@@ -227,8 +230,8 @@ class InputAssembler:
         if description.photographs is not None:
             self._photograph_scenes = list(description.photographs.scenes.values())
         self._resolution = resolution
-        # inputs of the finished image by the index of the photograph, see
-        # `_get_image_inputs`
+        # inputs of the finished image by the index of the photograph; those of further
+        # photographs are computed on first use, see `_get_image_inputs`
         self._image_inputs_of: dict[int, dict[str, Tensor]] = {}
         # The radiance of the plane that receives the shadow. There is one plane, and
         # one light on it, for all photographs.
@@ -257,7 +260,8 @@ class InputAssembler:
         if PHOTOGRAPH_INPUT in parameters:
             photograph_index = int(parameters.pop(PHOTOGRAPH_INPUT))
         parameters |= self._get_image_inputs(photograph_index)
-        # Lamps move with the car that carries them, whose pose is among the inputs.
+        # Lamps move with the car that carries them, whose pose is in `inputs`. From
+        # `parameters` it is removed below.
         for part in self._carried:
             parameters |= _move_carried(part, inputs)
         for name, mesh in self.meshes.items():
@@ -313,7 +317,7 @@ class InputAssembler:
     def get_vertices(self, name: str, assembled: Mapping[str, Tensor]) -> Tensor:
         """Return the vertices (V, 3) of a mesh in world space.
 
-        `assembled` are inputs as a call returns them.
+        `assembled` is the result of calling this object with inputs of the space.
         """
         vertices = assembled.get(f"{name}.vertices")
         if vertices is None:  # nothing moves the mesh
@@ -328,10 +332,10 @@ def _move_carried(
 ) -> dict[str, Tensor]:
     """Return the inputs that move a lamp with the car that carries it.
 
-    The glass of a lamp is in the carrier's coordinates: it has the carrier's pose, and
-    the offsets of the vertices that it lies on, even without a pose. A beam is a point
-    at a fixed pose on the carrier, which does not follow a deformation. The result is
-    empty if nothing moves the carrier.
+    The glass of a lamp is in the carrier's coordinates. It gets the carrier's pose, and
+    the offsets of the carrier's vertices on which it lies. A beam is a point at a fixed
+    pose on the carrier, and does not follow a deformation. The result is empty if
+    nothing moves the carrier.
 
     Args:
         part: the beam or the glass.
@@ -343,13 +347,15 @@ def _move_carried(
     offsets = inputs.get(f"{part.carrier}.offsets")
     if isinstance(part, LampGlass):
         if offsets is not None:
+            # the vertex of the carrier with which each vertex of the glass moves
             carrier_vertex = torch.from_numpy(part.vertex_of_carrier).to(offsets.device)
             moved_inputs[f"{part.name}.offsets"] = offsets[carrier_vertex]
         if carrier_pose is not None:
             moved_inputs[f"{part.name}.to_world"] = carrier_pose
     elif carrier_pose is not None:
         car_pose = carrier_pose
-        if part.carrier == CAMERA:  # the camera looks out of a car of its own
+        if part.carrier == CAMERA:
+            # The camera looks out of a car, whose pose follows from the camera's.
             car_pose = compute_car_pose(carrier_pose)
         # The same dtype and device as the carrier's pose.
         pose_on_carrier = torch.from_numpy(part.pose_on_carrier).to(carrier_pose)
@@ -448,7 +454,7 @@ class Motion:
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
         # Half the width of the square ground, and points (n, 3) of it that are
-        # followed: its edge, or all vertices of a photographed ground.
+        # followed: its edge, or all vertices if its texture is a photograph.
         if description.photograph is None:
             self._ground_half_width = description.get_number("ground.size") / 2.0
             self._ground_points = _sample_square_edge(self._ground_half_width)
@@ -520,7 +526,7 @@ class Motion:
 
     def measure_speeds(
         self,
-        inputs: Callable[[Tensor], Mapping[str, Tensor]],
+        make_inputs: Callable[[Tensor], Mapping[str, Tensor]],
         u: Tensor,
         coordinates: list[int],
     ) -> Tensor:
@@ -529,20 +535,22 @@ class Motion:
         It is in pixels per unit of u, and 0 for coordinates that are not requested.
 
         Args:
-            inputs: maps a configuration to assembled inputs.
+            make_inputs: maps a configuration to assembled inputs.
             u: (d,) configuration at which speeds are measured, by small changes of it.
             coordinates: indices of the coordinates whose speed is measured.
         """
         speeds = torch.zeros(len(u))
         with torch.no_grad():
-            positions, is_visible = self.project_points(inputs(u))
+            positions, is_visible = self.project_points(make_inputs(u))
             for coordinate in coordinates:
-                for nudge in NUDGES:  # largest first
+                for nudge in NUDGES:  # changes of u, largest first
                     nudged = u.clone()
                     # At the upper border of the unit cube the change goes backwards.
                     sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
                     nudged[coordinate] += sign * nudge
-                    new_positions, still_visible = self.project_points(inputs(nudged))
+                    new_positions, still_visible = self.project_points(
+                        make_inputs(nudged)
+                    )
                     shifts = (new_positions - positions)[is_visible & still_visible]
                     distances = shifts.norm(dim=1)
                     # If no visible point has moved, all that moved may have left the

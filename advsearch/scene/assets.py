@@ -367,6 +367,7 @@ def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArra
         the faces (F, 3) of new vertices. Faces with two corners in one cluster are left
         out.
     """
+    # (V, 2) column and row of the texture's cell in which each vertex is
     texture_cell = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(
         np.int64
     )
@@ -375,7 +376,9 @@ def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArra
         cluster_and_cell, return_index=True, return_inverse=True
     )
     faces = new_vertex.reshape(-1)[mesh.faces]
-    cluster_a, cluster_b, cluster_c = cluster_of[representative][faces].T
+    # clusters of the three corners of each face
+    cluster_of_new = cluster_of[representative]
+    cluster_a, cluster_b, cluster_c = cluster_of_new[faces].T
     is_face = (
         (cluster_a != cluster_b) & (cluster_b != cluster_c) & (cluster_c != cluster_a)
     )
@@ -410,8 +413,10 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
         representative, faces = _merge_clusters(mesh, cluster_of)
         if len(faces) <= max_faces:
             break
+    # The clusters and faces are those of the grid with which the loop has ended.
     distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
     cluster_size = np.bincount(cluster_of)
+    cluster_of_new = cluster_of[representative]  # of each new vertex
 
     def simplify(full: Mesh) -> Mesh:
         """Return a mesh with the same vertices elsewhere, simplified in the same way.
@@ -420,9 +425,9 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
         the texture coordinates of one of them.
         """
         sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
-        mean = np.stack([total / cluster_size for total in sums], axis=1)
+        cluster_mean = np.stack([total / cluster_size for total in sums], axis=1)
         return Mesh(
-            mean[cluster_of[representative]].astype(np.float32),
+            cluster_mean[cluster_of_new].astype(np.float32),
             distinct_faces,
             full.normals[representative],
             full.uvs[representative],
@@ -440,11 +445,12 @@ def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
     """
     lower = mesh.vertices.min(axis=0)
     extent = max(float((mesh.vertices.max(axis=0) - lower).max()), 1e-12)
-    # `scaled` is 0 at the lowest point and grid - 1 at the far end of the largest
-    # extent. Rounded, both are in the middle of a cell.
+    # Cells are centered at integers: the lowest point, 0, and the far end of the
+    # largest extent, grid - 1, are in the middle of a cell.
     scaled = (mesh.vertices - lower) / extent * (grid - 1)
     cells = np.floor(scaled + 0.5).astype(np.int64)
-    return np.unique(_encode_rows(cells), return_inverse=True)[1].reshape(-1)
+    _cell_codes, cluster_of = np.unique(_encode_rows(cells), return_inverse=True)
+    return np.asarray(cluster_of.reshape(-1))
 
 
 def _encode_rows(rows: IntArray) -> IntArray:
@@ -620,6 +626,7 @@ def describe_size_doubts(
     is_missing = size is None and (needs_metres or extent is not None)
     if has_user_size or not (is_unusual or is_missing):
         return ()
+    # `is_unusual` with a size, and `is_missing` without one
     clauses = []
     if size is not None:
         clauses.append(f"its longest side is {format_rounded(size)} m")

@@ -160,7 +160,8 @@ def find_photographed_light(photograph: object) -> Path | None:
         return None
     for suffix in LIGHT_SUFFIXES:
         light = path.with_suffix(suffix)
-        if light != path and light.is_file():
+        is_photograph = light == path  # the photograph itself may be an .exr file
+        if light.is_file() and not is_photograph:
             # The map is recorded as a file that belongs to the photograph.
             with track_opened_files(path):
                 record_opened(light)
@@ -188,10 +189,10 @@ def with_front(photograph: BackdropPhotograph, spec: str | Path) -> BackdropPhot
         return replace(photograph, depth=depth, front_spec=str(spec))
     path = Path(spec)
     with track_opened_files(path), open_image(path, LARGEST_FILE) as image:
-        check_no_depth(image.mode, path)
+        check_no_depth(image.mode, path)  # a depth without its meters per level
         levels = _decode_photograph(image, path)
     _check_front_size(photograph, levels.shape, "a mask", spec)
-    # A mask is grey, so that any channel would do.
+    # All channels of a grey mask are the same: this takes green.
     front = np.ascontiguousarray(levels[..., 1])
     return replace(photograph, front=front, front_spec=str(spec))
 
@@ -311,14 +312,17 @@ def compose_over_photograph(
     if not has_coat:
         return radiance + shade * behind
 
-    # A shadow darkens the light of the matt ground, but not the environment in the
-    # coat. So the fraction of light that the shadow takes is added again for the part
-    # of the photograph that is this reflection. The coat was rendered for the fraction
-    # of the pixel that the object does not cover.
-    uncovered_before = (1.0 - rendered_coverage).clamp_min(1e-3)
-    environment_in_coat = rendered[..., channels.ENVIRONMENT_IN_COAT] / uncovered_before
-    unshaded = (uncovered - shade) * torch.minimum(environment_in_coat, behind)
-    return radiance + (shade * behind + unshaded + coat_change).clamp_min(0.0)
+    # The reflection of the environment in the coat was rendered for the fraction of the
+    # pixel that the object does not cover: the division makes it that of a full pixel.
+    environment_in_coat = rendered[..., channels.ENVIRONMENT_IN_COAT] / (
+        1.0 - rendered_coverage
+    ).clamp_min(1e-3)
+    # The photograph contains this reflection, at most all of its light.
+    reflection = torch.minimum(environment_in_coat, behind)
+    # A shadow darkens only the matt ground. `shade` has also darkened the reflection,
+    # and what it has lost is added again.
+    lost_reflection = (uncovered - shade) * reflection
+    return radiance + (shade * behind + lost_reflection + coat_change).clamp_min(0.0)
 
 
 def compute_front(
@@ -416,7 +420,7 @@ def make_backdrop(
 def compute_photograph_gain(
     description: SceneData, photograph: BackdropPhotograph
 ) -> float:
-    """Return the factor from a scene's radiance to a photograph's display-linear values.
+    """Return the factor from a scene's radiance to a photograph's linear values.
 
     With it a level surface of the reflectance `GREY_CARD`, lit by the environment, has
     the mean luminance of the photograph. The factor is 1 if no environment lights the
@@ -434,6 +438,7 @@ def compute_photograph_gain(
     channel_means = np.array(
         [np.average(decoded, weights=histogram) for histogram in histograms]
     )
+    # at least 1e-3, so that a black photograph does not make the factor 0
     mean_luminance = max(float(channel_means @ LUMINANCE), 1e-3)
     # a matt surface has the radiance reflectance * irradiance / pi
     return mean_luminance * math.pi / (GREY_CARD * irradiance)
@@ -494,7 +499,7 @@ def compute_plane_radiance(description: SceneData) -> Tensor | None:
         return None
     srgb = np.array(description.ground_color, np.float32)
     albedo = srgb_to_linear(srgb).astype(np.float64)
-    # `compute_level_irradiance` leaves out the exposure.
+    # The irradiance below is that of the map without this exposure.
     brightness = 2.0 ** description.get_number("environment.exposure")
     radiance = albedo * brightness * compute_level_irradiance(description) / math.pi
     return torch.from_numpy(radiance).float()
@@ -522,8 +527,8 @@ def measure_plane_color(
         return {}
     display = levels.astype(np.float32) / np.float32(255.0)
     # (3,) display-linear values of a plane with an albedo of 1
-    light = gain * compute_level_irradiance(description) / math.pi
-    albedo = np.median(srgb_to_linear(display), axis=0) / light
+    white = gain * compute_level_irradiance(description) / math.pi
+    albedo = np.median(srgb_to_linear(display), axis=0) / white
     color = linear_to_srgb(np.clip(albedo, *ALBEDO_RANGE).astype(np.float32))
     return dict(zip(names, map(float, color), strict=True))
 
@@ -557,9 +562,10 @@ def _look_up_levels(
     """
     height, width = photograph.full_size
     camera = camera_to_world(description, width / height)
-    # in the camera's coordinates: left, up and ahead
+    # points in the camera's coordinates: left, up and ahead
     relative = (points - camera[:3, 3]) @ camera[:3, :3]
-    # The description may have the aspect of a film for a part of the photograph.
+    # Projection needs the aspect of the full photograph; that of the description may
+    # be that of a part.
     full_description = replace(description, aspect=width / height)
     no_inputs: dict[str, Tensor] = {}
     positions, is_visible = project_points(
@@ -570,8 +576,9 @@ def _look_up_levels(
     # pixels from its top left.
     pixels = np.floor(positions.numpy() + size / 2.0).astype(int)
     is_inside = is_visible.numpy() & ((pixels >= 0) & (pixels < size)).all(axis=1)
-    inside: npt.NDArray[np.intp] = pixels[is_inside]
-    return photograph.levels[inside[:, 1], inside[:, 0]]
+    column, row = pixels[is_inside].T
+    looked_up: npt.NDArray[np.uint8] = photograph.levels[row, column]
+    return looked_up
 
 
 # ---- The camera of a photograph
@@ -634,7 +641,8 @@ def fit_to_photograph(
         description: the scene, whose camera took the full photograph.
         photograph: photograph that it is rendered into.
         resolution: height and width of the film, pixels.
-        gain: factor from radiance to display-linear values.
+        gain: factor from radiance to display-linear values, from which the plane's
+            color follows.
 
     Raises:
         InputError: the film, or the camera's picture, has another shape than the
@@ -646,9 +654,10 @@ def fit_to_photograph(
     full_aspect = full_width / full_height
     model = description.camera_model
     if model is not None:
-        # A bundled model, such as the fisheye, depends on the shape of the image, and
-        # is made again for the full photograph. Other models stay.
-        model = make_bundled_models(full_aspect).get(model.name, model)
+        # A bundled model, such as the fisheye, depends on the shape of the image: it is
+        # replaced by that for the full photograph. Other models stay.
+        bundled_models = make_bundled_models(full_aspect)
+        model = bundled_models.get(model.name, model)
         _check_camera_shape(photograph, model)
     uncropped = replace(description, camera_model=model)
     color_settings = measure_plane_color(uncropped, photograph, gain)
@@ -747,12 +756,14 @@ def _check_gloss(description: SceneData) -> None:
         )
     if not is_glossy or has_plane(description):
         return
-    # The conditions of `has_plane` in their order: if the others hold, it is the last.
-    reason = "the camera is not above ground.level"
+    # the first condition of `has_plane` that does not hold
+    is_lit = bool((compute_level_irradiance(description) > 0.0).all())
     if description.get_number("ground.size") == 0.0:
         reason = "ground.size is 0"
-    elif not (compute_level_irradiance(description) > 0.0).all():
+    elif not is_lit:
         reason = "no environment lights the scene"
+    else:
+        reason = "the camera is not above ground.level"
     raise InputError(
         f"`set` ground.gloss: {reason}, so that no plane reflects the object; change "
         "that, or leave ground.gloss out"
@@ -817,7 +828,7 @@ def compute_view_settings(
     distance = float(center[2])
     if distance <= 0.0:
         raise InputError("object_to_camera: puts the object behind the camera")
-    object_up = mesh_to_camera[:3, 2]
+    object_up = mesh_to_camera[:3, 2]  # z axis of the mesh in camera coordinates
     world_axes = _make_world_axes(
         object_up if up is None else np.asarray(up, np.float64)
     )
@@ -825,10 +836,11 @@ def compute_view_settings(
     # shift of the object's center from the point that the camera orbits, in the world
     orbit_center = np.array([0.0, 0.0, distance])
     offset = world_axes @ (center - orbit_center)
-    # The camera orbits the height `middle[2]`, that of the center of an object that
-    # stands on the height 0. So this is the height of the lowest vertex in the world.
-    lowest_from_center = float(((vertices - middle) @ rotation.T)[:, 2].min())
-    lowest = float(offset[2] + middle[2]) + lowest_from_center
+    # The orbited point is at the height `middle[2]`: the mesh stands on the height 0,
+    # and that is the height of its center.
+    center_height = float(offset[2] + middle[2])
+    rotated_vertices = (vertices - middle) @ rotation.T  # relative to the center
+    lowest = center_height + float(rotated_vertices[:, 2].min())
     return {
         **_compute_orbit(world_axes),
         # in meters; `_check_and_map` has checked that the size is known
@@ -836,7 +848,8 @@ def compute_view_settings(
         **_decompose_rotation(rotation),
         "pose.x": float(offset[0]),
         "pose.y": float(offset[1]),
-        # Without a shift the lowest vertex of the object is at the height 0.
+        # `pose.z` 0 puts the lowest vertex at the height 0. So it is the height of this
+        # vertex, on which the ground lies.
         "pose.z": lowest,
         "ground.level": lowest,
     }
@@ -868,8 +881,8 @@ def compute_mesh_to_camera(
 ) -> Float64Array:
     """Return the rigid map (4, 4) from a mesh to camera coordinates.
 
-    A mesh is in object sizes: its longest side is 1. So are the camera coordinates of
-    the result, which makes the map rigid.
+    A mesh is in object sizes: its longest side is 1. The camera coordinates of the
+    result are in object sizes, too, so that the map has no scale.
 
     Args:
         file_to_mesh: (4, 4) from coordinates of the object's file to those of its mesh.
@@ -893,9 +906,10 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
 
     Raises InputError: the camera looks straight up or down.
     """
-    # Each column is an axis of the camera in the coordinates of the world. The camera
-    # looks along its z, so that this direction goes from the object to the camera.
-    outwards = -world_axes[:, 2]
+    # Each column is an axis of the camera (right, down, ahead) in world coordinates.
+    # The opposite of "ahead" is the direction from the object to the camera.
+    right, _down, ahead = world_axes.T
+    outwards = -ahead
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
     if abs(elevation) > MAX_ELEVATION:
         raise InputError(
@@ -907,8 +921,8 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
     upright = np.cross(-outwards, level_left)
-    # The roll is the angle from there to the camera's own left; its x points right.
-    left = -world_axes[:, 0]
+    # The roll is the angle from there to the camera's own left.
+    left = -right
     return {
         "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
         "camera.elevation": elevation,
@@ -939,9 +953,10 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
 
 
 def _make_world_axes(up: Float64Array) -> Float64Array:
-    """Return world axes (3, 3), rows in camera coordinates, with z along `up`.
+    """Return the axes x, y and z of the world, with z along `up`.
 
-    +x is the level part of the direction from the object to the camera.
+    They are the rows of the result (3, 3), in camera coordinates. +x is the horizontal
+    part of the direction from the object to the camera.
 
     Args:
         up: (3,) direction in camera coordinates: x to the right, y down, z ahead.
@@ -955,7 +970,8 @@ def _make_world_axes(up: Float64Array) -> Float64Array:
     x_axis = towards_camera - (towards_camera @ z_axis) * z_axis
     if np.linalg.norm(x_axis) < 1e-6:  # the camera looks straight up or down
         # towards the lower border of the image instead
-        x_axis = np.array([0.0, 1.0, 0.0]) - z_axis[1] * z_axis
+        down = np.array([0.0, 1.0, 0.0])
+        x_axis = down - z_axis[1] * z_axis  # its part at right angles to z
     x_axis /= np.linalg.norm(x_axis)
     return np.stack([x_axis, np.cross(z_axis, x_axis), z_axis])
 

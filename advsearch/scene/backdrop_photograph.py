@@ -73,15 +73,17 @@ class BackdropPhotograph:
     def resample_depth(self, resolution: tuple[int, int]) -> Tensor | None:
         """Return the depth (H S, W S) float32 in metres at S x S points of each pixel.
 
-        So edges of the depth are followed inside a pixel. S is the number of pixels of
-        the depth along a side of a pixel of the image, cut to `MIN_DEPTH_POINTS` and
-        `MAX_DEPTH_POINTS`. The result is None if the photograph has no depth.
+        So edges of the depth are followed inside a pixel. S is how many pixels of the
+        depth there are along a side of a pixel of the image, but at least
+        `MIN_DEPTH_POINTS` and at most `MAX_DEPTH_POINTS`. The result is None if the
+        photograph has no depth.
 
         Args:
             resolution: height and width of the image in pixels.
         """
         if self.depth is None:
             return None
+        # The depth has the pixels of the full photograph.
         left, top, width, height = self.crop
         part = self.depth[top : top + height, left : left + width]
         needed = math.ceil(max(height / resolution[0], width / resolution[1]))
@@ -111,6 +113,7 @@ class BackdropPhotograph:
         seed = int(self.digest[:8], 16)  # of the photograph's content
         if sigma is not None:
             return make_noise(np.full(3, sigma / 255.0), resolution, seed)
+        # in the photograph's own pixels
         noise = make_noise(measure_noise(part) / 255.0, self.size, seed)
         return _resample_image(noise.numpy(), resolution)
 

@@ -64,10 +64,12 @@ def round_to_8_bit(display: Tensor) -> Tensor:
 
 
 def combine_channels(values: Mapping[str, Tensor]) -> Tensor:
-    """Return the linear color (3,) of display-referred numbers red, green and blue.
+    """Return a linear color (3,), differentiable.
 
-    Differentiable.
+    Args:
+        values: display-referred numbers by the names "red", "green" and "blue".
     """
-    import torch  # whoever has tensors has it already
+    # Imported here, so that the module loads fast where there are no tensors.
+    import torch
 
     return srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))

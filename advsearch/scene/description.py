@@ -185,9 +185,12 @@ class SceneDescription(SceneData):
         values = dict(self.values)
         if "ground.size" not in self.requested:
             values["ground.size"] = PLANE_SIZE
+        # `backdrop` says that something is behind the object instead of the
+        # environment.
         scene = replace(
             self, backdrop=True, backdrop_photograph=photograph, values=values
         )
+        # A scene in a photograph has no road or place: those of `self` are removed.
         return with_requested_ground(scene)
 
     def _check_backdrop(self, photograph: BackdropPhotograph) -> None:
@@ -228,9 +231,9 @@ class SceneDescription(SceneData):
     ) -> SceneDescription:
         """Return the scene with a measured camera and pose of the object.
 
-        They are those of the photograph that the scene is rendered into. If it shows
-        the object itself, the object's shadow is in it already: then set
-        ``ground.size`` to 0, which leaves the plane out.
+        They are those of the photograph that the scene is rendered into. If the
+        photograph already shows the object, and so its shadow, set ``ground.size`` to
+        0. Then no second shadow is rendered.
 
         Args:
             camera_matrix: intrinsics (3, 3) of the full photograph, in pixels, as
@@ -285,11 +288,12 @@ class SceneDescription(SceneData):
             )
         with track_opened_files(photograph):
             pose, model = photograph_cameras.find_pose_and_model(photograph)
-        # `AXES` turns our camera axes (left, up, ahead) to those of the file's pose.
+        # The file's pose is for other camera axes. `AXES` maps ours (left, up, ahead)
+        # to these.
         to_world = pose @ AXES
         # from meters to object sizes
         to_world[:3, 3] /= self.object.size_in_metres
-        model.check_no_fov(self.requested)
+        model.check_no_fov(self.requested)  # the lens has a field of view of its own
         # Focal lengths are in widths and heights of the image, so that half a side's
         # angle has the tangent 0.5 / focal. The field of view is along the larger side.
         tangents = (
@@ -382,6 +386,7 @@ class SceneDescription(SceneData):
                 model = read_camera(camera)
         else:
             model = make_bundled_models()[camera]
+        # A camera of a rig may have a field of view, and no model of a lens.
         if model is not None:
             model.check_no_fov(self.requested)
         return replace(scene, camera_model=model)
@@ -415,16 +420,19 @@ class SceneDescription(SceneData):
         if "camera.distance" in self.requested:
             return scene
         fov = torch.tensor(scene.get_number("camera.fov"), dtype=torch.float64)
-        framing = float(geometry.compute_framing_distance(scene, fov, scene.aspect))
-        distance = max(preset.distance, framing * scene.size_in_metres)
+        # the distance from which the object fits into the image, in object sizes
+        framing_distance = float(
+            geometry.compute_framing_distance(scene, fov, scene.aspect)
+        )
+        distance = max(preset.distance, framing_distance * scene.size_in_metres)
         return scene.with_values(camera__distance=distance)
 
     def _make_preset_values(self, preset: CameraPreset) -> dict[str, float]:
         """Return the settings of a mounted camera by name, except for its distance.
 
-        A small object on a plain ground stands on a table. The preset's height counts
-        from the floor, `TABLE_HEIGHT` below the table, and the ground gets the size of
-        a table.
+        Heights are in meters above the ground of the scene. A small object on a plain
+        ground stands on a table: then this ground is the table top, with the size of a
+        table, and the floor is `TABLE_HEIGHT` below it.
         """
         is_on_plain_ground = (
             self.get_number("ground.size") > 0.0
@@ -439,6 +447,7 @@ class SceneDescription(SceneData):
             floor = 0.0 if place is None else place.file.floor
             if is_on_table:
                 floor = -TABLE_HEIGHT
+            # The preset's height is above the floor, the setting above the ground.
             preset_values["camera.height"] = preset.height + floor
         if preset.in_lane:  # azimuth 0 is in the lane of the object
             preset_values["camera.azimuth"] = 0.0
@@ -494,13 +503,14 @@ class SceneDescription(SceneData):
     @property
     def is_lit(self) -> bool:
         """Whether there is anything that shines."""
-        shining = any(
+        # `has_emission` is about meshes; Mitsuba's own plugins may shine as well.
+        has_shining_plugin = any(
             part.emits_light for part in self.parts if isinstance(part, PluginPart)
         )
         return (
             self.environment is not None
             or bool(self.lamps)
-            or shining
+            or has_shining_plugin
             or self.has_emission
         )
 
@@ -519,14 +529,14 @@ class SceneDescription(SceneData):
             needs_metres=is_paved(self),
         )
         front = self.object.front
-        front_remarks = (
-            (front.reason,)
-            if front is not None and (self.is_in_lane or has_lanes(self))
-            else ()
-        )
-        traffic_remarks = (
-            (make_traffic_remark(self),) if self._drives_against_traffic else ()
-        )
+        front_remarks: tuple[str, ...] = ()
+        stands_on_road = self.is_in_lane or has_lanes(self)
+        if front is not None and stands_on_road:
+            # how the front was found, which matters on a road
+            front_remarks = (front.reason,)
+        traffic_remarks: tuple[str, ...] = ()
+        if self._drives_against_traffic:
+            traffic_remarks = (make_traffic_remark(self),)
         notes = (
             *self.object.notes,
             *front_remarks,
@@ -570,8 +580,10 @@ class SceneDescription(SceneData):
     def metered_irradiance(self) -> float:
         """Irradiance that the exposure of images is metered for, in scene units.
 
-        Under it, a grey card has the radiance reflectance * irradiance / pi, which
-        times the gain is `CARD_DISPLAY_VALUE`.
+        It is the solution of the equation for a grey card, whose radiance is
+        reflectance * irradiance / pi:
+
+            gain * radiance = CARD_DISPLAY_VALUE
         """
         return (
             CARD_DISPLAY_VALUE
@@ -607,31 +619,34 @@ class SceneDescription(SceneData):
             value = self.values[name]
             if value is None:
                 continue
-            requested[name] = value
             setting = settings.find_parameter(name)
-            if setting is not None and setting.options:
-                requested[name] = setting.options[int(value)]
+            is_choice = setting is not None and bool(setting.options)
+            if setting is not None and is_choice:
+                option_index = int(value)
+                requested[name] = setting.options[option_index]
+            else:
+                requested[name] = value
         return requested
 
     @property
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values.
 
-        It is the exposure times 2 to the power of `camera.exposure`. The exposure is
-        the first of these that applies: that of the exposure value `camera.ev`; that of
-        the photograph that the scene is rendered into; the metered one; 1.
+        It is a base factor times 2 to the power of `camera.exposure`. The base factor
+        is the first of these that applies: that of the exposure value `camera.ev`; that
+        of the photograph that the scene is rendered into; the metered one; 1.
         """
         exposure_value = self.values.get("camera.ev")
-        exposure = 1.0
+        base_gain = 1.0
         if exposure_value is not None:
-            exposure = self._compute_exposure(exposure_value)
+            base_gain = self._compute_gain_of_ev(exposure_value)
         elif self.backdrop_photograph is not None:
-            exposure = compute_photograph_gain(self, self.backdrop_photograph)
+            base_gain = compute_photograph_gain(self, self.backdrop_photograph)
         elif self.metered:
-            exposure = compute_metered_gain(self)
-        return exposure * math.pow(2.0, self.get_number("camera.exposure"))
+            base_gain = compute_metered_gain(self)
+        return base_gain * math.pow(2.0, self.get_number("camera.exposure"))
 
-    def _compute_exposure(self, exposure_value: float) -> float:
+    def _compute_gain_of_ev(self, exposure_value: float) -> float:
         """Return the factor from scene radiance to display-linear values of an EV.
 
         A sensor saturates, and the display value is 1, at a luminance of 1.2 * 2^EV in
@@ -705,8 +720,9 @@ def load_description(
     requested = set(setting_values)
     if environment_spec is not None:
         requested.add(ENVIRONMENT)
-    # a Mitsuba scene is seen by its first camera, unless settings describe another
     camera = ORBIT_CAMERA
+    # A Mitsuba scene is seen by its first camera, if it has one and settings describe
+    # no other.
     if is_mitsuba and not _describes_orbit(setting_values):
         camera = next(iter(imported.cameras), ORBIT_CAMERA)
     described = SceneDescription(
@@ -723,10 +739,14 @@ def load_description(
         parts=imported.surroundings,
         cameras=imported.cameras,
         camera=camera,
+        # The light of a Mitsuba scene counts as it is, without metering.
         metered=not is_mitsuba,
     )
-    described = add_things(with_requested_ground(described), things, _load_thing)
-    described = add_lamps(add_solid_remarks(described))
+    # Things stand on the ground, and lamps are carried by things.
+    described = with_requested_ground(described)
+    described = add_things(described, things, _load_thing)
+    described = add_solid_remarks(described)
+    described = add_lamps(described)
     check_mesh_names(described, values)
     _check_material_settings(described.object, setting_values)
     return described
@@ -750,8 +770,9 @@ def _find_source(
 ) -> _Source:
     """Return the file and the node that an object spec names.
 
-    With `plugins`, a Mitsuba scene as a dictionary, the spec is the id of a shape, and
-    its file is not used. `split_node_argument` cuts "scene.glb#car" into file and node.
+    "scene.glb#car" names the file "scene.glb" and its node "car". With `plugins`, a
+    Mitsuba scene as a dictionary, the spec is the id of a shape, and the file of the
+    result is not used.
     """
     file: str | Path | ObjectAsset = object_spec
     node = None
@@ -781,7 +802,7 @@ def _import_source(
         # Imported here, since other scenes do not need Mitsuba to be read.
         from advsearch.scene.mitsuba_backend.scene_files import import_mitsuba_scene
 
-        # "scene#mug" and "mug" both name the shape "mug".
+        # The spec names a shape of the dictionary: "mug", or "scene#mug".
         shape_id = source.node or str(object_spec)
         return import_mitsuba_scene(plugins, shape_id)
     if source.node is None:
@@ -901,7 +922,7 @@ def check_mesh_names(scene: SceneDescription, names: Iterable[str]) -> None:
     Raises UnknownNameError: there is no such mesh.
     """
     for name in names:
-        mesh = settings.parse_mesh_name(name)
+        mesh = settings.parse_mesh_name(name)  # None for settings of other things
         if mesh is not None and mesh not in scene.surrounding_meshes:
             raise UnknownNameError(
                 "mesh around the object",

@@ -83,6 +83,7 @@ class Group:
         if self.estimator not in DIFFERENCE_ESTIMATORS:
             return ""
         if self.step == self.pixel_step:
+            # Also the reason of a default step, where no outline moves.
             return "it moves an outline by a pixel, or moves none"
         return (
             f"{self.step / self.pixel_step:.2g} times as wide as moves an outline by a "
@@ -124,18 +125,20 @@ The first is that of a range, the second that of a full turn.
 # motion of the fastest point of an outline in half a difference (docs/gradients.md,
 # "The estimators")
 DEFAULT_PIXELS = 1.0
+MIN_SPEED = 1e-3  # smallest speed that counts as motion, pixels per unit of u
 STEP_RANGE = (1e-6, 0.15)  # smallest and largest step in u
 
 
 def compute_steps(speeds: Tensor) -> Tensor:
     """Return half-widths of differences in u over which outlines move by a pixel.
 
-    The speeds of the outlines are in pixels per unit of u. Where nothing moves (below a
-    thousandth of a pixel) it is `DEFAULT_STEP`; all steps are within `STEP_RANGE`.
+    The speeds of the outlines are in pixels per unit of u. Speeds up to `MIN_SPEED`
+    count as no motion, for which the step is `DEFAULT_STEP`. All steps are within
+    `STEP_RANGE`.
     """
     steps = torch.where(
-        speeds > 1e-3,
-        DEFAULT_PIXELS / speeds.clamp_min(1e-3),
+        speeds > MIN_SPEED,
+        DEFAULT_PIXELS / speeds.clamp_min(MIN_SPEED),
         torch.full_like(speeds, DEFAULT_STEP),
     )
     return steps.clamp(*STEP_RANGE)
@@ -235,7 +238,8 @@ class GradientPlan:
         for group in stored["groups"]:
             change = {name: group[name] for name in RESTORED_FIELDS}
             change["estimator_costs"] = group["variance_x_seconds"]
-            changes[f"{group['control']}.{group['parameter']}"] = change
+            group_name = f"{group['control']}.{group['parameter']}"  # as `Group.name`
+            changes[group_name] = change
         plan = self._change_groups(lambda group: changes[group.name])
         return replace(plan, spp=stored["spp"])
 
@@ -248,6 +252,7 @@ class GradientPlan:
         for group in self.groups:
             entries = {name: getattr(group, name) for name in STORED_FIELDS}
             entries["valid"] = list(group.valid)
+            # the costs by the name of their unit
             entries["variance_x_seconds"] = dict(group.estimator_costs)
             groups.append(entries)
         return {"renders_per_gradient": self.renders, "spp": self.spp, "groups": groups}
@@ -256,8 +261,9 @@ class GradientPlan:
 def select_compared(valid: Sequence[str], size: int) -> tuple[str, ...]:
     """Return which of the valid estimators of a group are worth a measurement.
 
-    Differences take two renders for each of the group's `size` coordinates, an adjoint
-    one for all: above `MAX_COMPARED_SIZE` only adjoints are, if there are any.
+    Differences take two renders for each of the group's `size` coordinates; an adjoint
+    takes one for all of them. So a group with more than `MAX_COMPARED_SIZE` coordinates
+    is measured with adjoints alone, if one is valid.
     """
     adjoints = tuple(
         estimator for estimator in valid if estimator in ADJOINT_ESTIMATORS
@@ -309,8 +315,8 @@ def _plan_group(
     """Return a group with its preferred or forced estimator.
 
     An estimator forced for the group ("pose.yaw") wins over one for its control
-    ("pose"), and that over one for all groups ("*"). The last is ignored for groups for
-    which it is not valid; the others are errors then.
+    ("pose"), and that over one for all groups ("*"). If it is not valid for the group,
+    one for all groups is ignored, and one of the other two raises an InputError.
 
     Args:
         group: the group; its valid estimators are in order of preference.
@@ -360,7 +366,7 @@ def _choose_step(group: Group, image_size: float) -> float:
     them by no more than `SEARCH_FRACTION` of the image, whose longer side has
     `image_size` pixels.
     """
-    # "adjoint" and "image" are valid only for groups that move no outline.
+    # These two estimators are valid only for groups that move no outline.
     moves_no_outline = bool({"adjoint", "image"} & {*group.valid})
     if group.size != 1 or moves_no_outline:
         return group.pixel_step
@@ -389,10 +395,10 @@ Backward = Callable[[Any, Tensor], tuple[Tensor | None, ...]]
 def forbid_second_derivatives(backward: Backward) -> Backward:
     """Return a backward pass whose results raise an error if they are differentiated.
 
-    Torch's own `once_differentiable` raises an error only if the second backward pass
-    reaches its node in the graph. `torch.autograd.grad` and `functional.hessian` visit
-    only nodes on the way to the requested inputs. They may leave that node out, and
-    would return a second derivative in which a part is missing.
+    Torch's own `once_differentiable` does not suffice. It raises an error only if the
+    second backward pass visits its node in the graph. `torch.autograd.grad` visits only
+    nodes on the way to the requested inputs: it may leave that node out, and return a
+    second derivative in which a part is missing.
     """
 
     @wraps(backward)

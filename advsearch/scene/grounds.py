@@ -53,8 +53,11 @@ def is_against_traffic(scene: SceneData, camera: Float64Array) -> bool:
         scene: the scene.
         camera: (4, 4) pose of the camera.
     """
-    if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
+    # The camera is mounted in a car in the object's lane, or the place has lanes.
+    has_traffic = scene.is_in_lane or has_lanes(scene)
+    if not (scene.object.drives and has_traffic):
         return False
+    # along x and y, since the object faces +x
     distance_ahead, distance_aside = (
         camera[:2, 3] - compute_center(scene)[:2]
     ) * scene.size_in_metres
@@ -82,10 +85,11 @@ def make_traffic_remark(scene: SceneData) -> str:
 def is_enclosed(scene: SceneData) -> bool:
     """Return whether houses or trees stand around the object.
 
-    Then light paths seldom leave the scene. Only places with such meshes have them.
+    They enclose the scene, so that light paths seldom leave it. Only some places have
+    such meshes.
     """
-    # `is_laid_ground` marks all meshes of a road or a place, `is_ground` those that are
-    # the ground itself.
+    # `is_laid_ground` is true for all meshes of a road or a place, and `is_ground` for
+    # those that are the ground itself.
     return any(
         part.is_laid_ground and not part.is_ground
         for part in scene.surrounding_meshes.values()
@@ -140,15 +144,16 @@ def find_place(scene: SceneData) -> Place | None:
 def load_requested_place(scene: SceneData) -> Place | None:
     """Return the place that settings or the environment require; None for none.
 
-    If there is a kind of ground, that decides: it is a bundled place or none. Otherwise
-    the environment may have a place, which is ignored if settings describe a table or
-    the ground has the size 0.
+    A kind of ground, if there is one, decides alone: it is a bundled place, or no place
+    (a table, for example). Otherwise the environment may have a place, which is ignored
+    if settings describe a table or the ground has the size 0.
     """
     kind = find_ground_kind(scene)
     if kind is not None:
         if kind not in PLACE_BY_GROUND_KIND:
             return None
-        return load_bundled_place(*PLACE_BY_GROUND_KIND[kind])
+        bundled_name, variant = PLACE_BY_GROUND_KIND[kind]
+        return load_bundled_place(bundled_name, variant)
     if scene.environment is None:
         return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
@@ -180,6 +185,7 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
         return replace(scene, parts=other_parts)
     environment = scene.environment
     radiance_unit = None if environment is None else environment.candelas
+    # Nothing but lamps depends on darkness.
     is_dark = bool(place.file.lamps) and _is_dark(environment)
     place_parts = make_place_parts(
         place, scene.size_in_metres, radiance_unit, is_dark=is_dark
@@ -195,10 +201,12 @@ def _is_dark(environment: EnvironmentAsset | None) -> bool:
     """
     if environment is None or environment.candelas is None:
         return False
+    # of level ground, (3,)
     irradiance = compute_irradiance(torch.from_numpy(environment.radiance.copy()))
-    # Weighted like a luminance, times cd/m2 for a radiance of 1, it is in lux.
     weighted_irradiance = float(irradiance @ torch.tensor(LUMINANCE))
-    return environment.candelas * weighted_irradiance < DUSK_ILLUMINANCE
+    # `candelas` is the luminance of a radiance of 1, cd/m2: the product is in lux.
+    illuminance = environment.candelas * weighted_irradiance
+    return illuminance < DUSK_ILLUMINANCE
 
 
 DUSK_ILLUMINANCE = (
@@ -301,6 +309,7 @@ def find_valid_range(
     # length of the ground in front of the camera that is below the image's lower border
     hidden_ground_distance = math.inf
     if camera.lower_angle > 0.0:
+        # Beyond 90 degrees the distance is negative; at 180 it would be infinite.
         lower_angle = math.radians(min(camera.lower_angle, 179.0))
         hidden_ground_distance = camera.height / math.tan(lower_angle)
     # The ground ends where the camera stands, at its azimuth from the object.
@@ -314,7 +323,7 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
     """Return how far an area reaches from the object in a direction, by its azimuth.
 
     `area` is a box around the object, or a number: the same in all directions. The
-    azimuth is in degrees. A ray leaves a box where it first passes one of the sides.
+    azimuth is in degrees.
     """
     if isinstance(area, float):
         return area
@@ -323,7 +332,10 @@ def _reach_of_area(area: Box | float, azimuth: float) -> float:
     x_from, x_to, y_from, y_to = area
     x_side = x_to if x > 0.0 else -x_from
     y_side = y_to if y > 0.0 else -y_from
-    return min(x_side / max(abs(x), 1e-12), y_side / max(abs(y), 1e-12))
+    # A ray leaves the box at the first of its sides.
+    reach_to_x_side = x_side / max(abs(x), 1e-12)
+    reach_to_y_side = y_side / max(abs(y), 1e-12)
+    return min(reach_to_x_side, reach_to_y_side)
 
 
 def find_surroundings(scene: SceneData) -> Surroundings | None:
@@ -349,9 +361,11 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
     # The near part of the place is geometry, and the far part a picture, whose limits
     # the place's file states.
     if place is not None and picture is not None:
+        # a `Box`: from and to in x, and in y
+        nearest_things: Box = (*picture.x, *picture.y)
         return Surroundings(
             height=picture.height,
-            nearest_distance=(*picture.x, *picture.y),
+            nearest_distance=nearest_things,
             ground_extent=extent,
             rotation=scene.get_number("environment.rotation"),
         )
@@ -410,8 +424,8 @@ def make_camera_view(
     half_height_angle = math.degrees(
         math.atan(math.tan(half_fov) * height_to_larger_side)
     )
-    # A lens of the user's, which has a name, may have any field of view: it may show
-    # the ground straight below the camera.
+    # A lens that the user has chosen has a name. It may have any field of view, and so
+    # show the ground straight below the camera.
     if scene.camera_model is not None and scene.camera_model.name:
         half_height_angle = 90.0
     azimuth = math.degrees(math.atan2(y, x))
@@ -420,6 +434,7 @@ def make_camera_view(
         view_azimuth = math.degrees(math.atan2(forward[1], forward[0]))
     # how far above the horizon the middle of the image is
     view_elevation = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
+    # how far below the horizon the lower border of the image is
     lower_angle = half_height_angle - view_elevation
     return CameraView(
         azimuth=azimuth,
@@ -468,10 +483,11 @@ def list_view_remarks(
     outside = () if place is None else list_outside_remarks(scene, place, views)
     if outside or surroundings is None:
         return outside
-    # `NO_RANGE` depends on the map's rotation only, so that any view would do.
+    # Whether the range is `NO_RANGE` depends on the map's rotation alone, and so is the
+    # same for all views.
     is_against_road = find_valid_range(surroundings, views[0]) == NO_RANGE
-    # Houses along a road are at different distances in x and y, which are a tuple.
-    # Other surroundings are equally far in all directions.
+    # Only houses along a road have a `Box`. Other surroundings are equally far in all
+    # directions, and have a number.
     has_houses = isinstance(surroundings.nearest_distance, tuple)
     if is_against_road or (rotates_map and has_houses):
         return (
@@ -497,8 +513,8 @@ def _list_range_remarks(
     limits = [find_valid_range(surroundings, view) for view in views]
     views_beyond = [
         view
-        for view, (distance, height) in zip(views, limits, strict=True)
-        if view.distance > distance or view.height > height
+        for view, (max_distance, max_height) in zip(views, limits, strict=True)
+        if view.distance > max_distance or view.height > max_height
     ]
     if not views_beyond:
         return ()
@@ -545,7 +561,10 @@ def _describe_position(position: Float64Array) -> str:
 def list_outside_remarks(
     scene: SceneData, place: Place, views: Sequence[CameraView]
 ) -> tuple[str, ...]:
-    """Return a remark if views are outside of the box that a place is valid for.
+    """Return a remark if cameras are outside of the box that a place is made for.
+
+    From there its image is not that of a real place. The result is empty if all views
+    are inside.
 
     Args:
         scene: the scene.

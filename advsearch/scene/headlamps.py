@@ -42,7 +42,7 @@ from advsearch.scene.assets import (
 )
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
-from advsearch.scene.scene_data import AnyScene, SceneData
+from advsearch.scene.scene_data import OBJECT, AnyScene, SceneData
 from advsearch.scene.settings import LAMPS, LAMPS_OFF
 from advsearch.scene.things import ThingPart, find_triangle_heights
 
@@ -165,7 +165,7 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     )
     # "off", "low" or "high" beam of each car
     kind_by_carrier = {
-        "object": get_lamp_kind(scene, "object.lamps"),
+        OBJECT: get_lamp_kind(scene, "object.lamps"),
         CAMERA: get_lamp_kind(scene, "camera.lamps"),
     }
     for part in other_parts:
@@ -177,7 +177,7 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     if not kind_by_lit_carrier:
         had_lamps = len(other_parts) < len(scene.parts)
         return replace(scene, parts=other_parts) if had_lamps else scene
-    # The units are those of the scene. One of the carriers is named in the message.
+    # All cars have the unit of the scene. The first is named if there is none.
     first_carrier = next(iter(kind_by_lit_carrier))
     radiance_unit = _get_radiance_unit(scene, first_carrier)
     scene = replace(scene, parts=other_parts)
@@ -206,9 +206,9 @@ def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
     Raises InputError: the environment's light has no unit, or the object's size in
     metres is not known.
     """
-    # names for the message; all other cars are things
-    settings = {"object": "`set` object.lamps", CAMERA: "`set` camera.lamps"}
-    setting = settings.get(carrier, "things: lamps")
+    # the setting that switched the lamps on, for the message; all other cars are things
+    setting_by_carrier = {OBJECT: "`set` object.lamps", CAMERA: "`set` camera.lamps"}
+    setting = setting_by_carrier.get(carrier, "things: lamps")
     radiance_unit = None if scene.environment is None else scene.environment.candelas
     if radiance_unit is None:
         raise InputError(
@@ -249,20 +249,15 @@ def _make_lamps(
         carrier: the mesh that carries them, or `CAMERA`.
         kind: beam, "low" or "high".
         radiance_unit: luminance in cd/m2 of a radiance of 1 in the scene.
-        weight: how often each beam is sampled; the environment has 1.
+        weight: how often the renderer samples each beam, relative to the environment.
     """
     if carrier == CAMERA:
-        # in the coordinates of the camera's car, see `compute_car_pose`
-        left_position = np.array(EGO_LAMP_POSITION)
-        right_position = left_position * [1.0, -1.0, 1.0]  # mirrored to the other side
-        positions = [
-            position / scene.size_in_metres
-            for position in (left_position, right_position)
-        ]
+        positions = _compute_ego_beam_positions(scene)
     else:
         part = scene.meshes[carrier]
         units_per_metre = _compute_units_per_metre(scene, part)
-        # radiance of the scene times square meters
+        # Luminous intensity as radiance of the scene times square meters: `_make_glass`
+        # divides by the area of the glass in square meters.
         front_power = HEADLAMP_CANDELA / radiance_unit * WHITE
         rear_power = TAILLAMP_CANDELA / radiance_unit * RED
         headlamp_glass = _make_glass(
@@ -281,9 +276,41 @@ def _make_lamps(
             power=rear_power,
         )
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
-    # The color of a beam, and the factor from candela to the scene's unit. Intensity is
-    # radiance times squared length, and a beam is a point in the scene, whose lengths
-    # are in object sizes. (The area of glass is measured in square meters.)
+    yield from _make_beams(scene, carrier, kind, positions, radiance_unit, weight)
+
+
+def _compute_ego_beam_positions(scene: SceneData) -> list[Float64Array]:
+    """Return where the left and the right beam of the camera's own car start.
+
+    They are in object sizes, in the coordinates of that car, see `compute_car_pose`.
+    """
+    left_position = np.array(EGO_LAMP_POSITION)
+    right_position = left_position * [1.0, -1.0, 1.0]  # mirrored to the other side
+    return [
+        position / scene.size_in_metres for position in (left_position, right_position)
+    ]
+
+
+def _make_beams(
+    scene: SceneData,
+    carrier: str,
+    kind: str,
+    positions: Sequence[Float64Array],
+    radiance_unit: float,
+    weight: float,
+) -> Iterable[ScenePart]:
+    """Yield the left and the right beam of a car.
+
+    Args:
+        scene: scene in which they shine.
+        carrier: the mesh that carries them, or `CAMERA`.
+        kind: beam, "low" or "high".
+        positions: where they start, in the car's coordinates.
+        radiance_unit: luminance in cd/m2 of a radiance of 1 in the scene.
+        weight: how often the renderer samples each beam, relative to the environment.
+    """
+    # A beam has its table in candela. This is its color, times the factor from candela
+    # to the scene's unit, which is radiance times squared object size.
     beam_color = WHITE / (radiance_unit * scene.size_in_metres**2)
     red, green, blue = map(float, beam_color)
     for name, position in zip(("left", "right"), positions, strict=True):
@@ -300,13 +327,14 @@ def _make_lamps(
 def _compute_units_per_metre(scene: SceneData, part: MeshPart) -> float:
     """Return the length of a meter in the coordinates of a car's mesh.
 
-    The size of a car in meters is that of its longest side. `add_lamps` has checked
-    that it is known.
+    The size of a car is the length of its longest side. `add_lamps` has checked that
+    the object's size in meters is known.
 
     Args:
         scene: the scene.
         part: the scene's object, or a thing next to it.
     """
+    # of the scene's object; a thing has a size of its own
     size_in_metres = scene.size_in_metres
     if isinstance(part, ThingPart):
         size_in_metres = part.size_in_metres
@@ -385,7 +413,7 @@ def _make_glass(
     # The base color has the light's color, with 0.8 as its largest channel: no surface
     # reflects all light.
     glass_color = (0.8 * power / power.max()).astype(np.float32)
-    # The visible area is that of both lamps, and so is the power.
+    # The visible area is that of both lamps, so that the power of one is doubled.
     visible_area = float(facing_area.clip(0.0).sum())
     radiance = 2.0 * power / max(visible_area, 1e-9)
     return LampGlass(
@@ -432,21 +460,22 @@ def _make_disks(
         facing: 1 for lamps that shine along +x, -1 along -x.
         units_per_metre: length of a metre in the car's coordinates.
     """
-    # For tail lamps the car is mirrored, so that these face along +x, too.
+    # For tail lamps (`facing` -1) the car is mirrored, so that its rear faces +x.
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [facing, 1.0, 1.0]
     lower = corners.min(axis=(0, 1))
     upper = corners.max(axis=(0, 1))
-    height, height_fraction = LAMP_HEIGHTS[lamp_type]
+    height, height_fraction = LAMP_HEIGHTS[lamp_type]  # meters, and of the car's height
     width = upper[1] - lower[1]
-    # A disk is at most a fifth as wide as a narrow car.
+    # A disk is at most a fifth as wide as the car.
     rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
+    # the lower one of both heights, above the lowest point
     center_z = lower[2] + min(
         height * units_per_metre, height_fraction * (upper[2] - lower[2])
     )
     disks = list[Float64Array]()
     for side in (1.0, -1.0):
         center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
-        # x is set below
+        # The disk lies in the plane x = 0 until it is moved in front of the body.
         center = np.array([0.0, center_y, center_z])
         disk_vertices = np.concatenate([[center], center + rim_offsets])
         body_x = _find_foremost_x(corners, disk_vertices, default=upper[0])
@@ -513,7 +542,7 @@ def _find_foremost_x(
         disk: (V, 3) vertices of the disk, whose x does not count.
         default: result if no such line meets a face.
     """
-    # (F, 3): for each axis, whether the boxes of triangle and disk lie apart
+    # (F, 3): for each axis, whether the bounds of face and disk do not overlap
     is_disjoint = (corners.min(axis=1) > disk.max(axis=0)) | (
         corners.max(axis=1) < disk.min(axis=0)
     )
@@ -521,8 +550,7 @@ def _find_foremost_x(
     may_meet = ~is_disjoint[:, 1:].any(axis=1)
     # `find_triangle_heights` finds heights z over points (x, y). With the axes in the
     # order y, z, x it finds x over points (y, z).
-    rotated_faces = corners[may_meet][:, :, [1, 2, 0]]
-    met_x = [
-        x for point in disk[:, 1:] for x in find_triangle_heights(rotated_faces, point)
-    ]
+    corners_yzx = corners[may_meet][:, :, [1, 2, 0]]
+    disk_yz = disk[:, 1:]
+    met_x = [x for point in disk_yz for x in find_triangle_heights(corners_yzx, point)]
     return max(met_x, default=default)

@@ -59,7 +59,8 @@ def make_finished_surface(
         [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
     )
     for name, finish in finishes.items():
-        face_values[mesh.materials[name]] = (
+        face_indices = mesh.materials[name]
+        face_values[face_indices] = (
             finish.roughness,
             finish.metallic,
             finish.clearcoat,
@@ -248,19 +249,18 @@ def load_environment(name: str) -> EnvironmentAsset:
         raise UnknownNameError("environment", name, known_names, MAP_HINT)
     facts = _read_environment_facts()[name]
     try:
-        content = (
-            _get_data_directory() / "environments" / f"{facts.get('map', name)}.exr"
-        ).read_bytes()
-        radiance: Float32Array = np.stack(
-            read_exr(Path(name), content)[0], axis=2
-        ).astype(np.float32)
+        # An environment has a map of its own, or that of another.
+        map_file = f"{facts.get('map', name)}.exr"
+        content = (_get_data_directory() / "environments" / map_file).read_bytes()
+        planes, _notes = read_exr(Path(name), content)  # red, green and blue
+        radiance: Float32Array = np.stack(planes, axis=2).astype(np.float32)
     except (OSError, FileFormatError) as error:
         raise FileFormatError(
             f"bundled environment {name!r} cannot be read ({error}); "
             "reinstall advsearch"
         ) from error
     ground = facts.get("ground")
-    candelas = facts.get("candelas")
+    candelas = facts.get("candelas")  # luminance of a radiance of 1, cd/m2
     return EnvironmentAsset(
         name, radiance, source=BUNDLED_ENVIRONMENT, ground=ground, candelas=candelas
     )
@@ -294,7 +294,7 @@ class LightImage:
 
 
 def read_light(path: Path, label: str = "environment") -> LightImage:
-    """Read an ``.hdr`` or ``.exr`` image of any shape.
+    """Read an ``.hdr`` or ``.exr`` image of any height and width.
 
     Its rows become floats only when they are read, so that a large image takes less
     memory.
@@ -310,11 +310,12 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
     """
     data = read_bytes(path, label, ENVIRONMENT_SUFFIXES)
     if path.suffix.lower() == ".hdr":
+        # RGBE pixels, and the factor from their numbers to radiance
         pixels, scale, notes = read_radiance(path, data)
         return LightImage(
-            pixels.shape[:2],
-            lambda top, end: decode_rgbe(pixels[top:end]) * scale,
-            tuple(notes),
+            size=pixels.shape[:2],
+            read_rows=lambda top, end: decode_rgbe(pixels[top:end]) * scale,
+            notes=tuple(notes),
         )
     planes, notes = read_exr(path, data)
     _check_planes(path, planes)
@@ -323,7 +324,7 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
         """Return rows (n, W, 3) of the three planes."""
         return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
 
-    return LightImage(planes[0].shape, read_rows, tuple(notes))
+    return LightImage(size=planes[0].shape, read_rows=read_rows, notes=tuple(notes))
 
 
 def _check_planes(path: Path, planes: Sequence[Plane]) -> None:

@@ -109,9 +109,9 @@ def _compare_outline(
     x = outline.left + (column + 0.5) * outline.step
     y = outline.top + (row + 0.5) * outline.step
     is_inside = (x > 0) & (x < width) & (y > 0) & (y < height)
-    # Visible pixels over the pixels of the full outline, also those beyond the image. A
-    # cell of the outline is `step` pixels wide and high.
-    fraction = float(mask.sum()) / (len(row) * outline.step**2)
+    # of the full outline, also beyond the image; a cell is `step` pixels wide and high
+    n_outline_pixels = len(row) * outline.step**2
+    fraction = float(mask.sum()) / n_outline_pixels
     is_truncated = bool((~is_inside).any())
     return min(1.0, fraction), is_truncated
 
@@ -170,7 +170,8 @@ class _Outline:
     """A rasterised outline, in cells of one or more pixels."""
 
     cells: BoolArray  # (rows, columns)
-    left: float  # left of the first cell, pixels from the image's top left
+    # position of the first cell's corner, in pixels from the image's top left
+    left: float
     top: float
     step: int  # width of a cell in pixels
 
@@ -179,7 +180,7 @@ class _Outline:
 
         At least `MIN_MATCHING_FRACTION` of them have to lie in a cell of the outline,
         or in a neighbor of one. Otherwise the outline, which was made by projecting the
-        faces, is not that of the rendered mesh.
+        faces, is not that of the rendered mesh. The mask has at least one pixel.
         """
         n_rows, n_columns = self.cells.shape
         pixel_row, pixel_column = np.nonzero(mask)

@@ -345,10 +345,10 @@ class PosedCamera:
 
         `aspect` is its width over its height.
         """
-        # `fov` is along the larger side already, unless it is along the height of an
-        # image that is wider than high
-        if not self.upright or aspect <= 1.0:
+        is_along_smaller_side = self.upright and aspect > 1.0
+        if not is_along_smaller_side:
             return self.fov
+        # from the height to the width: the tangents are in proportion to the sides
         return math.degrees(
             2.0 * math.atan(math.tan(math.radians(self.fov) / 2.0) * aspect)
         )

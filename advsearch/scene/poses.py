@@ -41,22 +41,18 @@ def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPa
         part: the mesh.
         values: all settings of the scene by name.
     """
-    parameters = {}
+    user_parameters = {}
     for parameter in POSE:
         value = values.get(f"pose:{part.name}.{parameter.name}")
         if value is not None:
-            parameters[parameter.name] = value
-    if parameters:
+            user_parameters[parameter.name] = value
+    if user_parameters:
+        defaults = {parameter.name: float(parameter.default) for parameter in POSE}
+        # The pose is that of the vertices in the world, so that it follows `to_world`.
         positions = compute_base_vertices(part)
-        parameters = {
-            **{parameter.name: float(parameter.default) for parameter in POSE},
-            **parameters,
-        }
-        part = replace(
-            part,
-            to_world=compute_pose(positions, float(positions[:, 2].min()), parameters)
-            @ part.to_world,
-        )
+        floor = float(positions[:, 2].min())
+        pose = compute_pose(positions, floor, {**defaults, **user_parameters})
+        part = replace(part, to_world=pose @ part.to_world)
     return replace(
         part, material=part.material.with_values(values, f"material:{part.name}.")
     )

@@ -126,8 +126,8 @@ class Renderer:
             scene renders them.
         n_renders: number of primal renders so far, those of differences included.
         n_gradients: number of adjoint renders so far.
-        n_non_finite: number of pixels and gradient entries that were NaN or infinite and
-            were set to zero.
+        n_non_finite: number of pixels and gradient entries that were NaN or infinite
+            and were set to zero.
 
     Args:
         scene: the scene inside Mitsuba, at the formation's resolution.
@@ -172,6 +172,7 @@ class Renderer:
         self.moments = tuple(moments)
         self.root_seed = root_seed
         self._shape = space.start.shape
+        # functions that replace the scene's tracing, see `copy_with`
         self._external_render: Source | None = None
         self._predict: Predict | None = None
         self.crop: Crop | None = None
@@ -291,13 +292,17 @@ class Renderer:
         """
         with torch.no_grad():
             inputs = self.scene.input_assembler(self.space.inputs(u))
+            # A copy counts its renders itself, so that this one is not counted here.
             surroundings = self.copy_with().render_radiance(
-                _select_scene_inputs(inputs), seed, spp, "backdrop.color" in inputs
+                _select_scene_inputs(inputs),
+                seed,
+                spp,
+                hide_environment="backdrop.color" in inputs,
             )
         return self.copy_with(crop=Crop(window, surroundings))
 
     def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
-        """Render one or several configurations as the model would see them.
+        """Render one or several configurations as finished images.
 
         Args:
             u: (d,) in [0, 1], a tensor or an array; or (N, d), rendered one after the
@@ -321,17 +326,18 @@ class Renderer:
         if is_batch:
             return torch.stack([self(row, seed, spp) for row in u])
         # An empty batch goes on, and is rejected for its shape.
-        u, masked_u = self._check_arguments(u, spp)
+        u, autograd_u = self._check_arguments(u, spp)
         with _leave_inference_mode():
-            image = self._render_image(masked_u, seed, spp)
-            # The derivatives that autograd does not compute through `masked_u` are
-            # added by differences.
-            is_masked = masked_u is not u
-            if (
-                is_masked
+            image = self._render_image(autograd_u, seed, spp)
+            # Autograd does not differentiate all coordinates through `autograd_u` if
+            # that is another tensor than u. The others are differentiated by
+            # differences.
+            needs_differences = (
+                autograd_u is not u
                 and torch.is_grad_enabled()
-                and self._select_difference_groups()
-            ):
+                and len(self._select_difference_groups()) > 0
+            )
+            if needs_differences:
                 image = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
             return image
 
@@ -342,18 +348,19 @@ class Renderer:
         the configuration, and laid over a backdrop. Controls that change the finished
         image are not applied.
         """
-        _, masked_u = self._check_arguments(u, spp)
+        _, autograd_u = self._check_arguments(u, spp)
         with _leave_inference_mode():
-            return self._render_image(masked_u, seed, spp, display=False)
+            return self._render_image(autograd_u, seed, spp, display=False)
 
     def render_independent_images(
         self, u: Tensor, seed: int, spp: int
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two images of a configuration with independent noise.
 
-        The tone curve is concave, so that it makes noisy images darker on average. The
-        two images therefore go through the curve's tangent at the third, denoised
-        image, and may leave [0, 1]. There is no graph, and the renders are not counted.
+        The tone curve is concave, so that it makes noisy images darker on average. So
+        the two images are not mapped by the curve, but by a straight line: its tangent
+        at the third, denoised image. They may leave [0, 1]. There is no graph, and the
+        renders are not counted.
 
         Args:
             u: (d,) configuration in [0, 1].
@@ -409,6 +416,7 @@ class Renderer:
         """
         hides_environment = "backdrop.color" in inputs
         scene_inputs = _select_scene_inputs(inputs)
+        # a copy, whose renders are not counted here
         undenoised = self.copy_with(denoiser="none")
         noise_seeds = [seeds.derive_seed(seed, "traced", half) for half in range(2)]
         halves = [
@@ -465,12 +473,13 @@ class Renderer:
                 _select_scene_inputs(inputs), subdivision
             )
             if "backdrop.front" in inputs:
-                # The first channel is the hidden fraction of the object. Its pixels
-                # that are mostly hidden have no surface, whatever is behind.
+                # The first channel is the hidden fraction of the object. Where
+                # something in front hides most of a pixel, no surface of the scene is
+                # visible.
                 is_hidden = inputs["backdrop.front"][..., 0] > 0.5
                 for dim in (0, 1):  # a pixel's value for all of its points
                     is_hidden = is_hidden.repeat_interleave(subdivision, dim)
-                surfaces.id[is_hidden] = 0  # no surface
+                surfaces.id[is_hidden] = 0  # no surface; depths stay
         # The scene is in object sizes.
         object_size = self.scene.description_and_filter[0].size_in_metres
         return replace(
@@ -505,8 +514,8 @@ class Renderer:
         Returns:
             The loss without graph, and (d,) float32.
         """
-        # Read by `_select_difference_groups` in the forward and backward pass of the
-        # call. "secant" is skipped there, since the loop below adds it.
+        # During the call below, `_select_difference_groups` leaves these out: "secant"
+        # in any case, since its differences are written at the end.
         self._skipped_estimators = (
             DIFFERENCE_ESTIMATORS if free else frozenset({"secant"})
         )
@@ -519,9 +528,32 @@ class Renderer:
                 (gradient,) = torch.autograd.grad(value, leaf, allow_unused=True)
         finally:
             self._skipped_estimators = frozenset()
+        # A loss that does not depend on u has no graph, and no gradient.
         derivative = torch.zeros_like(leaf) if gradient is None else gradient
-        if free:
-            return value.detach(), derivative
+        if not free:
+            self._write_secant_differences(loss, u.detach(), seed, spp, derivative)
+        return value.detach(), derivative
+
+    @torch.no_grad()
+    def _write_secant_differences(
+        self,
+        loss: Callable[[Tensor], Tensor],
+        u: Tensor,
+        seed: int,
+        spp: int,
+        derivative: Tensor,
+    ) -> None:
+        """Write differences of a loss into a derivative (d,), in place.
+
+        Only the coordinates with the estimator "secant" are written.
+
+        Args:
+            loss: function from an image (H, W, 3) sRGB to a scalar.
+            u: (d,) configuration.
+            seed: seed of the noise.
+            spp: samples per pixel, unless the plan has its own number.
+            derivative: (d,) tensor that is changed.
+        """
         noise_seed = seeds.derive_seed(self.root_seed, "differences", seed)
         difference_spp = self.plan.spp or spp
 
@@ -529,11 +561,8 @@ class Renderer:
             image = self._render_image(configuration, noise_seed, difference_spp)
             return loss(image)
 
-        with torch.no_grad():
-            for group in self.plan.select_groups("secant"):
-                # writes the entries of the group into `derivative`
-                write_central_differences(compute_loss, group, u.detach(), derivative)
-        return value.detach(), derivative
+        for group in self.plan.select_groups("secant"):
+            write_central_differences(compute_loss, group, u, derivative)
 
     # ---- from u to the image
 
@@ -575,14 +604,15 @@ class Renderer:
             )
         with _leave_inference_mode():
             u = u.clone() if u.is_inference() else u
+            # A prediction is differentiated by autograd for all coordinates.
             if self._predict is not None or not u.requires_grad:
                 return u, u
             is_by_autograd = self.plan.autograd_mask
             if bool(is_by_autograd.all()):
                 return u, u
             # The difference is 0, so that the value is u; the derivative is the mask.
-            masked_u = u.detach() + is_by_autograd * (u - u.detach())
-            return u, masked_u
+            autograd_u = u.detach() + is_by_autograd * (u - u.detach())
+            return u, autograd_u
 
     def _render_image(
         self, u: Tensor, seed: int, spp: int, *, display: bool = True
@@ -634,7 +664,7 @@ class Renderer:
             mount: a camera of a rig; None if the scene has one camera.
             u: (d,) configuration.
             space: mapping of u to scene inputs at the time of the image. None is the
-                renderer's space, at the time of this camera.
+                renderer's space, with the delay of this camera.
         """
         if space is None:
             space = self.space
@@ -661,10 +691,10 @@ class Renderer:
         """Render the mean radiance of the moments of u, denoised once.
 
         Rows of a sensor may be read one after the other, so that each row is exposed
-        during some of the moments only. A moment is weighted in each row by the
-        fraction of that row's exposure (`row_fractions`), which add up to 1 over the
-        moments. The guides of the denoiser are averaged in the same manner. All moments
-        together count as one render.
+        during some of the moments only. `row_fractions` (H,) of a moment are its
+        fractions of the exposure of each row, which add up to 1 over the moments. The
+        guides of the denoiser are averaged in the same manner. All moments together
+        count as one render.
 
         Args:
             mount: the camera of a rig; None if the scene has one camera.
@@ -675,6 +705,7 @@ class Renderer:
         """
         is_denoised = self.formation.denoiser == "oidn"
         renders_before = self.n_renders
+        # sums over moments, which the first addition makes images
         exposed = torch.zeros(())
         guides = torch.zeros(())
         for index, moment in enumerate(self.moments):
@@ -710,8 +741,7 @@ class Renderer:
         """Return the denoised image minus the image, (H, W, C).
 
         Args:
-            exposed: (H, W, C). C is 3, or 4 with coverage, or 7 or 13 with the changes
-                of the plane that receives the shadow.
+            exposed: (H, W, C), with the channels of `render_radiance`.
             guides: (H, W, 6) albedo and normals.
         """
         has_plane = exposed.shape[-1] > 4
@@ -751,9 +781,9 @@ class Renderer:
             radiance = radiance * torch.exp2(exposure)
             coat = coat * torch.exp2(exposure)
         if "backdrop.color" in inputs:
-            # The photograph is display-linear, which is radiance times the gain. The
-            # exposure does not change it. Channels 4 to 6, the change of the plane, are
-            # used relative to the plane's radiance, so that they need no exposure.
+            # The photograph is display-linear, which is radiance times the gain, and
+            # has no exposure of ours. Nor has the change of the plane (channels 4 to
+            # 6), which is used relative to the plane's radiance.
             behind = inputs["backdrop.color"] / self.formation.gain
             coverage_and_plane = rendered[..., 3:7]
             layers = torch.cat([radiance, coverage_and_plane, coat], dim=-1)
@@ -783,8 +813,9 @@ class Renderer:
             return inputs
         front_inputs = dict(inputs)
         depth = front_inputs.pop("backdrop.depth")
-        # The depth is an image with n x n points in each pixel.
-        n_points = depth.shape[0] // self.formation.resolution[0]
+        # The depth has n x n points in each pixel of the image.
+        image_height, _image_width = self.formation.resolution
+        n_points = depth.shape[0] // image_height
         surfaces = self.scene.find_surfaces(_select_scene_inputs(inputs), n_points)
         blur = float(inputs["backdrop.blur"]) if "backdrop.blur" in inputs else 0.0
         # A blur reaches about three standard deviations; 1 is for the pixel itself.
@@ -805,7 +836,7 @@ class Renderer:
     ) -> Tensor:
         """Return the linear radiance of scene inputs, differentiable in them.
 
-        If paths are traced, it counts in `n_renders`; a prediction does not.
+        If paths are traced, `n_renders` goes up by 1; a prediction is not counted.
 
         Args:
             inputs: inputs of the scene.
@@ -883,13 +914,13 @@ class Renderer:
         A group counts as not moving if it moves no outline, if it has more than
         `MAX_MEASURED_SIZE` coordinates, or if there is no `motion` to measure it. Then
         it has a default step: `TURN_STEP` if it is periodic, as an angle over a full
-        turn, and else the step of `compute_steps` for a speed of 0.
+        turn, and else `DEFAULT_STEP`, which `compute_steps` uses for a speed of 0.
         """
         speeds = torch.zeros(len(self.start))  # pixels per unit of each coordinate
         coordinates: list[int] = []
         for group in groups:
-            # "adjoint" and "image" are valid only for what moves no outline: a group
-            # with any other valid estimator may move one.
+            # "adjoint" and "image" are valid only for groups that move no outline, so
+            # that any other valid estimator is a sign of motion.
             may_move = {*group.valid} - {"adjoint", "image"}
             if may_move and group.size <= MAX_MEASURED_SIZE:
                 coordinates += range(group.begin, group.begin + group.size)
@@ -1022,9 +1053,8 @@ class _Radiance(torch.autograd.Function):
         inputs = dict(zip(names, tensors, strict=True))
         noise_seed = seeds.derive_seed(renderer.root_seed, "primal", seed)
         guides: Tensor | None = None
-        if (
-            renderer._external_render is not None
-        ):  # another program, which also denoises
+        # another program, which also denoises
+        if renderer._external_render is not None:
             rendered = renderer._external_render(inputs, noise_seed, spp)
         else:
             image_seeds = {"hidden" if hide else "path": noise_seed}
@@ -1066,8 +1096,8 @@ class _Radiance(torch.autograd.Function):
         noise_seed = seeds.derive_seed(renderer.root_seed, "gradient", ctx.seed)
         cotangent = renderer.replace_non_finite(cotangent)
         gradient_of_input = dict[str, Tensor]()
-        # If groups of both estimators reach an input, it is differentiated by the
-        # material form, which is right for more inputs.
+        # The material form is right for more inputs. So it differentiates those that
+        # are reached by groups of both estimators.
         by_material = _select_reached_inputs(renderer, "material")
         by_interior = _select_reached_inputs(renderer, "adjoint") - by_material
         material_names = [name for name in inputs if name in by_material]
@@ -1094,7 +1124,8 @@ class _Radiance(torch.autograd.Function):
             renderer.n_gradients += 1
         for name, gradient in gradient_of_input.items():
             gradient_of_input[name] = renderer.replace_non_finite(gradient)
-        # The six arguments of `forward` before the tensors have no gradients.
+        # The six arguments of `forward` between `ctx` and the tensors have no
+        # gradients.
         no_gradients = (None,) * 6
         return (*no_gradients, *map(gradient_of_input.get, ctx.names))
 

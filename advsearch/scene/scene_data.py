@@ -153,13 +153,15 @@ class SceneData:
 
     @property
     def environment_name(self) -> str:
-        """How the environment was asked for, or else its own name.
+        """How the environment was requested, or else its own name.
 
-        `NO_ENVIRONMENT` where there is none.
+        `NO_ENVIRONMENT` if it was not requested and there is none.
         """
-        return self.environment_spec or (
-            NO_ENVIRONMENT if self.environment is None else self.environment.name
-        )
+        if self.environment_spec:
+            return self.environment_spec
+        if self.environment is None:
+            return NO_ENVIRONMENT
+        return self.environment.name
 
     @property
     def base_vertices(self) -> Float64Array:
@@ -187,8 +189,8 @@ class SceneData:
 
         The setting `ground.kind` decides if it is set. Otherwise a photographed
         environment has such a ground, with two exceptions: settings describe a table,
-        or the environment may be hidden behind a plain color. The color would hide only
-        what is above the horizon, while the ground would still show the photograph.
+        or a plain color hides the environment. The ground would still show the
+        photograph then.
         """
         environment = self.environment
         kind = self.values.get("ground.kind")
@@ -272,4 +274,4 @@ def compute_object_to_world(description: SceneData) -> Float64Array:
         parameter.name: description.get_number(f"pose.{parameter.name}")
         for parameter in POSE
     }
-    return compute_pose(vertices, 0.0, parameters)
+    return compute_pose(vertices, floor=0.0, parameters=parameters)

@@ -65,7 +65,8 @@ class Parameter:
     def is_number(value: object) -> TypeGuard[float]:
         """Return whether a value is a number that float32 has.
 
-        No truth value, not NaN, and at most `MAX_VALUE` either way.
+        It is an int or a float from -`MAX_VALUE` to `MAX_VALUE`. Booleans and NaN, for
+        which the comparison is false, are none.
         """
         is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
         return is_real and abs(value) <= Parameter.MAX_VALUE  # type: ignore[arg-type]
@@ -191,7 +192,7 @@ class Parameter:
             name=name,
             shape=(),
             unit="name",
-            low=0.0,
+            low=0.0,  # the value is an index of `options`
             high=len(options) - 1.0,
             default=default,
             description=text,

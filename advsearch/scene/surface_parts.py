@@ -78,16 +78,18 @@ def unwrap(soup: TriangleSoup, chart_group: IntArray | None = None) -> TriangleS
         # patches are cut further where the group changes
         patch_and_group = patch * (int(chart_group.max()) + 1) + chart_group
         patch = np.unique(patch_and_group, return_inverse=True)[1].reshape(-1)
-    if int(patch.max()) >= _MAX_PATCHES:
+    has_too_many_patches = int(patch.max()) >= _MAX_PATCHES  # counted from 0
+    if has_too_many_patches:
         return replace(soup, uvs=_make_grid_uvs(len(soup.faces)))
     groups = group_indices(patch)
     atlas = _generate_atlas(soup, groups)
     uvs = np.empty((len(soup.faces), 3, 2))
     for index, group in enumerate(groups):
-        _, corners, atlas_uvs = atlas[index]
+        _vertices, corners, atlas_uvs = atlas[index]
         uvs[group] = np.asarray(atlas_uvs, dtype=np.float64)[np.asarray(corners)]
-    # A look-up near the border also reads the opposite one, and xatlas leaves no gap
-    # there: the charts are shrunk by half a gap on each side.
+    # An interpolated look-up near a border of the square also reads texels at the
+    # opposite border. xatlas leaves no gap there, so that the charts are shrunk: by
+    # half a gap on each side.
     margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
     return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(uvs, 0.0, 1.0))
 
@@ -171,8 +173,8 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     """
     normals: Float64Array = normalize_vectors(soup.compute_area_vectors())
     count = len(normals)
-    # The two faces of each shared edge. `find_shared_edges` returns corners, of which
-    # each face has three.
+    # The two faces of each shared edge. `find_shared_edges` returns corners, and the
+    # corners 3 f to 3 f + 2 are those of face f.
     left_corner, right_corner, _ = find_shared_edges(soup.faces)
     face = left_corner // 3
     neighbour = right_corner // 3
@@ -181,14 +183,15 @@ def _find_patches(soup: TriangleSoup) -> IntArray:
     patch = np.zeros(count, dtype=np.int64)
     # whether both faces of an edge stay in one patch
     is_same = np.ones(len(face), np.bool_)
+    # a large mesh, or a curved surface that would count as one plane
     if count > _FACES_PER_ATLAS or not _are_straight(normals, plane):
         direction = _find_directions(normals, face, neighbour)
         is_same = direction[face] == direction[neighbour]
         patch = find_components(count, face[is_same], neighbour[is_same])
-    cell = _find_cells(soup, patch)
-    if cell is None:
+    piece = _find_pieces(soup, patch)
+    if piece is None:
         return patch
-    is_same &= cell[face] == cell[neighbour]
+    is_same &= piece[face] == piece[neighbour]
     return find_components(count, face[is_same], neighbour[is_same])
 
 
@@ -198,19 +201,29 @@ def _find_directions(
     """Return the index (F,) of the cutting direction nearest to each face's normal.
 
     The directions are the 14 of `_make_cut_directions`. The normals are smoothed
-    before; the arguments are those of `_smooth_normals`.
+    before.
+
+    Args:
+        normals: (F, 3) unit normals of the faces.
+        face: (E,) index of one face of each shared edge.
+        neighbour: (E,) index of the other face.
     """
     smoothed = _smooth_normals(normals, face, neighbour)
     return np.asarray((smoothed @ _make_cut_directions().T).argmax(axis=1))
 
 
-def _find_cells(soup: TriangleSoup, patch: IntArray) -> IntArray | None:
-    """Return the piece (F,) of each face, if patches (F,) are cut for speed.
+def _find_pieces(soup: TriangleSoup, patch: IntArray) -> IntArray | None:
+    """Cut the patches of a large mesh into pieces, since xatlas is slow for large ones.
 
-    xatlas takes long for large patches. The result is None if the mesh is too small to
-    need that.
+    Args:
+        soup: the faces.
+        patch: (F,) number of the patch that each face is in.
+
+    Returns:
+        (F,) the piece of each face; None if the mesh is too small to need that.
     """
-    # from the largest meshes to smaller ones
+    # The largest meshes come first. A mesh with more than `min_faces` faces gets pieces
+    # of at most `max_faces`.
     for min_faces, max_faces in _CELL_FACES:
         if len(patch) > min_faces:
             centers = soup.points[soup.faces].mean(axis=1)
@@ -262,9 +275,9 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
     Returns:
         (F,) the piece of each face, numbered from 0.
     """
-    cell = np.zeros(len(patch), dtype=np.int64)
-    count = 0
-    remaining = group_indices(patch)
+    piece_of_face = np.zeros(len(patch), dtype=np.int64)
+    n_pieces = 0
+    remaining = group_indices(patch)  # groups of faces that may be too large
     while remaining:
         group = remaining.pop()
         if len(group) > max_faces:
@@ -273,9 +286,9 @@ def _halve_patches(centers: Float64Array, patch: IntArray, max_faces: int) -> In
             middle = len(order) // 2
             remaining += [order[:middle], order[middle:]]
         else:
-            cell[group] = count
-            count += 1
-    return cell
+            piece_of_face[group] = n_pieces
+            n_pieces += 1
+    return piece_of_face
 
 
 MAP_SIZE = 64  # cells along each side of the map
@@ -304,8 +317,8 @@ class SurfaceParts:
         counts_faces: whether the faces are parts too.
         n_parts: number of parts: cells, row by row from v = 1, and then the faces.
         is_covered: (CELLS, CELLS) whether the center of a cell lies in a chart.
-        face_of_part: (count,) the face at the center of each part; of a cell outside of all
-            charts the nearest one.
+        face_of_part: (count,) the face at the center of each part; of a cell outside of
+            all charts the nearest one.
         centers: (count, 3) that center, in the mesh's coordinates.
         center_uvs: (count, 2) and its u and v.
     """
@@ -359,20 +372,22 @@ class SurfaceParts:
         outside of the map count as on its border.
 
         Args:
-            face_of_part: (n,) index of the face.
+            face: (n,) index of the face.
             uv: (n, 2) the mesh's own texture coordinates.
         """
         if self.is_unwrapped:
-            # The arguments are in the order of rows and columns: v, then u.
-            weights = compute_barycentric(self._mesh_uvs[face], uv[:, 1], uv[:, 0])
-            # In a face without area the weights are NaN or infinite. Then the middle of
-            # the face is used.
+            u, v = uv.T
+            # `compute_barycentric` takes the position in the order of row and column.
+            weights = compute_barycentric(self._mesh_uvs[face], v, u)
+            # In a face without area the weights are NaN or infinite. A weight of 1/3
+            # for each corner is the middle of the face.
             weights = np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3)
             weights = np.clip(weights, 0.0, 1.0)
             weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
             uv = np.einsum("nk,nkc->nc", weights, self.face_uvs[face])
+        map_u, map_v = uv.T
         # v points up, and rows go down
-        column_and_row = np.floor(np.stack([uv[:, 0], 1 - uv[:, 1]]) * MAP_SIZE)
+        column_and_row = np.floor(np.stack([map_u, 1 - map_v]) * MAP_SIZE)
         column, row = np.clip(column_and_row, 0, MAP_SIZE - 1).astype(np.int64)
         return np.asarray(row * MAP_SIZE + column)
 

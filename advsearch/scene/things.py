@@ -109,8 +109,8 @@ def parse_things(things_spec: str | None) -> tuple[RequestedThing, ...]:
                 f"things: {part}: another thing of the scene is called "
                 f"{thing.name}; choose another name"
             )
-        # car, car-2, car-3: each number takes the place of the one before. (A name that
-        # ends in "-1" itself, as from a file "car-1.glb", becomes "car-2" at once.)
+        # car, car-2, car-3: each number replaces the one before. So a name that ends in
+        # "-1", as that of the file "car-1.glb", is followed by "car-2".
         number = 2
         while thing.name in used_names:
             plain_name = thing.name.removesuffix(f"-{number - 1}")
@@ -155,7 +155,8 @@ def _parse_thing(part: str) -> RequestedThing:
     size = None
     if "size" in options:
         size = _parse_number(part, "size", options["size"], MIN_METRES, MAX_METRES)
-    # what is behind a # names a part of a file, as in scene.glb#chair
+    # Without `name=` the file's name counts, without what is behind a #, which names a
+    # part of the file, as in scene.glb#chair.
     name = make_safe_name(Path(options.get("name") or object_spec.partition("#")[0]))
     return RequestedThing(
         object_spec=object_spec,
@@ -282,6 +283,7 @@ def _make_thing(
         )
     pose = _compute_pose(scene, asset, thing, asset.size_in_metres)
     part = make_mesh_part(name, asset, pose, asset.material)
+    # the fields of the mesh, with the label of the thing if it has one
     fields = {**vars(part), "label": thing.label or asset.label}
     remarks = [
         *asset.notes,
@@ -437,8 +439,8 @@ def list_camera_remarks(
     """
     solid_names = list[str]()
     for eye in eyes:
-        # Overlap is defined for footprints, so that the camera is taken for a tiny
-        # square.
+        # Overlap is defined for footprints. So the camera is a tiny square, whose
+        # corners are on the axes. Lengths of the scene are in object sizes.
         x, y, z = eye / scene.size_in_metres
         corners = np.array(
             [(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)]

@@ -53,8 +53,8 @@ class Window(NamedTuple):
         It is differentiable with respect to these (h, w, ...).
         """
         pasted = image.clone()
-        # `crop_image` returns a view, through which `pasted` is written.
-        self.crop_image(pasted)[...] = pixels
+        window_of_pasted = self.crop_image(pasted)  # a view of its memory
+        window_of_pasted[...] = pixels
         return pasted
 
     def pad(self, pixels: Tensor, resolution: tuple[int, int]) -> Tensor:

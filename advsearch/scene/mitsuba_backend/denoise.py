@@ -45,7 +45,7 @@ def denoise(
     """
     with mitsuba_lock:
         try:
-            # not before `mitsuba()`, which chooses libLLVM
+            # imported here, after Mitsuba, since Mitsuba has to choose libLLVM first
             import mitsuba_oidn
         except ImportError as error:
             raise EnvironmentSetupError(
@@ -53,6 +53,7 @@ def denoise(
                 "or use `denoise=none`"
             ) from error
         resolution = (radiance.shape[0], radiance.shape[1])
+        # images in memory that is used again by the next call in this thread
         buffers = _get_buffers(resolution, threading.get_ident())
         color_buffer, albedo_buffer, normal_buffer, output = buffers
         # The image gets the brightness for which the filter was trained; then back.
@@ -67,7 +68,7 @@ def denoise(
             normal_buffer,
             hdr=True,
             quality=quality,
-            input_scale=1.0,
+            input_scale=1.0,  # the gain is applied already
             output=output,
         )
         return (output / gain).to(radiance.device)
@@ -93,7 +94,8 @@ def denoise_image(
     """Denoise a rendered image (H, W, C).
 
     C is 3 or 4 without a photograph, 7 with one, and 13 if its plane has a coat. The
-    plane is the ground of the photograph, on which the object's shadow falls.
+    plane is the ground of the photograph, on which the object's shadow falls. Each
+    group of channels is denoised as an image of its own.
 
     Args:
         rendered: the image, with the channels of `advsearch.scene.rendered_channels`.
@@ -142,12 +144,13 @@ def _denoise_shade(
     it changes.
 
     Args:
-        change: (H, W, 3) relative change times the visible fraction.
+        change: (H, W, 3) relative change, as rendered: in a pixel that the object
+            covers in part, it is multiplied by the visible fraction of the plane.
         visible: (H, W, 1) fraction of a pixel in which the plane is visible.
         remove_noise: denoises an image (H, W, 3) of numbers of at least 0.
     """
-    # Two box filters are about a Gaussian one. The quotient is the mean change of the
-    # visible plane nearby.
+    # Two box filters (`_average`) are about a Gaussian one. The quotient is the mean
+    # change of the visible plane nearby.
     change_and_visible = torch.cat([change, visible], dim=-1)
     for _ in range(2):
         change_and_visible = _average(change_and_visible, FILL_RADIUS)
@@ -187,7 +190,8 @@ def _average(image: Tensor, radius: int) -> Tensor:
 def _get_buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
     """Return four buffers (H, W, 3) for images of one size in one thread.
 
-    They are cached: with other memory the filter would be set up anew, which takes
+    They hold the color, the albedo, the normal and the result. They are cached, for
+    each thread apart: with other memory the filter would be set up anew, which takes
     longer than to run it.
     """
     return [torch.zeros(*resolution, 3) for _ in range(4)]
@@ -197,9 +201,9 @@ def _compute_gain(radiance: Tensor) -> float:
     """Return the factor that gives an image the mean logarithmic luminance
     `KEY_LUMINANCE`.
 
-    The mean is over bins of the image (H, W, 3), black ones left out, as the denoiser
-    itself computes it. Its own sum depends on the number of threads, by a few units in
-    the last place; this one does not.
+    The mean is over bins of the image (H, W, 3), without black ones. The denoiser would
+    compute the same factor, but the last bits of its sum depend on the number of
+    threads.
     """
     luminance = (radiance.cpu().numpy() * LUMINANCE_WEIGHTS).sum(axis=-1)
     height, width = luminance.shape

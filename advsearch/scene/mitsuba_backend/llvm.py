@@ -104,7 +104,7 @@ def find_libraries(
     library = ctypes.util.find_library("LLVM") if root == Path("/") else None
     if library and os.sep in library:
         paths.append(Path(library))
-    # several links may lead to one file
+    # one of the links that lead to each file, by the file
     link_of_file = {path.resolve(): path for path in paths if path.is_file()}
     libraries = [
         examine_library(path, name_hint=link) for path, link in link_of_file.items()
@@ -140,7 +140,8 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         path: path of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
-    # the first bytes of Python's own program; empty on systems without ELF files
+    # The first bytes of Python's own program. They are empty on systems whose programs
+    # are no ELF files: there the library is not checked by its header.
     interpreter_header = read_interpreter_header()
     header = b""
     try:
@@ -159,7 +160,7 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
     version = (
         parse_version(path) or parse_version(name_hint) or query_version(str(path))
     )
-    return LibraryFile(path, version, explain_refusal(version))
+    return LibraryFile(path, version, refusal=explain_refusal(version))
 
 
 def explain_refusal(version: Version) -> str:
@@ -258,9 +259,9 @@ def get_install_command(
     release = release or {}
     ids = {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
     version = release.get("VERSION_ID", "")
-    # The packages of Ubuntu before 24 end with LLVM 15. conda's can be installed there,
-    # too, after conda itself.
-    if "ubuntu" in ids and re.match(r"(1\d|2[0-3])\.", version):
+    # Ubuntu before 24 has no package of a good version: there it is conda's.
+    is_old_ubuntu = "ubuntu" in ids and re.match(r"(1\d|2[0-3])\.", version)
+    if is_old_ubuntu:
         return commands["conda"]
     if ids & {"debian", "ubuntu"}:
         return commands["Debian, Ubuntu"]

@@ -132,8 +132,7 @@ def material_adjoint(
 ) -> dict[str, Tensor]:
     """Return the gradient of `sum(cotangent * radiance)` by vertices and normals.
 
-    The scene is only read. Nothing is recorded with `dr.freeze`. The first call for a
-    depth makes a path tracer.
+    The scene is only read. The first call for a `max_depth` makes a path tracer.
 
     Args:
         scene: Mitsuba's scene, loaded with `optimize=False`.
@@ -145,8 +144,9 @@ def material_adjoint(
             box-filtered pixels.
         seed: seed of all random numbers.
         spp: samples per pixel of the interior term.
-        boundary_spp, shadow_spp: samples of the outlines of each mesh and of the edges
-            that cast shadows, in multiples of the number of pixels; 0 leaves them out.
+        boundary_spp: samples of the outlines of each mesh, in multiples of the number
+            of pixels; 0 leaves the outlines out.
+        shadow_spp: samples of the edges of each mesh that cast shadows, likewise.
         max_depth: longest light path in segments. Only the first two segments, from the
             camera to a surface and from there on, are differentiated.
 
@@ -167,7 +167,8 @@ def material_adjoint(
     for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
         total += compute_outline_term(view, mesh, seed, index, boundary_spp)
         total += compute_shadow_term(view, mesh, seed, index, shadow_spp)
-    # `total` is no loss: each term is made so that its gradient is the derivative.
+    # The value of `total` means nothing: each term is made so that its gradient is the
+    # derivative of the loss.
     if dr.grad_enabled(total):
         dr.backward(total)
     gradients = dict[str, Tensor]()
@@ -186,11 +187,9 @@ def _is_rough(cotangent: Tensor) -> bool:
     values = cotangent.detach().to(torch.float64)
     right_square = torch.diff(values, dim=1).square().mean()
     down_square = torch.diff(values, dim=0).square().mean()
-    # 4: twice for each of the two directions
-    return bool(
-        right_square + down_square
-        > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean()
-    )
+    # the sum of both for a correlation of `ROUGH_COTANGENT`: 2 v (1 - c) twice
+    limit = 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean()
+    return bool(right_square + down_square > limit)
 
 
 def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> Any:
@@ -215,19 +214,22 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
             view.camera.make_ray(film), mi.RayFlags.All
         )
     # Point, normal and shading normal depend on the vertices. The first step is taken
-    # on copies that depend on nothing.
-    attached_values = view.attach_hit(hit)[:3]
+    # on copies that depend on nothing. All hits are on moving meshes.
+    *attached_values, _is_moving = view.attach_hit(hit)
     local_values = [type(value)(dr.detach(value)) for value in attached_values]
     dr.enable_grad(local_values)
     point, scaled_normal, shading_normal = local_values
 
-    # Step 1: differentiate the sum of W L J / J over all samples. The film area J that
-    # a piece of the surface covers counts relatively, so that constant factors of it
-    # may be left out.
+    # Step 1: differentiate the sum over all samples of W L J / J0. W is the cotangent
+    # (`weight`), L the radiance and J the area on the film of a piece of the surface,
+    # up to a constant factor. J0 is J without gradient, so that J / J0 has the value 1.
+    # J is area cos / depth^2, where the product below has the length depth / cos of the
+    # axis: hence the third power.
     film_area = (
         dr.dot(scaled_normal, point - view.camera.eye)
         / view.camera.compute_depth(point) ** 3
     )
+    # the sampled film position, which moves with the point
     moving_film = dr.replace_grad(film, view.camera.project(point))
     weight = view.interpolate_cotangent(moving_film, mi.Bool(True))
     moving_si = _attach_interaction(view, si, point, scaled_normal, shading_normal)
@@ -252,8 +254,9 @@ def _sample_first_hits(
     """Sample film positions that see a moving mesh.
 
     The film is cut into cells whose corners are the centers of pixels, since the
-    cotangent is bilinear between those. With half a cell past each border there is one
-    more cell than pixels along each side. Each has stratified samples.
+    cotangent is bilinear between those. The cells reach half a pixel past each border,
+    so that there is one more cell than pixels along each side. The samples of a cell
+    are stratified.
 
     Args:
         view: the scene.
@@ -277,7 +280,7 @@ def _sample_first_hits(
     tiles_across = math.ceil(n_columns / tile)
     n_tiles = tiles_across * math.ceil(n_rows / tile)
     tile_index = row // tile * tiles_across + column // tile
-    # One stream of random numbers for each sample of a tile.
+    # Sample i of all cells of a tile has the same stream of random numbers.
     sampler = make_sampler(
         make_stream(seed, INTERIOR),
         count=n_tiles * spp,
@@ -297,7 +300,7 @@ def _sample_first_hits(
     for mesh in view.moving_meshes:
         on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
     dr.eval(on_moving, film, hit, sampler)
-    # Keep the lanes that see a moving mesh. Each sampler goes on where it is.
+    # Keep the lanes that see a moving mesh, with the states of their generators.
     selected_lanes = dr.compress(on_moving)
     film = dr.gather(type(film), film, selected_lanes)
     hit = dr.gather(type(hit), hit, selected_lanes)
@@ -350,10 +353,11 @@ def _attach_interaction(
     moving_si.n = attach_normal(si.n, scaled_normal)
     normal = attach_normal(si.sh_frame.n, shading_normal)
     fixed_tangent = si.sh_frame.s
-    # the part of the tangent that is perpendicular to the moving normal
+    # the part of the tangent t that is perpendicular to the moving normal n:
+    # t - n (n . t)
     perpendicular = dr.fma(-normal, dr.dot(normal, fixed_tangent), fixed_tangent)
     tangent = dr.replace_grad(fixed_tangent, dr.normalize(perpendicular))
-    # The third axis has the value of `si.sh_frame.t`: a frame's axes are perpendicular.
+    # The cross product has the value of the frame's second tangent, `si.sh_frame.t`.
     moving_si.sh_frame = mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
     to_eye = dr.normalize(view.camera.eye - point)
     moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))
@@ -379,9 +383,9 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
         is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     direct = _reflect_light(view, moving_si, si, ds, em_weight, has_light)
 
-    # `incoming` is the light along the sampled direction, already multiplied by the
-    # BSDF. It is a constant but for the BSDF, which changes as the surface turns. A
-    # mirror has no BSDF value to differentiate: its factor is a constant 1.
+    # `incoming` is the light along the sampled direction, times the value of the BSDF
+    # over the density. Only this value changes as the surface turns, so that its
+    # relative change is multiplied. A mirror has no BSDF value: its factor is 1.
     bsdf_value = si.bsdf().eval(
         mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & is_smooth
     )
@@ -400,6 +404,7 @@ def _sample_light(
     """Sample a direction to an emitter from surface points.
 
     Nothing is sampled at a perfect mirror: it reflects no light of a sampled direction.
+    A BSDF has Mitsuba's flag `Smooth` if a part of it is not a perfect mirror.
 
     Returns:
         Mitsuba's direction sample; the emitter's radiance over the density; and in
@@ -432,9 +437,9 @@ def _sample_incoming(
     is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
     radiance = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
-    # `sample_radiance` includes all emission of the next surface, which is found again
-    # here. Subtract the fraction that the samples at emitters cover; in the direction
-    # of a mirror they cover nothing.
+    # `sample_radiance` includes all emission of the next surface or of the environment.
+    # Its fraction 1 - MIS weight is covered by samples at emitters, and subtracted
+    # here. In the direction of a mirror they cover nothing.
     is_shared = active & is_smooth
     si_next = view.scene.ray_intersect(ray, active)
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
@@ -469,9 +474,10 @@ def _reflect_light(
     moving_radiance = view.scene.eval_emitter_direction(moving_si, ds, is_near)
     moving_weight = moving_radiance / dr.select(is_near, ds.pdf, 1.0)
     moving_weight = dr.select(is_near, moving_weight, em_weight)
-    # A sample on a surface counts by the solid angle that this covers: the cosine at
-    # the emitter over the squared distance. `em_weight` contains its value, so that
-    # only its relative change is multiplied; its sign cancels in that.
+    # A sample on an emitting surface is weighted by the solid angle that a piece of the
+    # surface covers: the cosine at the emitter over the squared distance. `em_weight`
+    # contains that already, so that only the relative change is multiplied. The sign of
+    # the cosine cancels. The divisor 1 avoids a division by 0 for other emitters.
     falloff = dr.dot(ds.n, ds.d) / dr.select(
         is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
     )

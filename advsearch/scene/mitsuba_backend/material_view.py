@@ -173,7 +173,8 @@ class FilmView:
                 mesh = _make_mesh(shape, parameters, positions, normals)
                 dr.enable_grad(mesh.positions, mesh.normals)
                 moving_meshes[vertices_name] = mesh
-            # A rectangle, which has two faces, is left out, such as the ground.
+            # all other meshes but single rectangles, which have two faces, such as the
+            # ground; the normals of still meshes are not used
             elif shape.is_mesh() and shape.face_count() > 2:
                 buffer = parameters[f"{shape.id()}.{POSITIONS}"]
                 positions = buffer.torch().reshape(-1, 3).clone()
@@ -190,13 +191,15 @@ class FilmView:
     def interpolate_cotangent(self, film: Any, active: Any) -> Any:
         """Return the cotangent at a film position, differentiable in the position.
 
-        It is bilinear between pixel centers, and zero outside.
+        The cotangent (the derivative of the loss by the image) is bilinear between
+        pixel centers, and zero outside of the film.
         """
         width = self.camera.width
         height = self.camera.height
         active = active & self.camera.is_in_frame(dr.detach(film))
-        # Positions count from the center of the first pixel of the padded image: + 1
-        # for the border and - 0.5 to the pixel's center. Cells lie between centers.
+        # Cells lie between the centers of pixels. In the image padded by 1 pixel, the
+        # center of the first pixel is the position 0. So 1 is added for the border, and
+        # 0.5 subtracted for the center.
         padded_film = film + 0.5
         cell_position = dr.floor(dr.detach(padded_film))
         cell = mi.Point2u(
@@ -343,11 +346,11 @@ def make_stream(seed: int, purpose: int, index: int = 0) -> int:
 
     Args:
         seed: seed of the random numbers.
-        purpose: one of the four purposes at the top, from `INTERIOR` to `_SHADOWS`.
+        purpose: one of the four purposes from `INTERIOR` to `_SHADOWS`.
         index: index of a mesh, below 64.
     """
-    # A different number for each seed, mesh and purpose. The 1 is added since the
-    # product with 0 would be 0.
+    # A different number for each seed, mesh (0 to 63) and purpose (0 to 3). The 1 is
+    # added since the product with 0 would be 0.
     number = (seed * 64 + index) * 4 + purpose + 1
     return (number * 0x9E3779B97F4A7C15) % 2**63
 
@@ -437,7 +440,8 @@ def compute_outline_term(
         # Evaluated here, so that the backward pass does not trace the rays again.
         dr.eval(strength, hit)
     # Outside of `suspend_grad`, since the motion is differentiated by the vertices.
-    # Only its gradient counts: where nothing moves, the position may be anything.
+    # Only its gradient is used. So a point that does not move may have any position: it
+    # is 0.
     point_behind, _normal, _shading_normal, moves_behind = view.attach_hit(hit)
     film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
     motion = dr.dot(film_normal, edge_film - film_behind)
@@ -450,6 +454,9 @@ def _sample_outline_strength(
 ) -> Any:
     """Return the cotangent at points of an outline times the radiance behind them.
 
+    The radiance of the mesh in front does not count here: what is visible of the mesh
+    moves with it, which is in the interior term.
+
     Args:
         view: the scene.
         ray: camera rays just past the outline.
@@ -457,6 +464,7 @@ def _sample_outline_strength(
         is_visible: lanes in which nothing hides the point; elsewhere the result is 0.
         stream: stream of the outline's random numbers.
     """
+    # other random numbers than those of the points on the outline
     sampler = make_sampler(stream + _PATHS, dr.width(edge_film))
     radiance_behind = view.sample_radiance(ray, sampler, view.max_depth, is_visible)
     cotangent = view.interpolate_cotangent(edge_film, is_visible)
@@ -537,7 +545,7 @@ def _sample_outline(
     Returns:
         The samples; None if no outline is in the image.
     """
-    # Dr.Jit's points have one entry for each axis, of one lane each
+    # An axis of a Dr.Jit point is an array over lanes, of which there is one here.
     eye = torch.tensor([axis[0] for axis in camera.eye], dtype=torch.float64)
     forward = torch.tensor([axis[0] for axis in camera.forward], dtype=torch.float64)
     ends, outwards = _find_outline(mesh, eye)
@@ -568,8 +576,8 @@ def _sample_outline(
 def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
     """Find the edges of a mesh that an eye at a position (3,) may see as its outline.
 
-    All faces at such an edge, whether one or more, lie on one side of the plane through
-    the edge and the eye. Edges that another surface hides are included.
+    All faces at such an edge lie on one side of the plane through the edge and the eye;
+    there may be a single face. Edges that another surface hides are included.
 
     Returns:
         (E, 2) vertices of the edges, and (E, 3) that plane's unit normal, away from the
@@ -583,7 +591,7 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
     )
     plane = torch.nn.functional.normalize(plane, dim=1)
     # (3 F,) for each side of a face: signed distance of the face's third corner from
-    # the plane of that edge
+    # the plane of the edge on which the side lies
     corner_from_eye = mesh.vertices[edges.third_corner] - eye
     offset_from_plane = (plane[edges.edge_of_side] * corner_from_eye).sum(dim=1)
     # (E,) the smallest and the largest distance over the faces at an edge
@@ -593,9 +601,11 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
     max_offset = torch.full(
         (len(ends),), -torch.inf, dtype=offset_from_plane.dtype
     ).scatter_reduce(0, edges.edge_of_side, offset_from_plane, "amax")
-    on_outline = (min_offset > 0.0) | (max_offset < 0.0)
-    # away from the faces
-    sign = torch.where(min_offset[on_outline] > 0.0, -1.0, 1.0)[:, None]
+    are_faces_in_front = min_offset > 0.0  # all on the side of the plane's normal
+    are_faces_behind = max_offset < 0.0
+    on_outline = are_faces_in_front | are_faces_behind
+    # turns the normals away from the faces
+    sign = torch.where(are_faces_in_front[on_outline], -1.0, 1.0)[:, None]
     return ends[on_outline], plane[on_outline] * sign
 
 
@@ -687,8 +697,8 @@ def compute_shadow_term(
         shadow = _sample_shadow_borders(view, mesh, lines, stream)
     if shadow is None:
         return mi.Float(0)
-    # Only the gradient of the motion counts: a point that does not move may be
-    # anywhere.
+    # Only the gradient of the motion is used. So a lit point that does not move may
+    # have any position: it is 0.
     index = shadow.line_index
     lit_point, _normal, _shading_normal, lit_point_moves = view.attach_hit(shadow.hit)
     edge_point = mesh.interpolate_edge(lines.ends[index], lines.fraction[index])
@@ -716,10 +726,10 @@ class _ShadowBorders(NamedTuple):
 def _sample_shadow_borders(
     view: FilmView, mesh: TriMesh, lines: _TangentLines, stream: int
 ) -> _ShadowBorders | None:
-    """Find the lines that end in a point which the camera sees; None if there is none.
+    """Find the lines whose lit points the camera sees; None if there is none.
 
-    A line comes from the light, touches the mesh at an edge and ends at the next
-    surface.
+    A line comes from the light, touches the mesh at an edge and ends at the lit point,
+    on the next surface.
 
     Args:
         view: the scene.
@@ -753,6 +763,7 @@ def _sample_shadow_borders(
     # how much the loss changes as the lit point passes the shadow's border
     difference = _sample_radiance_difference(view, si, edge_position, offset, stream)
     strength = dr.sum(light_weight * difference)
+    # A sample that is not finite is left out, so that it does not spoil the sum.
     strength = dr.select(dr.isfinite(strength), strength, 0.0)
     dr.eval(strength, hit)
     return _ShadowBorders(
@@ -773,8 +784,7 @@ def _weigh_lit_points(view: FilmView, si: Any, to_light: Any) -> Any:
     - the area on the film that a bundle of lines around this one covers, per unit of
       area across the bundle.
 
-    It is 0 where the camera does not see the point. In the formula of
-    `material_adjoint` these are W, f and J'.
+    It is 0 where the camera does not see the point.
 
     Args:
         view: the scene.
@@ -792,12 +802,16 @@ def _weigh_lit_points(view: FilmView, si: Any, to_light: Any) -> Any:
     is_visible &= dr.any(weight > 0.0)
     is_visible &= ~view.scene.ray_test(si.spawn_ray_to(camera.eye), is_visible)
     matrix = camera.to_film.matrix
-    # area in pixels of a unit square at depth 1 that faces the camera
+    # Area in pixels of a unit square at depth 1 that faces the camera. An entry of the
+    # matrix is an array with one lane.
+    film_widths_per_unit = float(matrix[0, 0][0])
+    film_heights_per_unit = float(matrix[1, 1][0])
     pixels_at_unit_depth = abs(
-        float(matrix[0, 0][0]) * camera.width * float(matrix[1, 1][0]) * camera.height
+        film_widths_per_unit * camera.width * film_heights_per_unit * camera.height
     )
-    # The same of a unit area of the surface at its depth. With the angle at the surface
-    # it is cos / depth^2, where `to_eye` has the length depth / cos of the axis.
+    # Area in pixels of a unit area of the surface. The cosine at the surface over the
+    # squared depth would hold on the camera's axis; away from it the product with
+    # `to_eye`, which is longer than the depth, needs the third power.
     film_area = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixels_at_unit_depth
     # An area across the bundle covers 1 / cosine of the surface where the light
     # arrives.
@@ -831,11 +845,10 @@ def _sample_radiance_difference(
     past_edge = edge_point + offset
     inside_edge = edge_point - offset
     occluder = view.scene.ray_intersect_preliminary(make_ray(past_edge), coherent=False)
-    # Shorter by tolerances, so that the mesh at the edge itself does not count: the ray
-    # passes it at the distance of the offset.
-    distance_to_edge = dr.norm(edge_point - si.p) * (1.0 - DEPTH_TOLERANCE)
-    distance_to_edge -= 2.0 * dr.norm(offset)
-    is_free = ~occluder.is_valid() | (occluder.t > distance_to_edge)
+    # The mesh itself, at the edge or within two offsets of it, is no occluder.
+    max_distance = dr.norm(edge_point - si.p) * (1.0 - DEPTH_TOLERANCE)
+    max_distance -= 2.0 * dr.norm(offset)
+    is_free = ~occluder.is_valid() | (occluder.t > max_distance)
 
     def sample_radiance(target: Any) -> Any:
         """Return the radiance from the direction of a target, with equal noise."""
@@ -871,9 +884,9 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
     """Sample lines that touch the mesh at points of its edges, evenly.
 
     A line through a point of an edge touches the mesh if both faces at the edge are on
-    one side of it. Seen along the edge, such lines lie within its exterior angle,
-    between one face and the continuation of the other, or in the opposite direction. At
-    an edge with a single face every line touches the mesh.
+    one side of it. In a cross-section of the edge, such lines lie within the exterior
+    angle, between one face and the continuation of the other, or in the opposite of
+    that angle. At an edge with a single face every line touches the mesh.
 
     Args:
         mesh: the mesh.
@@ -903,8 +916,8 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
     perpendicular = (
         torch.cos(angle) * along_second + torch.sin(angle) * edges.opening[edge_index]
     )
-    # One random number gives two values. From -2 to 2, its sign chooses the exterior
-    # angle or the opposite one, and its magnitude minus 1 is the cosine with the edge.
+    # The last random number is scaled to -2 to 2. Its sign chooses the exterior angle
+    # or the opposite one, and its magnitude minus 1 is the cosine of line and edge.
     signed_choice = 4.0 * random[:, 3:4] - 2.0
     perpendicular = torch.where(signed_choice < 0.0, -perpendicular, perpendicular)
     edge_cosine = signed_choice.abs() - 1.0
@@ -950,7 +963,8 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     # single face they are the same.
     sorted_sides = torch.argsort(edges.edge_of_side, stable=True)
     n_faces = torch.bincount(edges.edge_of_side, minlength=len(edges.ends))
-    last_index = n_faces.cumsum(dim=0) - 1  # indices into `sorted_sides`
+    # (E,) where the sides of each edge begin and end in `sorted_sides`
+    last_index = n_faces.cumsum(dim=0) - 1
     first_index = last_index - n_faces + 1
     length = _compute_edge_vectors(vertices, edges.ends).norm(dim=1)
     is_measured = (n_faces <= 2) & (length > 0.0)

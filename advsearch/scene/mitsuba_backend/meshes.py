@@ -196,7 +196,8 @@ def make_base_texture(
 ) -> Plugin:
     """Return a display-referred base color (h, w, 3) as a linear texture.
 
-    The options are how it is looked up.
+    The options are entries of the texture that say how it is looked up, such as
+    "wrap_mode".
     """
     return {**make_texture(srgb_to_linear(base_color)), **to_loadable(options)}
 
@@ -291,8 +292,8 @@ def to_loadable(plugin: Mapping[str, object]) -> Plugin:
     """Return a dictionary that Mitsuba loads.
 
     Arrays of shape (4, 4) and (3, 3) become Mitsuba's transforms, others its bitmaps
-    (H, W, C). Principled surfaces get the nearest values that Mitsuba takes in place of
-    those in `BLACK_METAL_VALUES`.
+    (H, W, C). If a principled surface has a number that Mitsuba does not take, it gets
+    the nearest one that it takes, see `BLACK_METAL_VALUES`.
     """
     entries = {key: _to_loadable_entry(value) for key, value in plugin.items()}
     if entries.get("type") == "principled":
@@ -330,5 +331,7 @@ def _to_plain_entry(value: object) -> object:
     matrix = getattr(value, "matrix", None)  # of a transform
     if matrix is None:
         return value
-    # Some of Dr.Jit's matrices have a further axis, of one lane.
-    return np.array(matrix, dtype=np.float64).reshape(len(matrix), len(matrix))
+    # The reshape drops a further axis, of one lane, that some of Dr.Jit's matrices
+    # have.
+    size = len(matrix)
+    return np.array(matrix, dtype=np.float64).reshape(size, size)

@@ -67,6 +67,7 @@ def find_plugin_numbers(
             )
         if key not in numbers:
             raise UnknownNameError("number or colour in Mitsuba", key, numbers)
+    # The scene may have an input for the number already; else it gets a new one.
     return tuple(
         replace(numbers[key], input=numbers[key].input or f"{name}.{key}")
         for key in full_keys
@@ -109,7 +110,11 @@ def _find_numbers(
             continue
         estimators = _find_valid_estimators(scene.parameters.flags(key))
         numbers[key] = PluginNumber(
-            key, values, input_of_key.get(key, ""), estimators, is_plain
+            key,
+            values,
+            input=input_of_key.get(key, ""),
+            valid=estimators,
+            plain=is_plain,
         )
     return numbers, other_types
 
@@ -118,14 +123,13 @@ def _find_valid_estimators(flags: int) -> tuple[str, ...]:
     """Return the estimators that are valid for a parameter, the best one first.
 
     Args:
-        flags: Mitsuba's `ParamFlags`. `Differentiable` alone means that the adjoint is
-            right; with a further flag (`Discontinuous`) it misses what changes at
-            outlines.
+        flags: Mitsuba's `ParamFlags`.
     """
     if flags & mi.ParamFlags.NonDifferentiable.value:
         return DIFFERENCES_ONLY
     if flags == mi.ParamFlags.Differentiable.value:
         return ADJOINT_FIRST
+    # `Differentiable` and `Discontinuous`: the adjoint misses what changes at outlines.
     return DIFFERENCES_FIRST
 
 

@@ -107,7 +107,7 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
     cell_centers = (
         np.arange(GRID_SIZE) + 0.5
     ) / GRID_SIZE * 2.0 * half_width - half_width
-    highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))
+    highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))  # no drop
     max_height = np.zeros((GRID_SIZE, GRID_SIZE))
     for index, (x, y, radius, curvature_radius) in enumerate(drops):
         # only the cells in the square around the drop are computed
@@ -339,8 +339,8 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             behind_ray = si.spawn_ray(ray.d)
             is_coherent = True
             next_hit = self.skip_area_emitters(scene, behind_ray, is_coherent, skipped)
-            # Distances count from the camera, since haze lies in front of the skipped
-            # surface too.
+            # The haze in front of the skipped surface counts, too. So the hit becomes
+            # one of the camera's ray: its distance is measured from the camera.
             next_hit.t += si.t
             si[skipped] = next_hit.compute_surface_interaction(
                 ray, mi.RayFlags.All, skipped
@@ -385,17 +385,18 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
             active: lanes that are traced.
 
         Returns:
-            Whether it is scattered within the haze; the distance; the density of light
-            at the end of the flight, attached to the haze's parameters; the detached
-            albedo per channel; and the extinction, which is grey.
+            Whether it is scattered within the haze; the distance; a weight, attached to
+            the haze's parameters; the detached albedo per channel; and the extinction,
+            which is grey.
 
-            Of that density, callers use only the gradient divided by the value
-            (`dr.relative_grad`). So it need not be divided by the sampling density.
+            The weight is the integrand of the flight: transmittance, times scattering
+            coefficient if light is scattered. It is not divided by the sampling
+            density, since callers use only its relative gradient (`dr.relative_grad`).
         """
         scattering, _, extinction = self.haze.get_scattering_coefficients(
             dr.zeros(mi.MediumInteraction3f)
         )
-        extinction = extinction[0]
+        extinction = extinction[0]  # grey: all channels are equal
         # Invert the distribution 1 - exp(-extinction distance). `MIN_EXTINCTION` avoids
         # a division by 0: a haze of extinction 0 scatters very far away.
         flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(
@@ -456,7 +457,8 @@ def _eval_towards_emitter(
         bsdf, si: the BSDF and the interaction of the surface.
         ds: the direction sample of the emitter.
         scattered: where the event is in the haze.
-        active: where the BSDF is evaluated.
+        active: lanes at a surface in which the BSDF is evaluated; elsewhere its value
+            is 0, unless light is scattered.
         throughput: throughput of the path up to the event.
     """
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
@@ -586,7 +588,8 @@ class _PlaneHits:
         # The reflectance of the matt part. What a coat takes from it is left out: the
         # changes are used as ratios to the plane's radiance, in which it cancels.
         self._albedo = self._si.bsdf().eval_diffuse_reflectance(self._si, self.is_hit)
-        light = self._sample_emitter(scene, sampler)  # which also sets `_factors`
+        # The call also sets `_factors`, one for each quantity of the class.
+        light = self._sample_emitter(scene, sampler)
         self.direct_changes = [
             dr.select(self.is_hit, factor * light, 0.0) for factor in self._factors
         ]
@@ -605,16 +608,20 @@ class _PlaneHits:
         self.path_ray = dr.select(self.is_hit, bounced_ray, ray)
         self.is_traced = active & (~self.is_hit | is_bounced)
         if coat is not None:
+            # adds to `direct_changes`
             self._reflect_environment(scene, coat, direction)
 
     def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
         """Sample an emitter from the plane, and return its radiance over the density.
 
-        This also sets `_factors`: a factor on that radiance for each quantity of the
-        class. It is the fraction of the light that the plane reflects; for the changes
-        it is multiplied by a sign. The photograph already has the light of the
-        environment: the sign is -1 where something blocks it, else 0. It does not have
-        the light of a lamp: the sign is 0 where something blocks it, else 1.
+        This also sets `_factors`, by which that radiance is multiplied for each of the
+        quantities: the change of the matt ground, and with a coat also the change of
+        the coat and the environment in it. A factor is the fraction of the light that
+        is reflected. For the two changes it has a sign:
+
+        - light of the environment is already in the photograph: -1 where something
+          blocks it, else 0;
+        - light of a lamp is not: 1, or 0 where something blocks it.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
@@ -643,8 +650,9 @@ class _PlaneHits:
     ) -> Any:
         """Return the fraction of an emitter sample's light that the coat reflects.
 
-        A path from the coat, which is sampled too, may find the same light of the
-        environment (`_reflect_environment`). So each of the two samples is weighted by
+        A path that leaves from the coat finds the same light of the environment
+        (`_reflect_environment`). Its density is `COAT_FRACTION`, the probability of
+        such a path, times that of the direction. Each of the two samples is weighted by
         its fraction of both densities, the balance heuristic (Veach 1997). A path
         cannot meet a lamp, whose sample counts in full.
 
@@ -663,8 +671,9 @@ class _PlaneHits:
     ) -> tuple[Any, Any]:
         """Choose whether a path goes on from the matt ground or from its coat.
 
-        This sets `weights`. In each lane only the weight of the chosen bounce is not 0;
-        it is divided by the probability of the choice.
+        This sets `weights`, one for each quantity of the class. In each lane only the
+        weight of the chosen bounce is not 0. It is divided by the probability of the
+        choice.
 
         Args:
             coat: coat of the plane.
@@ -683,7 +692,8 @@ class _PlaneHits:
         self.weights = [
             dr.select(leaves_coat, 0.0, matt_weight),
             mi.Color3f(dr.select(leaves_coat, coat_weight, 0.0)),
-            # The environment in the coat has no light that other surfaces send.
+            # The environment in the coat is that without objects: no light that other
+            # surfaces send is in it.
             mi.Color3f(0.0),
         ]
         direction = dr.select(leaves_coat, reflected, matt_direction)
@@ -693,11 +703,11 @@ class _PlaneHits:
     def _reflect_environment(self, scene: Any, coat: _Coat, direction: Any) -> None:
         """Add the light of the environment that a bounce off the coat would meet.
 
-        It is added to the environment in the coat, and where the object blocks it,
-        subtracted from the coat's change.
+        It is added to the environment in the coat (`direct_changes[2]`). Where an
+        object blocks it, it is subtracted from the change of the coat
+        (`direct_changes[1]`).
 
-        The emitter sample of `_sample_emitter` finds the same light. By the balance
-        heuristic each of the two counts by its fraction of both densities.
+        The emitter sample finds the same light, see `_compute_coat_fraction`.
 
         Args:
             scene: Mitsuba's scene.
@@ -721,14 +731,14 @@ class _PlaneHits:
         reflected = self.weights[1] * mis_weight * environment.eval(escaped, is_bounced)
         reflected = dr.select(is_bounced, reflected, 0.0)
         is_blocked = scene.ray_test(self.path_ray, is_bounced)
-        # 1 is the coat's change, 2 the environment in the coat.
         self.direct_changes[1] -= dr.select(is_blocked, reflected, 0.0)
         self.direct_changes[2] += reflected
 
     def list_changes(self, path_radiance: Any) -> list[Any]:
-        """Return the quantities of the class, three channels each.
+        """Return the one or three quantities of the class, three channels each.
 
-        They include the light that other surfaces send to the plane.
+        They are the direct changes, and the light that other surfaces send to the
+        plane.
 
         Args:
             path_radiance: radiance that arrives along the path's next segment.
@@ -742,9 +752,9 @@ class _PlaneHits:
     def backpropagate(self, scene: Any, cotangents: list[Any]) -> Any:
         """Add the derivatives of the direct changes by the lights' parameters.
 
-        The emitter sample is that of the primal pass, evaluated again with gradients.
-        The environment that a bounce meets has no derivative: in a photograph it is
-        fixed.
+        The emitter sample is evaluated again with gradients. The light of the
+        environment that a bounce meets has no derivative, since the environment of a
+        photograph is fixed.
 
         Args:
             scene: Mitsuba's scene.
@@ -766,8 +776,8 @@ class _PlaneHits:
             with dr.resume_grad():
                 change = cotangent * factor * light
                 if dr.grad_enabled(change):
-                    # The replay of the path needs the edges at the lights' parameters
-                    # later, so that only the interior ones are cleared.
+                    # Of the graph, only interior edges are cleared: the replay of the
+                    # path still needs those at the lights' parameters.
                     dr.backward_from(change, dr.ADFlag.ClearInterior)
         return path_cotangent
 
@@ -816,9 +826,10 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
     ) -> Any:
         """Sample paths of light, or in the adjoint modes replay them.
 
-        A path that meets the plane first goes on from there; `prb` traces that rest.
-        Its radiance is part of the change of the plane's radiance, which is returned in
-        the further channels, while the color is 0. See `_PlaneHits`.
+        Most work is done by the `sample` of the base class, `prb`. It traces a camera
+        ray that does not meet the plane first. If a ray does, it traces the path that
+        goes on from the plane. The radiance of that path is part of the further
+        channels, see `_PlaneHits.list_changes`, and the color of the ray is 0.
 
         Args:
             mode: primal (trace the image) or an adjoint mode of Dr.Jit.
@@ -837,11 +848,11 @@ class PhotographPath(PRBIntegrator):  # type: ignore[misc]
         camera_ray = mi.Ray3f(dr.detach(ray))
         plane = _PlaneHits(scene, sampler, camera_ray, mi.Bool(active), self.coat)
         if mode != dr.ADMode.Primal:
-            # A ray that meets the plane has color 0. Its rest, which `prb` traces,
-            # counts by the further channels only.
+            # Where the plane is hit, the radiance that `prb` traces affects the further
+            # channels only, whose cotangents are those of `δaovs`.
             path_cotangent = plane.backpropagate(scene, δaovs)
             δL = dr.select(plane.is_hit, path_cotangent, δL)
-        L, valid, _, state_out = super().sample(
+        L, valid, _channels, state_out = super().sample(
             mode=mode,
             scene=scene,
             sampler=sampler,
@@ -1051,12 +1062,12 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         """Read model, clipping and perhaps drops from the sensor's properties."""
         super().__init__(props)
         values = tuple(float(props[name]) for name in NUMBER_NAMES)
-        # "reach" is the largest angle to the axis at which the lens has rays
-        self._model = CameraModel(
-            str(props["kind"]), values, max_angle_degrees=float(props["reach"])
-        )
+        # the largest angle to the axis at which the lens has rays, degrees
+        reach = float(props["reach"])
+        self._model = CameraModel(str(props["kind"]), values, max_angle_degrees=reach)
         self._near = float(props["near_clip"])
         self._far = float(props["far_clip"])
+        # columns and rows of the grid of ray directions, about one for each pixel
         self._grid_cells = tuple(
             max(MIN_CELLS, min(MAX_CELLS, int(size)))
             for size in self.film().crop_size()
@@ -1132,9 +1143,10 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         # whose fields have different lengths.
         ray = dr.zeros(mi.RayDifferential3f)
         ray.time = time
-        # The near distance counts along the ray: a wide lens has no near plane.
+        # Near and far are distances along the ray, since a wide lens has no planes.
         ray.o = self.pose @ mi.Point3f(self._near * direction)
         ray.d = self.pose @ mi.Vector3f(direction)
+        # of length 0 where the lens has no direction, so that the ray hits nothing
         ray.maxt = dr.select(weight > 0.0, mi.Float(self._far), 0.0)
         return ray, mi.Spectrum(weight)
 
@@ -1166,7 +1178,9 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def _bend_by_drops(self, direction: Any, sample: Any) -> tuple[Any, Any]:
         """Refract the rays that pass through a raindrop on the sheet before the camera.
 
-        `sample` chooses the point of the aperture: drops are near, and so out of focus.
+        Rays meet the sheet shifted by points of the aperture, which `sample` chooses.
+        So drops, which are near, are out of focus. The directions of rays are those of
+        a pinhole, so that the scene is sharp.
 
         Returns:
             The unit directions, and the fraction of the light that passes: 1 without a
@@ -1224,6 +1238,7 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
     def _make_rays(self) -> None:
         """Compute the grid of ray directions from the lens's numbers."""
         n_columns, n_rows = self._grid_cells
+        # corners of the cells, one more than cells along each side
         x = torch.linspace(0.0, 1.0, n_columns + 1, dtype=torch.float64)
         y = torch.linspace(0.0, 1.0, n_rows + 1, dtype=torch.float64)
         positions = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
@@ -1251,7 +1266,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         upper = self._lerp_rays(upper_left, x_fraction)
         lower = self._lerp_rays(upper_left + (n_columns + 1), x_fraction)
         ray = dr.lerp(upper, lower, y_fraction)
-        return dr.normalize(mi.Vector3f(ray.x, ray.y, ray.z)), ray.w > 0.0
+        has_direction = ray.w > 0.0  # the margin, see `rays`
+        return dr.normalize(mi.Vector3f(ray.x, ray.y, ray.z)), has_direction
 
     def _lerp_rays(self, left: Any, fraction: Any) -> Any:
         """Interpolate between an entry of the grid and the next one in its row."""

@@ -68,8 +68,8 @@ def to_transform(value: Any) -> Any:
 
 def to_torch(value: Any) -> Tensor:
     """Convert a Dr.Jit value to a torch tensor with memory of its own."""
-    # A color or point becomes its three components. Dr.Jit's own conversion of a color
-    # has six entries.
+    # A color or point becomes its three components, one after the other. Dr.Jit's own
+    # conversion of a color is not used: its result has six entries.
     if isinstance(value, (mi.Color3f, mi.Point3f)):
         return torch.cat([to_torch(component) for component in value])
     value = getattr(value, "matrix", value)  # of a transform
@@ -245,7 +245,8 @@ def _load_user_surface(
         texture = mi.load_dict(
             meshes.make_base_texture(part.base_color, options), optimize=False
         )
-        # The key is found by its owner: the surface may have other textures.
+        # The surface may have other textures, so that several keys match. That of this
+        # texture is found by its owner.
         inputs.append(
             SceneInput(
                 f"{part.name}.base_color",
@@ -310,8 +311,9 @@ def _make_pose_input(name: str, parameter: str) -> SceneInput:
 
     Args:
         name: name of the part.
-        parameter: name of the input within the part, such as "to_world". Mitsuba's key
-            is always "to_world".
+        parameter: name of the input within the part: "to_world", or another one for a
+            pose that is not the base pose of a mesh. Mitsuba's key is always
+            "to_world".
     """
     return SceneInput(
         name=f"{name}.{parameter}",
@@ -333,8 +335,8 @@ def _translate_plugin(part: parts.PluginPart) -> TranslatedPart:
 def _translate_numbers(part: parts.PluginNumbers) -> TranslatedPart:
     """Return the inputs of numbers of Mitsuba's plugins, and no plugin.
 
-    Some numbers belong to another part, such as "object.roughness", which has that
-    input already. They are left out here.
+    The input of a number may belong to another part, as "object.roughness" belongs to
+    the object. That part has the input already, so that it is left out here.
     """
     inputs = [
         _make_number_input(plugin_number)
@@ -371,7 +373,7 @@ def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
         plugin_number.input,
         plugin_number.key,
         write,
-        # `valid` are the estimators that are valid for it.
+        # if the adjoint is among the estimators that are valid for it
         has_interior_adjoint="adjoint" in plugin_number.valid,
         shape=(len(plugin_number.values),),
         rendered_range=rendered_range,
@@ -427,7 +429,7 @@ def _translate_ball_lamp(part: parts.BallLamp) -> TranslatedPart:
         "emitter": {"type": "area", "radiance": _make_rgb(part.radiance)},
     }
     inputs = (
-        # Named "ball", since this pose is not the base pose of a mesh.
+        # not "to_world", which is the name for the base pose of a mesh
         _make_pose_input(part.name, "ball"),
         _make_light_input(part.name, parameter="radiance", key="emitter.radiance"),
     )
@@ -478,7 +480,8 @@ def _translate_beam(part: parts.BeamLamp) -> TranslatedPart:
     # cells alternate, and the first is a border.
     x = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2]
     y = np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
-    # A field of view of 90 degrees is 2 wide at distance 1, and less high.
+    # The field of view is 90 degrees along the width: at distance 1, half the width is
+    # 1, and half the height is height / width.
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
     image = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
     lamp = {
@@ -505,8 +508,8 @@ def _translate_haze(part: parts.HazePart) -> TranslatedPart:
         {"type": "homogeneous", "albedo": albedo, "sigma_t": part.density},
         optimize=False,
     )
-    # Mitsuba does not release media. So the medium is held as long as its owner lives,
-    # here the population itself: forever.
+    # Mitsuba does not release media. So the medium is held as long as the registry
+    # itself, that is forever.
     scene_registry.hold_objects(scene_registry, media=(medium,))
     inputs = (
         SceneInput(
@@ -608,8 +611,9 @@ def _make_ground(description: SceneDescription) -> Any:
     is rendered into a photograph (`backdrop_photograph`): then the ground is an
     invisible plane that receives the shadow. Otherwise it is a plain square.
 
-    The two latter are two-sided squares of the width `ground.size`. The result is None
-    if that is 0, or if the ground is a road or a square with meshes of its own.
+    The invisible plane and the plain ground are two-sided squares of the width
+    `ground.size`. The result is None if that is 0, or if the ground is a road or a
+    place, which has meshes of its own.
     """
     photographed_ground = description.photograph
     if photographed_ground is not None:
@@ -631,10 +635,11 @@ def _make_ground(description: SceneDescription) -> Any:
     gloss = description.get_number("ground.gloss")
     if description.backdrop_photograph is not None and gloss > 0.0:
         roughness = description.get_number("ground.roughness")
+        # a diffuse ground under a clear coat
         bsdf = {
             "type": "roughplastic",
             "distribution": "ggx",
-            "alpha": max(roughness, MIN_PLANE_ROUGHNESS) ** 2,
+            "alpha": max(roughness, MIN_PLANE_ROUGHNESS) ** 2,  # as in `_Coat`
             "int_ior": compute_refractive_index(gloss),
             "ext_ior": 1.0,
             "diffuse_reflectance": reflectance,
@@ -692,8 +697,9 @@ def _check_background(
             "leave one of the two out"
         )
     has_plain_backdrop = description.backdrop and not description.backdrop_photograph
-    # A searched lens has no name. At some of its numbers, two directions fall on one
-    # point of the image (it folds), and other parts of the image stay black.
+    # A lens has no name if its numbers are searched. Some numbers make a lens that
+    # folds (two directions fall on one point of the image), and leaves other parts
+    # black.
     is_searched = not model.name
     may_leave_black = model.black_fraction > 0.0 or is_searched
     if has_plain_backdrop and may_leave_black:
@@ -739,13 +745,15 @@ def _make_lens(description: SceneDescription) -> Plugin:
             name: description.get_number(f"camera.{name}")
             for name in ("drops", "drop_size", "drop_seed")
         }
-        # Drops cover the part of the glass through which the lens sees. A searched
-        # lens, whose view changes, gets the drops of a pinhole with its field of view.
+        # Drops cover the part of the glass through which the lens sees. A lens has no
+        # name if its numbers are searched. Then its view changes, and it gets the drops
+        # of a pinhole with the camera's field of view.
         is_searched = not model.name
         if is_searched:
             half_fov = math.radians(description.get_number("camera.fov")) / 2.0
             camera["drop_tangent"] = math.tan(half_fov)
         else:
+            # the larger one of width and height
             camera["drop_tangent"] = max(model.inner_half_tangents)
     return camera
 

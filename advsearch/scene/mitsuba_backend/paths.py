@@ -77,8 +77,8 @@ class PathSamples:
         state, increment = mi.sample_tea_32(seed, sample)
         self.rng = mi.PCG32(initstate=state, initseq=increment)
         self.index = sample % spp
-        # All samples of a pixel have one permutation seed, made from the index of the
-        # pixel's first sample.
+        # All samples of a pixel have one permutation seed, made from the image's seed
+        # and the index of the pixel's first sample.
         first_sample = sample - self.index
         self.permutation, _ = mi.sample_tea_32(0, first_sample + seed)
         self.dimension = mi.UInt32(0)
@@ -237,7 +237,8 @@ class LightPath:
             si: surface interaction where the path arrives.
         """
         ds = mi.DirectionSample3f(scene, si, self.vertex)
-        # After a mirror, no light was sampled: the density is 0 and the weight 1.
+        # A mirror samples no emitter (`is_delta`): there this density is 0, so that the
+        # weight below is 1.
         emitter_pdf = scene.pdf_emitter_direction(self.vertex, ds, ~self.is_delta)
         # Where the last surface sampled no direction, nothing arrives.
         has_direction = self.pdf > 0.0
@@ -248,9 +249,9 @@ class LightPath:
     def meet(self, si: Any, bsdf: Any, changed: Sequence[Any]) -> None:
         """Record whether the path has arrived at one of the changed shapes.
 
-        At the first changed surface, the radiance collected so far becomes
-        `radiance_before`; its emission, which `add_emission` has added already, is part
-        of that. At the first hit, the guides of the denoiser are recorded.
+        At the first changed surface of a path, the radiance collected so far, with what
+        the surface itself emits, becomes `radiance_before`, and `radiance` begins anew.
+        At the first hit, the guides of the denoiser are recorded.
 
         Args:
             si: surface interaction where the path arrives.
@@ -300,10 +301,12 @@ class LightPath:
             direction_numbers,
             self.active,
         )
+        # A BSDF sample cannot meet a point light, whose sample has all the weight.
         light *= dr.select(ds.delta, 1.0, _compute_weight(ds.pdf, pdf))
         radiance = dr.fma(self.throughput, value * light, self.radiance)
         self.radiance = dr.select(is_lit, radiance, self.radiance)
 
+        # the next segment; what it meets is weighted by the vertex and the density here
         self.ray = si.spawn_ray(si.to_world(sample.wo))
         self.throughput *= weight
         self.eta *= sample.eta
@@ -316,14 +319,14 @@ class LightPath:
         """End paths by Russian roulette from a number of bounces on.
 
         As in Mitsuba's `path`, the probability to survive is the throughput times the
-        squared index of refraction. Radiance in glass is larger by that square, and the
-        throughput of a path that enters glass smaller, although no light is lost.
+        square of the index of refraction. The throughput of a path that enters glass
+        falls by that square, although no light is lost.
         """
         max_throughput = dr.max(self.throughput)  # over the color channels
         survival = dr.minimum(max_throughput * dr.square(self.eta), MAX_SURVIVAL)
         has_roulette = self.depth >= roulette_depth
         survives = ~has_roulette | (numbers.next_1d() < survival)
-        # A survival of 0 gives NaN, in a path that ends in the next line.
+        # Where the survival is 0, this is NaN; such a path ends in the last line.
         self.throughput = dr.select(
             has_roulette, self.throughput * dr.rcp(survival), self.throughput
         )
@@ -336,7 +339,8 @@ class LightPath:
         Each has nine channels: radiance, albedo and normal.
         """
         guides = [*self.albedo, *self.normal]
-        # Without a changed surface, `radiance` is all of the radiance.
+        # A path that has met no changed surface has all its light in `radiance`, and
+        # nothing in `radiance_before`.
         unchanged = [
             *dr.select(self.has_met, self.radiance_before, self.radiance),
             *(dr.select(self.has_met_first, 0.0, channel) for channel in guides),
@@ -381,7 +385,8 @@ def trace_paths(
         path.meet(si, bsdf, changed_shapes)
         path.reflect(scene, si, bsdf, numbers, max_depth)
         path.survive(numbers, roulette_depth)
-    return *path.list_channels(), path.has_met
+    unchanged, changing = path.list_channels()
+    return unchanged, changing, path.has_met
 
 
 def _is_among(shape: Any, changed: Sequence[Any]) -> Any:

@@ -82,8 +82,10 @@ class MitsubaScene:
 
     Attributes:
         max_depth: longest light path in segments, as the argument.
-        current_max_depth: current longest light path; `limit_depth` makes it smaller for a time.
-        input_assembler: function that turns the inputs of a space into those of this scene.
+        current_max_depth: current longest light path; `limit_depth` makes it smaller
+            for a time.
+        input_assembler: function that turns the inputs of a space into those of this
+            scene.
         description_and_filter: description of the scene, and name of the filter.
         input_names: names of all inputs that can be set.
         parameters: Mitsuba's parameters of the scene, from `mi.traverse`.
@@ -102,9 +104,9 @@ class MitsubaScene:
         leave_out: names from `advsearch.scene.formation.OMISSIONS`: work that is not
             needed. The default is all of it; less is only for measuring what it saves.
         max_depth: longest light path in segments.
-        sampler_name: Mitsuba's name of the sampler; some round sample counts up, see
+        sampler: Mitsuba's name of the sampler; some round sample counts up, see
             `round_sample_count`.
-        integrator_name: Mitsuba's name of the path integrator of primal renders without
+        integrator: Mitsuba's name of the path integrator of primal renders without
             media. None chooses `path` in scenes with roulette, and else `prb`.
     """
 
@@ -127,8 +129,8 @@ class MitsubaScene:
             filter: reconstruction filter, "box" or "gaussian".
             leave_out: names of work that is left out; see the class.
             max_depth: longest light path in segments.
-            sampler_name: Mitsuba's name of the sampler, such as "independent".
-            integrator_name: Mitsuba's name of the path integrator; None chooses one.
+            sampler: Mitsuba's name of the sampler, such as "independent".
+            integrator: Mitsuba's name of the path integrator; None chooses one.
         """
         with mitsuba_lock:
             # The import registers the plugins, which needs the variant.
@@ -146,8 +148,8 @@ class MitsubaScene:
             self.current_max_depth = max_depth
             self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
-            # "tracing" is the work that recordings save. Dr.Jit can record neither a
-            # thin lens nor a textured emission.
+            # Recordings save work that is called "tracing": if that is left out, they
+            # are used. Dr.Jit can record neither a thin lens nor a textured emission.
             can_be_recorded = not description.thin_lens and not any(
                 map(has_textured_emission, description.meshes.values())
             )
@@ -200,7 +202,7 @@ class MitsubaScene:
         """Set the integrator of images, and the lengths from which paths may end early.
 
         Among walls light is reflected many times: there Russian roulette saves more
-        time than its noise costs. `integrator_name` is Mitsuba's type; None takes "path"
+        time than its noise costs. `integrator` is Mitsuba's type; None takes "path"
         there, and "prb" elsewhere.
         """
         self.integrator_name = integrator or "prb"
@@ -222,9 +224,12 @@ class MitsubaScene:
             description, self.resolution, filter_name, self.sampler_name
         )
         with parts.convert_refusals(description):
-            # lobes of the principled plugin that have no effect, but take time
-            lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
-            translations = [parts.translate_mesh(description.meshes[OBJECT], lobes)]
+            # Lobes of the principled plugin that have no effect, but take time. They
+            # are part of the plugin only if they are not left out.
+            idle_lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
+            translations = [
+                parts.translate_mesh(description.meshes[OBJECT], idle_lobes)
+            ]
             # each part becomes Mitsuba's plugins, entries of integrators, and inputs
             translations += [
                 parts.translate_part(get_positioned_part(description, part))
@@ -255,7 +260,7 @@ class MitsubaScene:
         self.declared_inputs = dict[str, tuple[str, parts.SceneInput]]()
         for scene_input in inputs:
             key = parts.find_key(self.parameters, scene_input)
-            if key:
+            if key:  # empty if Mitsuba has no such parameter
                 self.declared_inputs[scene_input.name] = (key, scene_input)
         self.input_names = frozenset(self.declared_inputs)
         self.interior_inputs = frozenset(
@@ -269,7 +274,8 @@ class MitsubaScene:
             for name, (key, _) in self.declared_inputs.items()
             if key.endswith((POSITIONS, NORMALS))
         )
-        # Numbers that Mitsuba compiles into its kernels, as constants.
+        # Numbers that Mitsuba compiles into its kernels, as constants. They are the
+        # ones that are converted by `to_constant`.
         self._constants = frozenset(
             name
             for name, (_, scene_input) in self.declared_inputs.items()
@@ -286,8 +292,8 @@ class MitsubaScene:
     def copy_with(self, **changes: Any) -> MitsubaScene:
         """Return another scene, made with the same arguments except for some changes.
 
-        `changes` may have `max_depth`, `sampler_name`, `integrator_name` and `leave_out`. The
-        integrator is chosen again if it is not among them.
+        `changes` may have `max_depth`, `sampler`, `integrator` and `leave_out`. Without
+        an integrator there, the other scene chooses one by itself.
         """
         description, filter_name = self.description_and_filter
         arguments = {
@@ -299,16 +305,17 @@ class MitsubaScene:
         other = MitsubaScene(
             description, self.resolution, filter=filter_name, **arguments
         )
-        # Both integrators are loaded on first use, which makes the recordings of all
-        # scenes stale. So that happens now, and not later between renders.
+        # An integrator is loaded on first use, which makes the recordings of all scenes
+        # stale. So that happens now, and not later between renders.
         for method in ("path", "guides"):
             other._get_integrator(method)
         return other
 
     @contextmanager
     def limit_depth(self, depth: int | None) -> Iterator[None]:
-        """Limit light paths to `current_max_depth` segments inside the `with`, if it is not
-        None.
+        """Limit light paths to `depth` segments inside the `with`, if it is not None.
+
+        `current_max_depth` is the limit that holds.
         """
         depth_before = self.current_max_depth
         if depth is not None:
@@ -345,7 +352,8 @@ class MitsubaScene:
         try:
             yield
         finally:
-            self._write_crop(Window(0, 0, *self.resolution))
+            height, width = self.resolution
+            self._write_crop(Window(top=0, left=0, height=height, width=width))
 
     def _write_crop(self, window: Window) -> None:
         """Set which window of the image the camera's film has."""
@@ -366,7 +374,7 @@ class MitsubaScene:
     def get_base_value(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh tensor of the input's shape.
 
-        All inputs of the scene are reset to their base values.
+        To read it, all inputs of the scene are reset to their base values.
         """
         key, scene_input = self.declared_inputs[name]
         self._set_inputs_exactly({})  # Mitsuba's parameter then has the base value
@@ -445,7 +453,8 @@ class MitsubaScene:
                 )
                 image = drjit_image.torch().clone()
                 if method == "guides":
-                    # the last six channels are albedo and normal
+                    # Albedo and normal are the last six channels. There may be a color
+                    # before them.
                     image = image[..., -6:]
                     image[..., :3].clamp_(0.0, 1.0)
                 images.append(image)
@@ -462,6 +471,7 @@ class MitsubaScene:
         It is recorded at the first call with a key, and replayed later.
         """
         if self._uses_recordings:
+            # Media are state that the recording reads.
             media = scene_registry.list_media() if self.is_volumetric else []
             function = self._recorded.get_or_record(key, function, media)
         return function(self._scene, self._sensor, *args)
@@ -503,10 +513,10 @@ class MitsubaScene:
     def set_geometry(self, inputs: Mapping[str, Tensor]) -> None:
         """Make sure that the scene has the vertices and normals of some inputs.
 
-        If it has them already, nothing is set, so that other inputs keep the values
-        that they have. Otherwise all of `inputs` are set.
+        If it has them already, nothing is set, not even the other inputs. Otherwise all
+        of `inputs` are set.
         """
-        # In both, buffers without an entry have their base values.
+        # Buffers without an entry have their base values, in both dictionaries.
         requested = {name: inputs[name] for name in inputs if name in self._buffers}
         applied = {
             name: self._applied_values[name]
@@ -579,8 +589,9 @@ class MitsubaScene:
         """
         with mitsuba_lock:
             requested = tuple(inputs if wrt is None else wrt)
-            # Inputs that are differentiated although they are not requested. "gradients"
-            # is that work: it is left out, except to measure what it takes.
+            # Inputs that are differentiated although they are not requested. Usually
+            # there are none, since "gradients" is left out. To measure what these
+            # gradients take, it is not left out.
             extra = set[str]()
             if "gradients" not in self._leave_out:
                 extra = set(self.interior_inputs)
@@ -619,7 +630,7 @@ class MitsubaScene:
 
         Without a backdrop these are the 3 channels of the radiance. With a backdrop,
         coverage is the fourth; its cotangent is 0, since it has no derivative here. The
-        channels after it, of a plane in a photograph, are copied.
+        channels after it, of a plane in a photograph, are copied if there are any.
 
         Args:
             cotangent: (H, W, C), where C may also be 3 with a backdrop.
@@ -628,7 +639,7 @@ class MitsubaScene:
         image_gradient = gradient[..., :3]
         if self._backdrop:
             coverage_gradient = torch.zeros(*gradient.shape[:2], 1)
-            plane_gradient = gradient[..., 4:]  # may have no channels
+            plane_gradient = gradient[..., 4:]  # no channels without a plane
             image_gradient = torch.cat(
                 [image_gradient, coverage_gradient, plane_gradient], dim=-1
             )
@@ -677,9 +688,9 @@ class MitsubaScene:
             yield tracked
         finally:
             mi.set_log_level(level)
-            # Each value is taken out of the dictionary as it is put back. If two
-            # objects owned its array, Dr.Jit would later write to a copy instead of
-            # the memory to which recordings refer, see `_write`.
+            # Each value is taken out of the dictionary as it is put back, and its local
+            # name is deleted. If two objects owned its array, Dr.Jit would later write
+            # to a copy instead of the memory to which recordings refer, see `_write`.
             while old_values:
                 key, value = old_values.popitem()
                 self.parameters[key] = value
@@ -778,14 +789,14 @@ class MitsubaScene:
                 depth=self.current_max_depth,
                 spp=spp,
                 projector=projector,
-                unseen=self._find_plane(),
+                unseen=self._find_plane(),  # its change is rendered apart
                 roulette_depth=self.roulette_depth,
             )
-            # The matrix that is made of the vertices repeats the texture. A surface of
-            # ours does the same, so that its coordinates stay. One of Mitsuba's own
-            # surfaces may mirror or clamp, and a projector's image ends at its border
-            # (no surface): their coordinates are converted.
-            surface = None
+            # The matrix that is made of the vertices repeats the texture. Texture
+            # coordinates are converted where Mitsuba does not: a projector's image ends
+            # at its border, and one of Mitsuba's own surfaces may mirror or clamp. A
+            # surface of ours (None) repeats, and its coordinates stay.
+            surface = None  # for `_to_repeating` a projector's image
             if projector is None:
                 surface = self.description_and_filter[0].meshes[part].surface
                 if surface is None:
@@ -812,7 +823,7 @@ class MitsubaScene:
         Inputs that already have the requested value are not written again. Vertices are
         overwritten in the memory that they have, since recordings refer to it. Some
         numbers are compiled into recordings as constants: if one of them changes, all
-        recordings are stale, which `scene_registry.changes` counts.
+        recordings are stale, which `scene_registry.n_changes` counts.
         """
         self._check_known(inputs)
         if self._values_to_upload:
@@ -854,9 +865,10 @@ class MitsubaScene:
         None as a value means that the input goes back to its base value.
         """
         reset = [name for name in self._applied_values if name not in inputs]
-        changes: dict[str, Tensor | None] = dict.fromkeys(reset)
+        changes: dict[str, Tensor | None] = dict.fromkeys(reset)  # all None
         for name, tensor in inputs.items():
-            value = self.declared_inputs[name][1].to_rendered(tensor)
+            _key, scene_input = self.declared_inputs[name]
+            value = scene_input.to_rendered(tensor)
             applied = self._applied_values.get(name)
             is_set = (
                 applied is not None
@@ -885,7 +897,8 @@ class MitsubaScene:
                 )
         is_buffer = name in self._buffers
         if name not in self._base_values:
-            # A buffer is copied, since it is overwritten in place below.
+            # The memory of a buffer is copied, since it is overwritten in place below.
+            # Other values are replaced.
             base = current.torch().clone() if is_buffer else current
             self._base_values[name] = type(current)(base)
         if tensor is None:
@@ -910,8 +923,8 @@ class MitsubaScene:
         address = buffer.torch().data_ptr()
         dr.scatter(buffer, value, dr.arange(mi.UInt32, len(buffer)))
         dr.eval(buffer)
-        has_moved = buffer.torch().data_ptr() != address
-        scene_registry.n_changes += has_moved
+        if buffer.torch().data_ptr() != address:
+            scene_registry.n_changes += 1
 
     def _get_integrator(self, method: str) -> Any:
         """Return the integrator of a method at the current depth, loaded on first use.
@@ -923,8 +936,8 @@ class MitsubaScene:
         """
         key = (method, self.current_max_depth)
         if key not in self._integrators:
-            # `_path_entries` has what a part of the scene needs, such as haze; it may
-            # replace the type.
+            # `_path_entries` has what a part of the scene needs. That of haze replaces
+            # the type, so that these entries come last.
             adjoint = {
                 "type": "prb",
                 "max_depth": self.current_max_depth,
@@ -941,7 +954,8 @@ class MitsubaScene:
             hidden = {**adjoint, "hide_emitters": True}
             if self.plane_radiance is not None:
                 hidden["type"] = "advsearch_photograph"
-                # `PhotographPath` names them as the properties of the plane's coat.
+                # gloss and roughness of the plane's coat, by the names of the
+                # properties of `PhotographPath`
                 hidden["reflectance"] = self.description_and_filter[0].get_number(
                     "ground.gloss"
                 )
@@ -968,7 +982,8 @@ class MitsubaScene:
 def _make_guides_plugin(description: SceneDescription) -> Plugin:
     """Return the integrator of the denoiser's guides.
 
-    Mitsuba's own does not see through cut-outs.
+    Mitsuba's own ("aov") does not see through cut-outs, for which there is one of ours.
+    The last six channels of both are albedo and normal.
     """
     if description.has_opacity:
         return {"type": "advsearch_guides"}
@@ -1004,8 +1019,8 @@ def _to_repeating(
         size: rows and columns of the texture.
     """
     if surface is None:
-        # Clamp to the centers of the outer texels: beyond them Mitsuba's look-up stays
-        # constant, but one that repeats would blend with the other side.
+        # a projector's image. Beyond the centers of the outer texels Mitsuba's look-up
+        # stays constant, but one that repeats would blend with the other side.
         half_texel = 0.5 / torch.tensor(size[::-1])
         return uv.clamp(half_texel, 1.0 - half_texel)
     options = next(

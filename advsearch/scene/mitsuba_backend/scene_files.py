@@ -128,13 +128,13 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
         InputError: an entry is no number, or not of the right shape.
     """
     for key, value in plugin.items():
-        # A color is written as a plugin, such as {"type": "rgb", "value": ...}, but is
-        # a value here. A dictionary without a type counts as one, and is rejected.
-        is_color = isinstance(value, Mapping) and value.get("type", "rgb") in (
+        # A color such as {"type": "rgb", "value": ...} is a value here, and no plugin.
+        # So is a dictionary without a type, which is rejected below as a number.
+        is_plugin = isinstance(value, Mapping) and value.get("type", "rgb") not in (
             "rgb",
             "spectrum",
         )
-        if isinstance(value, Mapping) and not is_color:
+        if isinstance(value, Mapping) and is_plugin:
             # Errors name the plugin at the top of the scene.
             inner_where = where
             if plugin["type"] == "scene":
@@ -180,7 +180,8 @@ def read_contents(path: Path) -> PluginContents:
     )
     cameras = tuple(name for name, kind in type_by_name.items() if kind in CAMERAS)
     known_names = {*objects, *cameras}
-    # Plugins of these types are replaced by our own; all others stay unchanged.
+    # Integrators and sensors are replaced by our own; sensors in `cameras` also give
+    # these their poses. All other plugins stay unchanged.
     replaced_types = INTEGRATOR_TYPES | SENSOR_TYPES
     unchanged = {
         name: kind
@@ -189,7 +190,10 @@ def read_contents(path: Path) -> PluginContents:
     }
     lights = tuple(name for name, plugin in named.items() if _emits_light(plugin))
     return PluginContents(
-        objects, unchanged, lights, tuple(map(_rename_reserved, cameras))
+        objects=objects,
+        unchanged=unchanged,
+        lights=lights,
+        cameras=tuple(map(_rename_reserved, cameras)),
     )
 
 
@@ -215,9 +219,8 @@ def import_mitsuba_scene(
 
     Args:
         scene: path of the file, or the dictionary.
-        object_id: id of the shape that is the object; where there is none, the only one
-            that differs in nothing but case and signs ("largebox" means "large-box", as
-            Mitsuba's own writer calls it).
+        object_id: id of the shape that is the object. If no shape has it, a similar id
+            counts, see `_find_shape`: "largebox" means "large-box".
 
     Raises:
         UnknownNameError: it has no such shape.
@@ -239,7 +242,7 @@ def import_mitsuba_scene(
     surface = shapes.read_surface(_find_surface(shape, plugins))
     mesh, has_uvs = shapes.load_shape_mesh(shape, object_id)
     frame = _ObjectFrame(mesh, object_id, z_up=_is_z_up(plugins))
-    # A haze replaces the plugins that it is made of.
+    # A haze replaces the plugins that it is made of: a ball and the medium in it.
     haze = None
     haze_names = frozenset[str]()
     haze_and_names = shapes.find_haze(plugins, frame.matrix)
@@ -256,10 +259,10 @@ def import_mitsuba_scene(
     notes += [f"{where}: {clause}" for clause in clauses]
     mesh, base_color = _paint(
         _make_upright(mesh, frame.rotation),
-        has_uvs,
-        surface,
-        str(shape["type"]),
-        where,
+        has_uvs=has_uvs,
+        surface=surface,
+        kind=str(shape["type"]),
+        where=where,
     )
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     asset = ObjectAsset(
@@ -361,7 +364,9 @@ def _import_surroundings(
         )
         part_type = MediumPart if has_medium else PluginPart
         yield part_type(
-            _rename_reserved(name), moved_plugin, _emits_light(moved_plugin)
+            _rename_reserved(name),
+            plugin=moved_plugin,
+            emits_light=_emits_light(moved_plugin),
         )
 
 
@@ -372,8 +377,8 @@ def _paint(
 
     A mesh keeps its texture coordinates if its surface has a texture or anything else
     that depends on them; the base color's transform is applied to them. A shape of one
-    color gets new ones if several of its points have the same, as on a cube, since a
-    searched texture needs different ones.
+    color may get new ones, since a texture that is searched needs different coordinates
+    at different points. On a cube, for example, all sides have the same.
 
     Args:
         mesh: mesh of the shape.
@@ -404,7 +409,7 @@ def _paint(
     soup, maps = apply_textures(
         join_parts([part], where, np.eye(3)), [surface_color], Notes(where)
     )
-    textured_mesh = make_mesh_from_soup(soup)[0]
+    textured_mesh, *_others = make_mesh_from_soup(soup)
     return textured_mesh, maps.color
 
 
@@ -645,7 +650,8 @@ class _ObjectFrame:
             entries = self._with_pose(plugin)
         elif not at_top:
             entries = dict(plugin)
-        elif kind == "merge":  # its shapes count as standing at the top
+        elif kind == "merge":
+            # It has no pose: each shape in it is moved, as at the top of the scene.
             return map_inner_plugins(plugin, self.move_plugin)
         elif kind in SHAPE_TYPES - {"shapegroup"}:
             entries = self._with_pose(plugin)
@@ -778,9 +784,10 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
         frame: the object's coordinates.
     """
     matrix = frame.matrix @ shapes.get_pose(sensor)
-    # without the scale of the object's frame
+    # Columns of length 1: a camera has no scale.
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
     entries = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
+    # types of films are "hdrfilm" and "specfilm"
     film = next((plugin for plugin in entries if "film" in str(plugin["type"])), {})
     width, height = _read_film_size(film)
     axis = str(sensor.get("fov_axis", "x"))

@@ -121,7 +121,7 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
     has_uvs = buffers.uvs is not None
     if shape.get("face_normals"):
         buffers = buffers._replace(normals=None)
-    vertices, faces, normals, uvs, attributes = buffers
+    vertices, faces, normals, uvs, attributes = buffers  # in the order of its fields
     if uvs is None or normals is None:
         # Default values belong to the corners of a face. So each corner becomes a
         # vertex, with default values for what is missing.
@@ -251,9 +251,9 @@ def _read_attributes(
 ) -> dict[str, Float32Array]:
     """Return the attributes (vertices or faces, c) of a mesh, such as colors, by name.
 
-    Names of attributes begin with what they belong to, such as "vertex_color"; so do
-    Mitsuba's own arrays. Parameters of the mesh's surface and light have a dot in
-    their names.
+    Names of attributes begin with what they belong to: "vertex_color", "face_color".
+    The names of Mitsuba's own arrays of vertices begin in the same manner, and are left
+    out. Parameters of the mesh's surface and light have a dot in their names.
     """
     attributes: dict[str, Float32Array] = {}
     count_by_prefix = {"vertex": n_vertices, "face": n_faces}
@@ -435,8 +435,8 @@ def find_haze(
 
     Returns:
         The haze and the names of the plugins that it is made of; None if there is none,
-        or if it cannot be rendered as one: not grey, out of range, or a ball that is
-        not about the object.
+        or if it cannot be rendered as one: not grey, out of range, or a ball whose
+        center is not near the object's.
     """
     names = _find_haze_plugins(named)
     if names is None:
@@ -479,9 +479,8 @@ def _read_haze_medium(
     """
     density = _parse_numbers(medium.get("sigma_t", 1.0))
     scale = _parse_numbers(medium.get("scale", 1.0))
-    # The cube root of the determinant is the factor of lengths, from the scene to the
-    # object's coordinates. The extinction is per length, so it is divided by the
-    # factor.
+    # `matrix` multiplies lengths by the cube root of its determinant. The extinction is
+    # per length, so that it is divided by that.
     length_scale = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     extinction = density * scale / length_scale
     # A color has three values, which are equal if it is grey. NaN is not equal to
@@ -553,6 +552,7 @@ def _parse_numbers(value: object) -> Float64Array:
     not_understood = np.full(1, np.nan)
     if isinstance(value, Mapping):
         is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
+        # None, of any other plugin, becomes NaN below.
         value = value.get("value") if is_constant else None
     # NumPy would convert a string or a bool to a number
     if isinstance(value, (str, bool)):
@@ -646,6 +646,7 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     has_constant_size = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE)
     varies = bool(np.ptp(linear, axis=(0, 1)).any())
     is_constant = has_constant_size and not varies
+    # to the mesh's own texture coordinates or attributes
     is_bound = any(
         plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
         for plugin in iterate_plugins(surface)
@@ -677,6 +678,7 @@ def _take_base_color(bsdf: Mapping[str, object]) -> tuple[Plugin, _Color | None]
         nonlocal base
         key = BASE_COLOR_KEYS.get(str(plugin["type"]))
         if key is not None and base is None:
+            # None for a color that cannot be read; then the search goes on
             base = _parse_base_color(plugin.get(key, DEFAULT_REFLECTANCE))
             if base is not None:
                 plugin = {**plugin, key: {"type": BASE_COLOR, **base.options}}
@@ -695,9 +697,9 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
     clauses = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
-        kinds = sorted(types & {"mesh_attribute", "volume"})
-        if kinds:
-            reason = f"its color is a {kinds[0]}"
+        unsupported_colors = sorted(types & {"mesh_attribute", "volume"})
+        if unsupported_colors:
+            reason = f"its color is a {unsupported_colors[0]}"
         else:
             reason = f"a {surface['type']} has none"
         clauses.append(
@@ -742,7 +744,7 @@ def _apply_uv_transform(
         return _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
     if not np.array_equal(to_uv, np.eye(3)):
         inverse = np.asarray(np.linalg.inv(to_uv), np.float64)
-        # The base color, a `BASE_COLOR`, is none of these types.
+        # all textures but the base color, whose placeholder is none of these types
         surface = _with_transform(surface, inverse, *UV_TEXTURES)
     return surface, to_uv
 
@@ -794,10 +796,11 @@ def _parse_base_color(value: object) -> _Color | None:
     pixels = _read_pixels(value) if value["type"] == "bitmap" else None
     if pixels is None:
         return None
-    # Without `to_uv`, which is stored apart: it is one of `IMAGE_ENTRIES`.
+    # What is left is how the image is looked up. `IMAGE_ENTRIES` also has `to_uv`,
+    # which is a field of its own.
     options = {key: entry for key, entry in value.items() if key not in IMAGE_ENTRIES}
     if options.get("filter_type") == "nearest":
-        pixels = _repeat_texels(pixels)
+        pixels = _repeat_texels(pixels)  # so that its texels stay sharp
     return _Color(linear=pixels, options=options, to_uv=value.get("to_uv"))
 
 

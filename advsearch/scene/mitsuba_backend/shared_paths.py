@@ -33,10 +33,10 @@ class StoredPaths:
     """The light that the images of one seed have in common.
 
     Attributes:
-        channel_sums: (pixels, channels) float64 sums over samples, without the light that
-            depends on a changed surface.
-        changed_sample_indices: for each launch the indices, a Dr.Jit array, of the samples whose path
-            has met a changed surface.
+        channel_sums: (pixels, channels) float64 sums over samples, without the light
+            that depends on a changed surface.
+        changed_sample_indices: for each launch the indices, a Dr.Jit array, of the
+            samples whose path has met a changed surface.
     """
 
     channel_sums: Float64Array
@@ -141,7 +141,7 @@ class SharedPaths:
                     _unchanged, values, _has_met = self._trace(seed, spp, samples)
                     _add_samples(changing, samples, values, spp)
         else:
-            stored = self._trace_all(seed, spp, changing)
+            stored = self._trace_all(seed, spp, changing)  # adds to `changing`
         self._store(key, stored)
         image = torch.from_numpy((stored.channel_sums + changing) / spp).float()
         image = image.reshape(height, width, N_CHANNELS)
@@ -153,8 +153,8 @@ class SharedPaths:
         Args:
             seed: seed of the image.
             spp: samples per pixel.
-            changing: (pixels, channels) array, changed in place: the light that depends
-                on changed surfaces is added to it.
+            changing: (pixels, channels) array to which the light that depends on
+                changed surfaces is added, in place.
 
         Returns:
             The light that is common to images of the seed.
@@ -163,7 +163,7 @@ class SharedPaths:
         met_samples = []
         first_pixel = 0
         for samples in _divide_samples(len(changing), spp):
-            unchanged, values, has_met = self._trace(seed, spp, samples)
+            unchanged, changing_values, has_met = self._trace(seed, spp, samples)
             sums = [dr.block_sum(channel, spp).numpy() for channel in unchanged]
             end_pixel = first_pixel + len(sums[0])
             common[first_pixel:end_pixel] = np.stack(sums, axis=1)
@@ -174,7 +174,9 @@ class SharedPaths:
             dr.eval(met)
             met_samples.append(met)
             if dr.width(met):
-                met_values = [dr.gather(mi.Float, value, index) for value in values]
+                met_values = [
+                    dr.gather(mi.Float, value, index) for value in changing_values
+                ]
                 _add_samples(changing, met, met_values, spp)
         return StoredPaths(common, met_samples)
 
@@ -190,7 +192,7 @@ class SharedPaths:
             Nine channels (radiance, albedo, normal) that do not depend on the changed
             surfaces; nine that do; and whether a path has met such a surface.
         """
-        # it needs the variant
+        # imported here, since its classes need Mitsuba's variant
         from advsearch.scene.mitsuba_backend import paths
 
         is_stratified = self.scene.sampler_name == "multijitter"
@@ -231,17 +233,21 @@ def can_share_paths(scene: MitsubaScene) -> bool:
     """Return whether images of a scene can share light paths, and save time by it.
 
     They save time where light paths are long, as among trees and houses: elsewhere
-    light soon leaves the scene. `MitsubaScene` has chosen the integrator "path" for
-    such scenes. The other conditions exclude what `trace_paths` does not support.
+    light soon leaves the scene. The other conditions exclude what `trace_paths` does
+    not support.
     """
     description, filter_name = scene.description_and_filter
+    # `MitsubaScene` chooses this integrator for scenes with long paths.
     has_long_paths = scene.integrator_name == "path"
     has_known_samples = filter_name == "box" and scene.sampler_name in SAMPLERS
     has_lens = bool(description.thin_lens) or description.camera_model is not None
-    passes_surfaces = (
-        bool(description.backdrop) or description.has_opacity or scene.is_volumetric
+    is_unsupported = (
+        has_lens
+        or bool(description.backdrop)
+        or description.has_opacity
+        or scene.is_volumetric
     )
-    return has_long_paths and has_known_samples and not (has_lens or passes_surfaces)
+    return has_long_paths and has_known_samples and not is_unsupported
 
 
 def _divide_samples(n_pixels: int, spp: int) -> Iterator[Any]:
@@ -249,7 +255,8 @@ def _divide_samples(n_pixels: int, spp: int) -> Iterator[Any]:
     step = max(1, MAX_SAMPLES // spp)
     for first in range(0, n_pixels, step):
         count = min(step, n_pixels - first) * spp
-        # `opaque`: a literal would be compiled into a kernel of its own for each launch.
+        # `opaque`: a literal would be compiled into a kernel of its own for each
+        # launch.
         first_sample = dr.opaque(mi.UInt32, first * spp)
         samples = dr.arange(mi.UInt32, count) + first_sample
         dr.eval(samples)

@@ -234,8 +234,9 @@ class ViewTracer:
             # without a lens a single 0, since the kernel's argument cannot be empty
             lens = np.zeros(1, np.float32) if self._lens is None else self._lens
             lane = dr.arange(mi.UInt32, count * height * width * RAYS_PER_PIXEL)
-            # A recording takes its size from its evaluated arguments. If the lanes were
-            # not evaluated, it would take that of the environment's map.
+            # A recording has as many lanes as its evaluated arguments have entries. If
+            # the indices of the lanes were not evaluated, these would be the entries of
+            # the environment's map.
             dr.eval(lane)
             channels = recording(
                 self._scene._scene,
@@ -283,7 +284,7 @@ class ViewTracer:
         to_local = texel_rays.get_world_to_map(self._scene)
         ray_flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
-        # 0 layers of cut-outs if the scene has none, and one opaque layer.
+        # number of layers of cut-outs; one opaque layer follows
         n_layers = texel_rays.count_cut_out_layers(self._scene)
         texture_channels = []
         radiance = mi.Color3f(0.0)
@@ -304,6 +305,8 @@ class ViewTracer:
                 mitsuba_scene, si, is_hit, direction, tables, lit
             )
             radiance += dr.select(is_hit, stopped_fraction * surface_radiance, 0.0)
+            # What is left of a ray that meets nothing more is the sky. It is not active
+            # in the next layers.
             escapes = active & ~si.is_valid()
             sky_radiance = _look_up_sky(lit, direction, to_local)
             radiance += dr.select(escapes, transmittance * sky_radiance, 0.0)
@@ -315,12 +318,12 @@ class ViewTracer:
                 side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL)
             )
             texture_channels += [si.uv.x, si.uv.y, texture_weight]
-            # Rays that missed end here: their transmittance is not used again.
             transmittance = transmittance - stopped_fraction
             active = is_hit & (transmittance > MIN_TRANSMITTANCE)
             ray = si.spawn_ray(direction)
         radiance /= RAYS_PER_PIXEL
-        # All at once: a kernel for each channel's sum would trace all rays again.
+        # Evaluated at once: otherwise the kernel of each channel's sum would trace all
+        # rays again.
         dr.eval(radiance, coverage, texture_channels)
         pixel_sums = [
             dr.block_sum(channel, RAYS_PER_PIXEL) for channel in (*radiance, coverage)
@@ -418,10 +421,10 @@ class ViewTracer:
         masks = [mask & is_hit for mask in grid_masks]
         normal = _turn_to_viewer(si.sh_frame.n, direction)
         cosine = -dr.dot(normal, direction)
-        diffuse, *lobe = self._look_up_lobes(masks, cosine, tables)
-        gloss = lobe[0]
+        # in the order of `LOBE_TABLES`: up, along, core and tail follow
+        diffuse, gloss, *lobe_shape = self._look_up_lobes(masks, cosine, tables)
 
-        # Diffuse light. That of the searched texture is left to the matrix.
+        # Diffuse light. That of the texture that is searched is left to the matrix.
         diffuse_radiance = self._look_up_diffuse(si, masks, lit, to_local)
         side = self._find_texture_side(masks)
         radiance = dr.select(
@@ -430,7 +433,7 @@ class ViewTracer:
 
         is_glossy = is_hit & (gloss > 1e-4)  # less is not visible
         reflected = self._reflect(
-            mitsuba_scene, si, direction, normal, lobe, is_glossy, lit
+            mitsuba_scene, si, direction, normal, lobe_shape, is_glossy, lit
         )
         radiance += dr.select(is_glossy, gloss * reflected, 0.0)
         return radiance, diffuse, side
@@ -492,7 +495,7 @@ class ViewTracer:
         si: Any,
         view_direction: Any,
         normal: Any,
-        lobe: Sequence[Any],
+        lobe_shape: Sequence[Any],
         active: Any,
         lit: LightMaps,
     ) -> Any:
@@ -508,11 +511,13 @@ class ViewTracer:
             si: surface interactions of the rays that hit the surface.
             view_direction: unit directions of these rays.
             normal: unit shading normals, towards the viewer.
-            lobe: gloss, up, along, core and tail of `Lobes` at the angle of view.
+            lobe_shape: up, along, core and tail of `Lobes` at the angle of view: the
+                components of the mean direction along normal and tangent, and the
+                angles by which the two halves of the lobe spread.
             active: lanes in which there is any gloss.
             lit: the light.
         """
-        _gloss, up, along, core, tail = lobe
+        up, along, core, tail = lobe_shape
         cosine = -dr.dot(normal, view_direction)
         # The part of the direction along the surface. A ray along the normal has none,
         # and without the 1e-8 its zeros would be normalized to NaN.
@@ -530,7 +535,7 @@ class ViewTracer:
         is_ground = mi.Bool(False)
         for grid, mask in zip(self._grids, masks, strict=True):
             is_ground |= mask & grid.is_ground
-        # The same texel, which is the ground's where the ray meets that.
+        # `texel` is one of the ground where `is_ground`; elsewhere this is not used.
         ground = self._blend_ground(hit, masks, texel, blurred, (core, tail), lit)
         surface = dr.select(is_ground, ground, texel)
         return dr.select(hit.is_valid(), surface, blurred)
@@ -579,7 +584,8 @@ class ViewTracer:
             spreads: angles by which core and tail of the lobe spread, radians.
             lit: the light.
         """
-        # The cell after those of all grids is the ground far away.
+        # The cell after those of all grids is the ground far away, which is lit by the
+        # environment alone.
         far_cell = mi.UInt32(self._grids[-1].first_cell_index + self._grids[-1].n_cells)
         far_texel = _gather_color(lit.texels, far_cell)
         relative_brightness = texel / far_texel
@@ -599,6 +605,7 @@ class ViewTracer:
         """
         if not any(grid.is_ground for grid in self._grids):
             return direction
+        # along the ray to z = 0; 1e-3 avoids a division by 0
         distance = si.p.z / dr.maximum(-direction.z, 1e-3)
         from_center = si.p + direction * distance - mi.Point3f(*self._center)
         return dr.select(direction.z < -1e-3, dr.normalize(from_center), direction)
@@ -608,8 +615,9 @@ class ViewTracer:
     ) -> Any:
         """Return the diffuse radiance of what was hit.
 
-        On a photographed ground the texels hold fractions; they are multiplied by the
-        photograph in the direction from the point where it was taken.
+        On a photographed ground the texels hold factors instead of radiance. They are
+        multiplied by the photograph, in the direction from the point where it was
+        taken.
 
         Args:
             si: the hit.
@@ -690,8 +698,8 @@ def _make_camera_numbers(
     # The field of view is along the larger side.
     larger_side = max(height, width)
     half_extent = [half_tangent * size / larger_side for size in (width, height)]
-    # The viewing axis meets the image at 0.5 - shift of its width and height. The image
-    # is 2 wide here.
+    # The viewing axis meets the image at the fraction 0.5 - shift of its width and
+    # height. Here both are 2, which gives 1 - 2 shift.
     shifts = [float(inputs.get(f"camera.shift_{axis}", 0.0)) for axis in "xy"]
     center = [1.0 - 2.0 * shift for shift in shifts]
     # The columns of the matrix are the axes. Transposed, they follow one another.
@@ -714,8 +722,10 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
     with mitsuba_lock:
         # The first channels are three of radiance, and the coverage.
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
+        # A copy, since `numpy` may return memory that belongs to Dr.Jit.
         coverage = channels[3].numpy().copy()
-        # u, v and weight of the first layer, then those of the next one
+        # after the four channels of the image: u, v and weight of the first layer, then
+        # those of the next one
         layer_channels = [channel.numpy() for channel in channels[N_IMAGE_CHANNELS:]]
         n_layers = len(layer_channels) // 3
         # each (rays x layers,), all layers of a ray side by side
@@ -866,5 +876,5 @@ def _look_up_blurred(
         )
 
     narrow = look_up_level(lower_level)
-    wide = look_up_level(lower_level + 1)
+    wide = look_up_level(lower_level + 1)  # if there is one width, it counts 0
     return narrow + (level - mi.Float(lower_level)) * (wide - narrow)

@@ -134,20 +134,21 @@ def _find_sky_cell(
         sky_shape: rows and columns of the environment's cells, counted row by row.
     """
     n_rows, n_columns = sky_shape
-    column, row = compute_map_position(direction, get_world_to_map(scene))
-    sky_column = mi.UInt32(column * n_columns) % n_columns
-    sky_row = mi.UInt32(dr.minimum(row * n_rows, n_rows - 1))
+    # fractions of the map's width and height
+    x, y = compute_map_position(direction, get_world_to_map(scene))
+    # The map wraps around from side to side, and ends at the poles.
+    sky_column = mi.UInt32(x * n_columns) % n_columns
+    sky_row = mi.UInt32(dr.minimum(y * n_rows, n_rows - 1))
     return sky_row * n_columns + sky_column
 
 
 def _find_nearest_cell(grid: TexelGrid, si: Any) -> Any:
     """Return the cell of a grid that is nearest to a hit on its surface."""
-    y, x = compute_grid_position(grid, si.p, si.uv)
-    return mi.Int32(
-        grid.first_cell_index
-        + _compute_cell_index(y, grid.shape[0]) * grid.shape[1]
-        + _compute_cell_index(x, grid.shape[1])
-    )
+    n_rows, n_columns = grid.shape
+    y_fraction, x_fraction = compute_grid_position(grid, si.p, si.uv)
+    row = _compute_cell_index(y_fraction, n_rows)
+    column = _compute_cell_index(x_fraction, n_columns)
+    return mi.Int32(grid.first_cell_index + row * n_columns + column)
 
 
 def _trace_batch(
@@ -167,7 +168,8 @@ def _trace_batch(
         sky_shape: rows and columns of the cells of the environment.
         normal, position: normal and position of the texel, for each ray.
         square: point of the unit square from which the direction is made, for each ray.
-        seed: seed of the random numbers that decide whether a ray passes a cut-out.
+        seed: seed of the random numbers that decide whether a ray passes a cut-out, and
+            index of the first texel.
 
     Returns:
         For each ray the index of the cell, int32; -1 where there is no light.
@@ -188,10 +190,10 @@ def _trace_batch(
     # Other rays meet a texel, or a shape without texels, which counts as dark (-1).
     masks = find_hit_grids(mitsuba_scene, grids, si, direction)
     for grid, is_hit in zip(grids, masks, strict=True):
-        has_single_grid = not grid.is_ground and grid.face_side == 0
-        if has_single_grid:
-            # `find_hit_grids` accepts both sides of a face. The texels of a single grid
-            # have the light of the front only, so that hits on the back stay -1.
+        # A grid with the side 0 has hits on both sides of its faces.
+        is_for_both_sides = not grid.is_ground and grid.face_side == 0
+        if is_for_both_sides:
+            # Its texels have the light of the front only: hits on the back stay -1.
             is_hit &= dr.dot(si.n, direction) < 0.0
         met = dr.select(is_hit, _find_nearest_cell(grid, si), met)
     return met
@@ -215,8 +217,8 @@ def compute_visible_cosines(
     Returns:
         (n, k) cosines; 0 where something blocks the light.
     """
-    # A row vector times the rotation is turned from the map to the world.
     world_to_map = np.array(get_world_to_map(scene))
+    # For rows v, `v @ world_to_map` is v turned from the map's axes to the world's.
     world_directions = (directions @ world_to_map).astype(np.float32)
     n_directions = len(world_directions)
     lane = dr.arange(mi.UInt32, len(positions) * n_directions)
@@ -225,11 +227,11 @@ def compute_visible_cosines(
     normal = _to_drjit_points(mi.Normal3f, normals, texel)
     direction = _to_drjit_points(mi.Vector3f, world_directions, lane % n_directions)
     cosine = dr.dot(normal, direction)
-    is_above = cosine > 0.0
-    active = is_above  # light from below the surface does not count
+    is_above = cosine > 0.0  # light from below the surface does not count
+    active = is_above  # rays that may still be blocked
     ray = mi.Ray3f(position + normal * RAY_OFFSET, direction)
     transmittance = mi.Float(1.0)
-    # A ray that meets nothing is free, and has its transmittance.
+    # A ray that meets nothing more is not blocked, and keeps its transmittance.
     for _ in range(count_cut_out_layers(scene)):
         si = scene._scene.ray_intersect(
             ray, mi.RayFlags.UV, coherent=False, active=active
@@ -276,13 +278,13 @@ def is_visible_from_behind(
 
 
 def _sample_outside_rays(positions: Float32Array) -> Any:
-    """Return `N_OUTSIDE_RAYS` random rays onto positions (n, 3), from above outside."""
+    """Return `N_OUTSIDE_RAYS` random rays from above onto positions (n, 3)."""
     generator = np.random.default_rng(0)
     to_origin = generator.standard_normal((N_OUTSIDE_RAYS, 3))
     to_origin /= np.linalg.norm(to_origin, axis=1, keepdims=True)
-    to_origin[:, 2] = np.abs(to_origin[:, 2])
+    to_origin[:, 2] = np.abs(to_origin[:, 2])  # not from below
     targets = positions[generator.integers(len(positions), size=N_OUTSIDE_RAYS)]
-    # so far that the origins are outside of the shape
+    # twice the largest extent, so that the origins are outside of the shape
     distance = 2.0 * float(np.ptp(positions, axis=0).max())
     origins = (targets + distance * to_origin).astype(np.float32)
     inwards = _to_drjit_points(mi.Vector3f, (-to_origin).astype(np.float32))
@@ -522,7 +524,8 @@ def measure_lobes(
     mean_z = (samples.weight * samples.z).mean(axis=1)
     length = np.linalg.norm(np.stack([mean_x, mean_z]), axis=0)
 
-    # Without gloss the mirrored direction stands for the lobe's mean direction.
+    # Components of the lobe's mean direction: along the surface towards the viewer, and
+    # along the normal. Without gloss the mirrored direction stands for it.
     no_gloss = gloss < 1e-6
     towards_viewer = np.where(
         no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
@@ -534,8 +537,8 @@ def measure_lobes(
         0.0, 1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
-    # The base colors were 0.5 and 0. What the grey surface reflects more than the black
-    # one is the diffuse part; dividing by 0.5 gives it for a base color of 1.
+    # The base color of `grey` is 0.5 and that of `black` is 0. Their difference is the
+    # diffuse part; dividing by 0.5 gives it for a base color of 1.
     by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
     diffuse = np.maximum(by_color, 0.0) / 0.5
     return Lobes(
@@ -590,7 +593,9 @@ def _sample_bsdf(
     bsdf = si.bsdf()
     opacity = _eval_opacity(si)
     black = dr.mean(bsdf.eval(context, si, cosine_direction) / opacity)
-    # A direction below the surface (z < 0) is transmitted, and is no gloss.
+    # A black surface reflects nothing but gloss, so that samples of its BSDF are
+    # samples of the gloss. A direction below the surface (z < 0) is transmitted, and is
+    # none.
     bsdf_sample, bsdf_weight = bsdf.sample(context, si, sample1, sample2)
     is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
     weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
@@ -653,7 +658,7 @@ def _hit_point(
 
 
 def _eval_opacity(si: Any) -> Any:
-    """Return the fraction of light that a surface stops, at least 0.001 to divide by."""
+    """Return the fraction of light that a surface stops, at least 0.001."""
     return dr.maximum(1.0 - eval_transmittance(si, True), 1e-3)
 
 

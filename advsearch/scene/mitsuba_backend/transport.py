@@ -101,8 +101,8 @@ def collect_paths(
     """Trace one pass of light paths and collect their vertices.
 
     It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel. The
-    parameter `key` is changed in between, and has its value again at the end. Radiance
-    that is not finite is replaced by zero.
+    texture is changed on the way, and restored. Radiance that is not finite is replaced
+    by zero.
 
     Args:
         scene: Mitsuba's scene.
@@ -114,16 +114,17 @@ def collect_paths(
         depth: maximum length of a path in segments.
         spp: samples per pixel.
         projector: Mitsuba's projector whose image `key` is; None for a base color.
-        unseen: Mitsuba's shape that is black to camera rays, with everything behind
-            it; None if there is none.
+        unseen: Mitsuba's shape whose pixels are black: camera rays that meet it first
+            are not traced. None if there is none.
         roulette_depth: bounces from which on Russian roulette may end a path; None if
             it never does.
     """
     ray, weight = _sample_camera_rays(scene.sensors()[0], noise, size, spp)
     if unseen is not None:
         weight = dr.select(_find_hits(scene, ray, unseen), 0.0, weight)
+    # From the bounce `depth` on there is no roulette, since paths end before.
     first_hit_channels, emitted, bounces = _trace_paths(
-        scene, ray, weight, noise, depth, roulette_depth or depth
+        scene, ray, weight, noise, depth, roulette_depth=roulette_depth or depth
     )
 
     if projector is None:
@@ -131,7 +132,7 @@ def collect_paths(
         reflected, vertices = _accumulate_radiance(bounces, emitted, slopes)
     else:
         vertices = _light_by_projector(scene, parameters, key, projector, bounces)
-        # Only the radiance is used here: the weights are those of projected light.
+        # Only the radiance is used here. The vertices are those of the projector above.
         no_slopes = [(0.0, 0.0)] * len(bounces)
         reflected, _ = _accumulate_radiance(bounces, emitted, no_slopes)
     reflected = dr.select(dr.isfinite(reflected), reflected, 0.0)
@@ -144,9 +145,10 @@ def collect_paths(
 def _compute_slopes(
     parameters: Any, key: str, bounces: Sequence[Bounce]
 ) -> list[tuple[Any, Any]]:
-    """Return for each bounce the derivatives of both BSDF values by the base color.
+    """Return for each bounce the derivatives by the base color of what it reflects.
 
-    The BSDFs are evaluated once more with all texels larger by `COLOR_STEP`.
+    There are two, see `Bounce.compute_slopes`. They are differences: the BSDFs are
+    evaluated once more with all texels larger by `COLOR_STEP`.
 
     Args:
         parameters: what `mi.traverse` returns for the scene.
@@ -162,6 +164,9 @@ def _light_by_projector(
     scene: Any, parameters: Any, key: str, projector: Any, bounces: Sequence[Bounce]
 ) -> list[tuple[Any, Any, Any]]:
     """Return the vertices of paths as a projector with a white image lights them.
+
+    Light is proportional to the image. So the light of a white image is the weight of
+    the texel that falls on the vertex.
 
     A vertex has its texture coordinates in the projector's image, its weight, and
     whether the camera sees it sharply, as from `_accumulate_radiance`. Other light does
@@ -230,7 +235,7 @@ def _accumulate_radiance(
     Args:
         bounces: bounces of the vertices but for the last, from the camera on.
         emitted: what each vertex emits; one more than bounces.
-        slopes: derivatives of both BSDF values of each bounce by the base color.
+        slopes: for each bounce the two derivatives of `Bounce.compute_slopes`.
 
     Returns:
         The radiance that leaves the first vertex, without its emission; and for each
@@ -281,8 +286,8 @@ def _fetch_paths(
     """Evaluate the kernel of a pass and fetch images and vertices into torch.
 
     Args:
-        channels: channels of the radiance and of the other images of `TracedPaths`, in their
-            order, for each sample.
+        channels: channels of the radiance and of the other images of `TracedPaths`, in
+            their order, for each sample.
         vertices: for each vertex its texture coordinates, its weight, and whether the
             camera sees it sharply.
         size: height and width of the image.
@@ -365,15 +370,16 @@ class Bounce:
     next_weight: Any = 1.0
 
     def compute_slopes(self) -> tuple[Any, Any]:
-        """Return the derivatives of both BSDF values by the base color.
+        """Return the derivatives by the base color of what a bounce reflects.
 
-        The caller has made the base color larger by `COLOR_STEP`, after the bounce was
-        sampled.
+        They are differences: the caller has made the base color larger by `COLOR_STEP`,
+        after the bounce was sampled.
 
         Returns:
-            The derivative of `bsdf_value_em`, and that of the BSDF in the path's
-            direction over the direction's density.
+            The derivative of `bsdf_value_em`, for the light that was sampled, and that
+            of `bsdf_weight`, for the direction in which the path goes on.
         """
+        # The weight is the value over the density. The difference is that of the value.
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
         slope_em = self._compute_slope(self.wo_em, self.bsdf_value_em, self.active_em)
         slope_bsdf = self._compute_slope(
@@ -400,6 +406,9 @@ class Bounce:
 
     def eval_projector(self, scene: Any, projector: Any) -> tuple[Any, Any]:
         """Return how a projector lights the vertex with a white image.
+
+        With a white image, the light is the derivative by the texel of the image that
+        falls there.
 
         Returns:
             The position in the projector's image, and the light that the vertex
@@ -454,15 +463,15 @@ def _trace_paths(
             its throughput, but at most `MAX_SURVIVAL`.
 
     Returns:
-        The images of `TracedPaths` after the radiance, in their order, channel by channel;
-        what each vertex emits; and the bounces at all vertices but the last.
+        The images of `TracedPaths` after the radiance, in their order, channel by
+        channel; what each vertex emits; and the bounces at all vertices but the last.
     """
     count = dr.width(ray.o)
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
     is_sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
     throughput = mi.Spectrum(1.0)
     has_cut_outs = _has_cut_outs(scene)
-    # lanes whose path has gone through cut-outs only; not used without cut-outs
+    # lanes whose path has so far gone straight through cut-outs; only used with some
     passed_straight = mi.Bool(has_cut_outs)
     first_hit = _FirstHit(count)
 
@@ -504,9 +513,10 @@ def _trace_paths(
         is_delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
         throughput = throughput * bounce.bsdf_weight
         active &= active_next
-        # Russian roulette, which leaves out the last bounce: a path ends after it in
-        # any case.
-        if roulette_depth <= segment + 1 < depth - 1:
+        # Russian roulette. There is none at the last bounce, after which a path has
+        # only one more segment.
+        n_bounces = segment + 1
+        if roulette_depth <= n_bounces < depth - 1:
             survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
             active &= noise.next_1d(active) < survival
             bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
@@ -615,8 +625,10 @@ def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Sur
     count = height * width
     ray, weight = _sample_center_rays(sensor, resolution)
     to_world = sensor.world_transform()
-    eye = to_world @ mi.Point3f(0.0)  # rays begin at the near clipping plane
+    # Depths count from here, not from the rays' origins on the near clipping plane.
+    eye = to_world @ mi.Point3f(0.0)
     forward = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
+    # The weight may be one number for all rays; `full` makes one entry for each.
     active = dr.any(mi.Spectrum(weight) > 0.0) & dr.full(mi.Bool, True, count)
     layers = _SurfaceLayers(scene.shapes(), count)
     while dr.any(active):

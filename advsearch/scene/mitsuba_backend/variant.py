@@ -95,9 +95,9 @@ def record_on_first_use(
 ) -> Callable[..., Any]:
     """Return a function that Dr.Jit records on first use and replays later.
 
-    Nothing may be freed while it records. If a scene or memory that torch shares is
-    freed, a function of Python is called. Dr.Jit 1.5.0 cannot record such a call, and
-    the process ends. So Python's garbage collector is disabled while the function runs.
+    Python's garbage collector is disabled while the function runs. It might free a
+    scene, or memory that torch shares, which calls a function of Python. Dr.Jit 1.5.0
+    cannot record such a call, and the process would end.
 
     Args:
         render: the function.
@@ -182,7 +182,7 @@ class SceneRegistry:
             media: further objects, which are Mitsuba's media; see `list_media`.
         """
         self.n_changes += 1
-        # The count of changes is also a unique key.
+        # a unique key, since the count only grows
         key = self.n_changes
         self._held[key] = (objects, media)
         weakref.finalize(owner, self.unused_keys.append, key)
@@ -190,7 +190,8 @@ class SceneRegistry:
     def free_unused(self) -> None:
         """Free the objects whose owner has been freed; call it only between renders.
 
-        It counts as a change of the population: callers test `unused_keys` before.
+        It makes all recordings stale, even if nothing is freed. So callers test first
+        that `unused_keys` is not empty.
         """
         while self.unused_keys:
             self._held.pop(self.unused_keys.pop(), None)

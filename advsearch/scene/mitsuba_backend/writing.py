@@ -62,9 +62,8 @@ def write_scene(
 ) -> None:
     """Write a scene with its inputs set as XML that stock Mitsuba loads.
 
-    Meshes and images are written next to it. Inputs are put into the scene's dictionary
-    in two steps: first those of the camera and of the parts, which are removed from
-    `remaining_inputs`, then the others by Mitsuba's keys.
+    Meshes and images are written next to it. Inputs of the camera and of the parts are
+    put into the scene's dictionary first, and then the others, by Mitsuba's keys.
 
     Args:
         scene: the scene.
@@ -99,7 +98,8 @@ def write_scene(
         # without the copied columns at both ends, which only the loaded scene has
         padded = remaining_inputs["environment.padded"]
         remaining_inputs["environment.padded"] = padded[:, 1:-1]
-    # The ground's vertices are in a file, written with those of the other meshes.
+    # A photographed ground is a mesh. `write_xml` writes its file, as those of all
+    # entries of the type "ply".
     if description.photograph is not None:
         xml_scene[GROUND_NAME] = {
             "type": "ply",
@@ -119,7 +119,7 @@ def write_scene(
 def _make_integrator(scene: MitsubaScene, hide_environment: bool) -> Plugin:
     """Return the dictionary of stock Mitsuba's integrator for a scene."""
     return {
-        # not `prbvolpath`, which starts outside of all media
+        # Haze needs a type with media; its paths start in the camera's medium.
         "type": "volpath" if scene.is_volumetric else "path",
         "max_depth": scene.max_depth,
         "rr_depth": scene.roulette_depth,
@@ -153,7 +153,10 @@ def _put_part(
         )
     else:
         xml_scene |= translate_part(get_positioned_part(description, part)).plugins
-    if not isinstance(xml_scene.get(part.name, {}), Mapping):
+    # A part may have no entry of its own name. An entry that is no dictionary is an
+    # object of a plugin that stock Mitsuba does not have.
+    entry = xml_scene.get(part.name, {})
+    if not isinstance(entry, Mapping):
         raise InputError(
             f"out: stock Mitsuba has nothing for {part.name}; export a run without it"
         )
@@ -203,7 +206,7 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> 
     ).tolist()
     albedo = remaining_inputs.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
     if not density[0] > 0.0:
-        return
+        return  # without haze its inputs have no effect
     medium_name = f"{haze.name}-medium"
     medium_reference = {"type": "ref", "id": medium_name}
     scene[medium_name] = {
@@ -224,7 +227,7 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> 
 def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> bool:
     """Set a number, color, transform or image of a dictionary by Mitsuba's key.
 
-    Dictionaries on the way are copied, so that the scene's own stay as they are.
+    Inner dictionaries are copied, so that those of the scene stay as they are.
 
     Args:
         plugin: the dictionary, which is changed.
@@ -236,8 +239,8 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     """
     name, *inner_parts = key_parts
     if name.startswith("brdf_") and name not in plugin:
-        # Mitsuba calls the surfaces of both sides "brdf_0" and "brdf_1"; in a
-        # dictionary they are one, the only inner plugin.
+        # Mitsuba has a surface for each side, "brdf_0" and "brdf_1". A dictionary has
+        # one for both, which is the only inner plugin.
         inner_names = [key for key in plugin if isinstance(plugin[key], Mapping)]
         if inner_names:
             name = inner_names[0]
@@ -290,6 +293,7 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
     # Vertices and normals are in the file of the mesh.
     part_inputs.pop("vertices", None)
     part_inputs.pop("normals", None)
+    # What is left was not set here, and goes back to the other inputs.
     remaining_inputs |= {
         f"{part.name}.{name}": value for name, value in part_inputs.items()
     }
@@ -308,7 +312,8 @@ def _make_surface(part: parts.MeshPart, part_inputs: Plugin) -> Plugin:
         part_inputs: its inputs by names such as "roughness"; those that are set here
             are removed.
     """
-    # The caller has put the base color into `part` already.
+    # The caller has put the base color into `part` already. A surface of the user's has
+    # no other inputs of ours.
     if part.surface is not None:
         base_color = part.base_color
         return fill_base_color(
@@ -356,8 +361,9 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
             "another run"
         ) from error
     root = ElementTree.fromstring(text)
-    # Mitsuba names parameters by the ids of plugins, but its writer gives an id only to
-    # plugins that are referred to, and a name to the others.
+    # Mitsuba names the parameters of a scene by the ids of plugins. Its writer gives an
+    # id only to plugins to which others refer, and a name to the rest: this becomes
+    # their id.
     for entry in root.findall("*[@type]"):
         entry.set("id", entry.attrib.pop("name"))
     text = ElementTree.tostring(root, encoding="unicode")
@@ -389,10 +395,12 @@ class _SceneFiles:
         entries: Plugin = {}
         for key, entry in plugin.items():
             if isinstance(entry, mi.Bitmap):
+                # under the key by which Mitsuba loads an image from a file
                 entries["filename"] = self._write_image(name, entry)
             elif isinstance(entry, Mapping):
                 entries[key] = self.write_files_of(f"{name}-{key}", entry)
             elif key == "filename" and os.path.isabs(entry):
+                # a relative name is that of a file that was written here
                 file = self.reserve(name, Path(entry).suffix)
                 shutil.copyfile(entry, file)
                 entries[key] = file.name
@@ -407,6 +415,7 @@ class _SceneFiles:
         if values.ndim < 3 or values.shape[2] == 1:
             channels = {"Y": values.reshape(values.shape[:2])}
         else:
+            # "RGB" or "RGBA": the name of a group of channels
             channels = {"RGBA"[: values.shape[2]]: values}
         # Not by Mitsuba's own writer, which waits forever if Dr.Jit has one thread.
         with OpenEXR.File({}, channels) as image:

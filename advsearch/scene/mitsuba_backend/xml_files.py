@@ -88,7 +88,7 @@ def read_scene(path: Path) -> Plugin:
         name = _make_plain_name(plugin_id)
         if name not in scene and plugin_id in state.id_to_index:
             index = state.id_to_index[plugin_id]
-            # The set is discarded: plugins that this one refers to are not copied.
+            # What this plugin refers to in turn is not copied: its ids are discarded.
             scene[name] = _convert_plugin(path, state, index, referred_ids=set())
     return scene
 
@@ -114,7 +114,8 @@ def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element)
     except RuntimeError as error:
         line_match = _ERROR_LINE.match(str(error))
         where = ""
-        # with included files in it, the lines of the text are not those of the file
+        # The lines of included files are inserted into the text that Mitsuba has
+        # parsed, so that a line is known only without any.
         if line_match and not text.included:
             where = f"line {int(line_match[1]) + text.lines_before}: "
         raise FileFormatError(
@@ -245,7 +246,7 @@ class _SceneText:
         place.
 
         A `<default name="x" value="1"/>` gives `$x` its value in everything that comes
-        after it, in included files too.
+        after it, in included files too. If there are several, the first one counts.
         """
         children: list[ElementTree.Element] = []
         for child in element:
@@ -277,12 +278,14 @@ class _SceneText:
         try:
             root = self.parse(self.references.read_file(name))
         except FileNotFoundError:
-            # `get` has added the reason at the end.
+            # The file that was requested last is the last one with a refusal.
             reason = next(reversed(self.references.refusal_by_name.values()))
             raise FileFormatError(
                 f"{self.path}: includes {format_name(name)}, which {reason}"
             ) from None
         if root.tag != "scene":
+            # The root is the only element: it gets a parent, as elements of a scene
+            # have.
             single = root
             root = ElementTree.Element("scene")
             root.append(single)
@@ -332,7 +335,8 @@ def _convert_plugin(
     types = mi.Properties.Type
     props = state.nodes[index].props
     entries: Plugin = {"type": props.plugin_name()}
-    # last number after each name; 1 stands for a name without a number
+    # Entries that have no name of their own may get the same: "bsdf", "bsdf-2". This is
+    # the last number of each name, 1 for the name without a number.
     last_number: dict[str, int] = {}
 
     def put(plain_name: str, entry: object) -> None:
@@ -367,9 +371,11 @@ def _convert_plugin(
 
 
 def _get_node_name(node: Any, argument: str, *, at_top: bool) -> str:
-    """Return the name of an inner plugin: its id, its argument's name, or its kind.
+    """Return the name of an inner plugin among the entries of its parent.
 
-    At the top of a scene the id comes first, elsewhere the argument.
+    At the top of a scene that is its id, by which others refer to it; elsewhere it is
+    the name of the argument. If it has neither, it is named by its plugin at the top
+    ("sphere"), and by its kind elsewhere ("bsdf").
     """
     node_id = str(node.props.id())
     if at_top:
@@ -382,7 +388,7 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     """Return a number, a string, a color or a transform of a plugin as Python has it.
 
     A color or a spectrum becomes a plugin, such as `{"type": "rgb", "value": [1, 0,
-    0]}`.
+    0]}`. A vector becomes a list of numbers, and a transform an array (4, 4).
 
     Args:
         where: beginning of error messages.
@@ -400,7 +406,7 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
         _check_affine(where, matrix)
         return matrix
     if kind == types.Spectrum:
-        # without wavelengths it is one value for all of them
+        # A spectrum without wavelengths has a single value, and no pairs.
         pairs = list(zip(value.wavelengths, value.values, strict=False))
         _check_finite(where, pairs or value.values)
         return {"type": "spectrum", "value": pairs or value.values[0]}
@@ -526,8 +532,7 @@ class _FileReader:
 
         Raises:
             FileFormatError: a plugin does not come with Mitsuba; a file can be read
-                only by Mitsuba; or the name of a material is not a single word, which
-                matters because Mitsuba builds the name of a file from it.
+                only by Mitsuba; or the name of a material is not a single word.
         """
         kind = str(plugin["type"])
         if kind not in STOCK_PLUGINS:
@@ -535,6 +540,7 @@ class _FileReader:
                 f"{self._path}: {format_name(kind)} is no plugin that comes with "
                 "Mitsuba; leave it out of the file"
             )
+        # Mitsuba builds the name of a file from the name of a material.
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(
                 f"{self._path}: {format_name(str(plugin['material']))} is no name of a "
@@ -575,9 +581,10 @@ class _FileReader:
             # checks that the name is allowed; its content is not needed
             self._references.read_file(str(name))
         except FileNotFoundError:
-            # why the file that was requested last was refused
-            refused = self._references.refusal_by_name
-            reason = refused.get(next(reversed(refused)), "is missing")
+            # The file that was requested last is the last one with a refusal.
+            refusal_by_name = self._references.refusal_by_name
+            last_name = next(reversed(refusal_by_name))
+            reason = refusal_by_name.get(last_name, "is missing")
             raise FileFormatError(
                 f"{self._path}: {kind} needs {format_name(str(name))}, which {reason}"
             ) from None

@@ -75,13 +75,15 @@ def import_place(spec: str) -> EnvironmentAsset:
         candelas = light.lux / illuminance
     asset_name = place.name
     if requested_light is not None:
-        # `.x` is taken for the suffix of a file, and left out
+        # `make_safe_name` leaves out the suffix of a file. The name of a light may have
+        # a dot in it, so that a suffix is added.
         asset_name = make_safe_name(Path(f"{place.name}-{light_name}.x"))
     return replace(
         environment,
         name=asset_name,
         source=spec,
         warnings=(*environment.warnings, *place.notes),
+        # The ground is that of the place, not one that belongs to the map.
         photographed=False,
         ground=None,
         candelas=candelas,

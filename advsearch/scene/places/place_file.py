@@ -95,7 +95,7 @@ def read_place_file(path: Path) -> PlaceFile:
 
 
 def resolve_sibling_path(path: Path, name: str) -> Path:
-    """Return the path of a file that the file of a place names.
+    """Return the path of a file that a place's file names, such as its mesh.
 
     Raises FileFormatError: it leads out of the folder of the place's file, `path`.
     """
@@ -135,8 +135,9 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         for outline in entry.list_footprints()
     )
     parts = [replace(part, is_ground=part.name in file.ground) for part in parts]
-    # Solids belong to the place and not to a mesh, but a scene has only meshes. Each
-    # solid has to be in the scene once, so the first mesh gets all of them.
+    # A scene stores solids at its meshes, although they belong to the full place. Each
+    # has to be in the scene once, so that the first mesh gets all of them. There is
+    # one: the file has at least one mesh as ground.
     parts[0] = replace(parts[0], solids=solids)
     directory = Path(os.path.abspath(path)).parent
     return Place(make_safe_name(directory), file, tuple(parts), tuple(notes))
@@ -165,7 +166,7 @@ def make_place_parts(
 
     Args:
         place: the place, whose lengths are in metres and whose emission is in cd/m2.
-        metres: one object size in metres.
+        metres: size of the scene's object, which is the unit of its lengths.
         candelas: luminance of a radiance of 1, cd/m2. None if the light has no unit:
             then the lamps stay off, and other emission is divided by
             `DEFAULT_LUMINANCE`.
@@ -177,7 +178,7 @@ def make_place_parts(
     for part in place.parts:
         emission = part.emission
         if part.name in place.file.lamps:
-            emission = None
+            emission = None  # off
             if are_lamps_on:
                 # one texel of the color that the file states
                 emission = np.array([[place.file.lamps[part.name]]], np.float32)

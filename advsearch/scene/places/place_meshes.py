@@ -185,6 +185,7 @@ def read_place_meshes(
     variant_index = None if variant is None else _find_variant(path, header, variant)
     with without_pillows_limit(), np.errstate(all="ignore"):
         primitives, surfaces = _read_primitives(file, variant_index, notes)
+    # what no import of glTF reads, and what only a place leaves out
     note_skipped_contents(_drop_supported_extensions(header), notes)
     _note_omissions(header, primitives, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in primitives))
@@ -311,8 +312,8 @@ def _read_primitives(
                 continue
             _surface, uv_scale, uv_shift = fitted[piece.material_index]
             part = transform_part(_fit_uvs(piece.part, uv_scale, uv_shift), pose)
-            # `piece` has the material of the variant, and names the surface. The
-            # original material names the mesh, see `_group_by_material`.
+            # The material of the variant decides about the surface, and the original
+            # one about the name of the mesh, see `_group_by_material`.
             primitives.append(
                 PosedPrimitive(
                     primitive.material, variant_material=piece.material_index, part=part
@@ -398,7 +399,8 @@ def _fit_surfaces(
     n_texels = 0
     for material, members in pieces_by_material.items():
         fit_by_material[material] = surfaces.make_surface(material, members)
-        n_texels += _count_texels(fit_by_material[material][0])
+        surface, _uv_scale, _uv_shift = fit_by_material[material]
+        n_texels += _count_texels(surface)
         check_most(
             file.path,
             n_texels,
@@ -431,9 +433,9 @@ def _group_by_material(
     """Group primitives to meshes of one material each, in the order of materials.
 
     A variant may replace the material of each primitive. If all primitives of an
-    original material get the same one, they are a mesh with the name of the original,
-    so that it has the same name in all variants. If they get different ones, there is a
-    mesh for each of these, with its name.
+    original material get the same replacement, they become one mesh. It has the name of
+    the original material, which is the same in all variants. If they get different
+    replacements, there is a mesh for each, with the name of the replacement.
 
     Args:
         header: header of the file, with the names of materials.
@@ -503,7 +505,7 @@ def _make_part(
         name=name,
         mesh=mesh,
         base_color=np.ascontiguousarray(texture[..., :3]),
-        # The fields of `surface` have the names of those of a material, without prefix.
+        # takes the numbers of `surface`, whose fields have the names of a material's
         material=Material().with_values(vars(surface), ""),
         opacity=opacity,
         normal_map=surface.normal_map,
@@ -549,6 +551,7 @@ def _with_finish(
     principled = {
         "type": "principled",
         "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
+        # roughness and so on, by Mitsuba's names
         **vars(material),
         "clearcoat_gloss": min(max(gloss, 0.0), 1.0),
     }

@@ -101,12 +101,13 @@ class SolidEntry(_Entry):
         return self
 
     def list_footprints(self) -> list[Footprint]:
-        """Return the outlines, in metres: the one, or a polygon around each position.
+        """Return the outline, or a round one at each position, in metres.
 
         A round outline is a regular polygon with its corners on the circle.
         """
         if self.outline is not None:
             return [Footprint(np.array(self.outline), *self.heights)]
+        # `_check_form` has checked that there are a radius and positions.
         turn = np.arange(N_CIRCLE_CORNERS) * (2.0 * np.pi / N_CIRCLE_CORNERS)
         circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
         return [

@@ -94,9 +94,9 @@ class SurfaceView:
         self.coverage = samples.coverage[camera_index]
         height, width = self.base_radiance.shape[:2]
         n_cells = shape[0] * shape[1]
-        # The rays of all cameras have ascending indices, camera after camera.
-        # `samples.sample` holds the ray index of each sample, in ascending order. So
-        # this camera's samples lie between its first ray and the next camera's.
+        # Rays are numbered camera after camera, and `samples.ray_index`, the ray of
+        # each sample, is ascending. So this camera's samples lie between those of its
+        # first ray and of the next camera's first ray.
         n_rays = height * width * RAYS_PER_PIXEL
         first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
         start, end = torch.searchsorted(samples.ray_index, first_rays).tolist()
@@ -205,7 +205,7 @@ class Arrangement:
     Args:
         renderer: renderer of the scene.
         inputs: assembled inputs of the scene, without `FREE_INPUTS`.
-        texture: rows and columns of the base color.
+        texture_shape: rows and columns of the base color.
         seed: seed of the rays.
 
     Attributes:
@@ -257,6 +257,7 @@ class Arrangement:
         if self._has_ground:
             surfaces.append(self._make_ground_texels(object_center))
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
+        # The fine grid has this number of cells along each side of a texel.
         refinement = max(1, math.ceil(MIN_FINE_SIZE / min(texture_shape)))
         self.fine_shape = (texture_shape[0] * refinement, texture_shape[1] * refinement)
         self._upsampling = None
@@ -268,9 +269,38 @@ class Arrangement:
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
         )
-        # For each side of the object: the matrix that takes the light on its texels to
-        # the fine grid. The back has the same texels, but the opposite normals.
-        self._to_fine = [
+        self._to_fine = self._make_lookup_matrices(
+            surfaces, charts, vertices, normals, met_cells
+        )
+        if self._has_ground:
+            ground_texels = surfaces[-1]
+            self._smooth = self._make_ground_smoothing(ground_texels, met_cells)
+        # both sides of the object have the same gloss, and the ground has none
+        self.lobes = [self._measure_object_lobes()] * self.n_sides
+        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
+        self.world_to_map = torch.tensor(get_world_to_map(scene), dtype=torch.float32)
+        self._ground_below = self._find_ground_below(object_center)
+        self._views = self._make_view_tracer(object_center)
+
+    def _make_lookup_matrices(
+        self,
+        surfaces: Sequence[texels.LitTexels],
+        charts: Charts,
+        vertices: Float32Array,
+        normals: Float32Array,
+        met_cells: Ints,
+    ) -> list[Tensor]:
+        """Return for each side of the object a matrix from texels to the fine grid.
+
+        Args:
+            surfaces: texels of each surface; the sides of the object come first.
+            charts: rasterized texture coordinates of the object.
+            vertices: (V, 3) in world space.
+            normals: (V, 3) in world space.
+            met_cells: (texels, rays) cells that rays from all texels met.
+        """
+        # The back has the same texels as the front, but the opposite normals.
+        return [
             texels.make_lookup_matrix(
                 surfaces[side],
                 charts,
@@ -281,14 +311,6 @@ class Arrangement:
             )
             for side in range(self.n_sides)
         ]
-        if self._has_ground:
-            self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
-        # both sides of the object have the same gloss, and the ground has none
-        self.lobes = [self._measure_object_lobes()] * self.n_sides
-        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
-        self.world_to_map = torch.tensor(get_world_to_map(scene), dtype=torch.float32)
-        self._ground_below = self._find_ground_below(object_center)
-        self._views = self._make_view_tracer(object_center)
 
     def _make_ground_texels(self, object_center: Float32Array) -> texels.LitTexels:
         """Return the texels of the ground, which goes on from below the object (3,)."""
@@ -348,6 +370,7 @@ class Arrangement:
             ground: texels of the ground.
             met_cells: (texels, rays) cells that rays from all texels met.
         """
+        # Texels that see nothing of the sky lie under something, and are left out.
         sees_sky = self._is_sky(met_cells[self._select_ground()]).any(axis=1)
         return texels.make_smoothing_matrix(ground, np.asarray(sees_sky))
 
@@ -378,6 +401,8 @@ class Arrangement:
             vertices: (V, 3) in world space.
             normals: (V, 3) in world space.
         """
+        # The side of a grid says which hits it has: 0 those on both sides of the faces,
+        # 1 those on the front, -1 those on the back.
         shared = texels.make_mesh_texels(OBJECT, charts, vertices, normals, side=0)
         if not is_visible_from_behind(self._scene, OBJECT, shared.positions):
             return [shared]
@@ -400,8 +425,8 @@ class Arrangement:
         buried.
 
         Args:
-            met_cells: (n, rays) cell that each ray of a texel met; a negative number is
-                a back without texels.
+            met_cells: (n, rays) cell that each ray of a texel met. A negative number is
+                something without light, usually a back without texels.
             side: 0 for the front of the object, 1 for its back.
         """
         cells = met_cells[self.texels.select_grid(side)]
@@ -445,7 +470,7 @@ class Arrangement:
         )
 
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
-        """Find where the blurred maps show the ground, as seen from the object's center.
+        """Find where the blurred maps, seen from the object's center, show the ground.
 
         A photographed ground takes its color from the environment's map. The color of a
         point is that in its direction from the camera that took the photograph, which
@@ -477,6 +502,7 @@ class Arrangement:
         is_photographed = self._capture_height is not None
         reach = self._compute_ground_reach(is_photographed)
         is_in_reach = (points[..., :2].abs() <= reach).all(dim=-1)
+        # For a plain ground, the directions from here are not used.
         capture_position = torch.tensor([0.0, 0.0, self._capture_height or 0.0])
         photograph_directions = (points - capture_position) @ self.world_to_map.T
         return goes_down & is_in_reach, photograph_directions
@@ -534,29 +560,46 @@ class Arrangement:
                 reflectance,
                 BOUNCES,
             )
-            # What a camera sees of each texel: the radiance of a diffuse surface. The
-            # texels of a photographed ground get a factor on the photograph instead.
-            visible_light = reflectance * irradiance / math.pi
-            gloss_map = sky.coarse_map  # what gloss on the object reflects
-            # Without a ground this is only a filler: no ray looks it up.
-            far_ground = torch.ones(1, 3)
-            if self._has_ground:
-                ground = self._select_ground()
-                visible_light[ground] = self._compute_visible_ground(
-                    irradiance, visible_light, padded
-                )
-                far_ground = self._compute_far_ground(visible_light[ground])
-                gloss_map = self._put_ground(gloss_map, far_ground, padded)
-            # The first grids are the sides of the object.
+            # The grids of the object's sides come first.
             side_irradiances = [
                 to_fine @ irradiance[self.texels.select_grid(side)]
                 for side, to_fine in enumerate(self._to_fine)
             ]
-            texel_of_cell = torch.from_numpy(self.texels.texel_of_cell)
-            # One more cell, the last, is the ground beyond all texels.
-            cells = torch.cat([visible_light[texel_of_cell], far_ground])
-            light_maps = make_light_maps(cells, padded, texels.blur_map(gloss_map))
+            light_maps = self._make_light_maps(sky, reflectance, irradiance, padded)
             return ArrangementLight(torch.cat(side_irradiances), light_maps)
+
+    def _make_light_maps(
+        self,
+        sky: texels.SkyLight,
+        reflectance: Tensor,
+        irradiance: Tensor,
+        padded: Tensor,
+    ) -> LightMaps:
+        """Return the maps in which rays of cameras look up light.
+
+        Args:
+            sky: the environment.
+            reflectance: (n, 3) reflectance of all texels.
+            irradiance: (n, 3) irradiance of all texels.
+            padded: (H, W + 2, 3) map of the environment.
+        """
+        # What a camera sees of each texel: the radiance of a diffuse surface. The
+        # texels of a photographed ground get a factor on the photograph instead.
+        visible_light = reflectance * irradiance / math.pi
+        gloss_map = sky.coarse_map  # what gloss on the object reflects
+        # Without a ground the value does not matter: no ray looks it up.
+        far_ground = torch.ones(1, 3)
+        if self._has_ground:
+            ground = self._select_ground()
+            visible_light[ground] = self._compute_visible_ground(
+                irradiance, visible_light, padded
+            )
+            far_ground = self._compute_far_ground(visible_light[ground])
+            gloss_map = self._put_ground(gloss_map, far_ground, padded)
+        texel_of_cell = torch.from_numpy(self.texels.texel_of_cell)
+        # One more cell, the last, is the ground beyond all texels.
+        cells = torch.cat([visible_light[texel_of_cell], far_ground])
+        return make_light_maps(cells, padded, texels.blur_map(gloss_map))
 
     def _compute_hot_cosines(self, sky: texels.SkyLight) -> Tensor | None:
         """Return the cosines (n, k) of n texels towards k directions of hot light.
@@ -606,8 +649,8 @@ class Arrangement:
     def _compute_far_ground(self, visible_ground: Tensor) -> Tensor:
         """Return what the camera sees of the ground beyond all texels, (1, 3).
 
-        It is the mean of the texels at the border, where the object hides little. Those
-        at the four corners count twice.
+        It is the mean of the texels at the border, where the object hides little. The
+        four corners are on two sides each, and count twice.
 
         Args:
             visible_ground: (n, 3) what the camera sees of the ground's texels; every
@@ -616,7 +659,7 @@ class Arrangement:
         ground_grid = self.texels.grids[-1]
         cells = visible_ground.reshape(*ground_grid.shape, 3)
         border = torch.cat([cells[0], cells[-1], cells[:, 0], cells[:, -1]])
-        # Positive, since the view tracer divides by it (`ViewTracer._reflect`).
+        # Positive, since the view tracer divides by it.
         return border.mean(dim=0, keepdim=True).clamp_min(1e-9)
 
     def _put_ground(
@@ -635,6 +678,7 @@ class Arrangement:
         is_ground, photograph_directions = self._ground_below
         ground = far_ground
         if self._capture_height is not None:
+            # Here `far_ground` is the factor on the photograph.
             photograph = texels.look_up_environment(
                 padded, photograph_directions.reshape(-1, 3)
             )
@@ -642,14 +686,16 @@ class Arrangement:
         return torch.where(is_ground[..., None], ground, surroundings)
 
     def _compute_reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
-        """Return which fraction (n, 3) of even light each texel reflects.
+        """Return the fraction (n, 3) of light that each texel reflects.
 
-        It is the base color times the diffuse fraction, plus the fraction of the gloss.
+        For light that is the same from all directions it is the base color times the
+        diffuse fraction, plus the fraction of the gloss.
 
         Args:
             color: (h, w, 3) base color of the object.
             padded: (H, W + 2, 3) map of the environment, for a photographed ground.
         """
+        # in the order of surfaces and of `lobes`: the object's sides, then the ground
         colors = [self._compute_object_color(color)] * self.n_sides
         if self._has_ground:
             colors.append(self._compute_ground_color(padded))

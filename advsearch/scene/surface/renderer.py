@@ -115,7 +115,7 @@ class SurfaceRenderer(Predictor):
             seed: seed of the rays by which texels see each other and the sky.
         """
         super().__init__(traced)
-        self.n_dropped = 0
+        self.n_dropped = 0  # lights
         self.stored_lights: dict[MapFingerprint, ArrangementLight] = {}
         # values for inputs that a configuration leaves at those of the scene
         self._scene_values = {
@@ -128,9 +128,9 @@ class SurfaceRenderer(Predictor):
         fixed_inputs = {
             name: inputs[name] for name in inputs if name not in FREE_INPUTS
         }
-        texture = (self.base_color.shape[0], self.base_color.shape[1])
+        texture_shape = (self.base_color.shape[0], self.base_color.shape[1])
         with torch.no_grad():
-            self.arrangement = Arrangement(traced, fixed_inputs, texture, seed)
+            self.arrangement = Arrangement(traced, fixed_inputs, texture_shape, seed)
 
     def compute_inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a configuration (d,), without a graph."""
@@ -146,8 +146,9 @@ class SurfaceRenderer(Predictor):
     def is_applicable(self, inputs: Mapping[str, Tensor]) -> bool:
         """Return whether `predict_images` holds for some scene inputs.
 
-        They may differ from those of this arrangement in cameras and environment only,
-        not in the base color, which `predict_images` leaves as it is.
+        They may differ from those of this arrangement in cameras and environment
+        (`FREE_INPUTS`). The base color is one of these, too, but `predict_images` does
+        not change it: so it is compared here.
         """
         expected = {**self.arrangement.inputs, COLOR_INPUT: self.base_color}
         fixed_inputs = {
@@ -185,10 +186,10 @@ class SurfaceRenderer(Predictor):
     def n_bytes(self) -> int:
         """Memory of the arrangement and the stored lights.
 
-        A renderer with a fixed light shares the arrangement with another renderer, so
-        that only its light counts.
+        A renderer with a fixed light was made by `with_fixed_light`. It shares the
+        arrangement with the original, so that only its light counts.
         """
-        if self.fixed_light is not None:  # the rest is shared
+        if self.fixed_light is not None:
             return self.fixed_light.n_bytes
         lights = sum(light.n_bytes for light in self.stored_lights.values())
         return self.arrangement.n_bytes + lights
@@ -206,9 +207,9 @@ class SurfaceRenderer(Predictor):
         """Return the light under the environment of scene inputs, and a factor (3,).
 
         Light is linear in the environment. So maps that differ only by exposure or tint
-        share one stored light, and the factor turns it into that of `inputs`, for each
-        color channel. A light is computed on first use. Up to `MAX_BYTES` of lights are
-        stored; the oldest are dropped first.
+        share one stored light. Times the factor of each color channel, the light that
+        is returned is that of `inputs`. A light is computed on first use. Up to
+        `MAX_BYTES` of lights are stored; the oldest are dropped first.
         """
         fingerprint = MapFingerprint.compute(
             inputs.get(
@@ -221,7 +222,7 @@ class SurfaceRenderer(Predictor):
                 return light, factor
         light = self.compute_light(inputs)
         self.stored_lights[fingerprint] = light
-        # `n_bytes` counts the stored lights.
+        # `self.n_bytes` includes the stored lights. The new one stays in any case.
         while len(self.stored_lights) > 1 and self.n_bytes > scale_limit(MAX_BYTES):
             oldest = next(iter(self.stored_lights))
             self.stored_lights.pop(oldest)
@@ -273,8 +274,8 @@ class SurfaceRenderer(Predictor):
         finish_launch = next(launches)
         for light, camera_indices in cameras_of_light.items():
             samples = finish_launch()
-            # The next launch runs while these samples are used. After the last group
-            # there is none to start, and `finish_launch` is not called again.
+            # Start the next launch, which runs while these samples are used. After the
+            # last one nothing is left, and `finish_launch` stays, but is not called.
             finish_launch = next(launches, finish_launch)
             for index_in_launch, camera_index in enumerate(camera_indices):
                 view = self.arrangement.make_view(samples, index_in_launch)
@@ -309,6 +310,7 @@ class SurfaceRenderer(Predictor):
             if light not in reflected_by_light:
                 reflected_by_light[light] = light.compute_reflected(fine_color)
             radiance = lit_view.view.compute_radiance(reflected_by_light[light])
+            # from the stored light to that of the camera's environment
             radiance = radiance * lit_view.light_factor
             images[lit_view.camera_index] = self.path_renderer.finish_image(
                 radiance,
@@ -349,7 +351,7 @@ class SurfaceRenderer(Predictor):
 def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
     """Return why light on surfaces cannot predict a space's images; None if it can.
 
-    None does not mean that the prediction is good: that is measured afterwards.
+    How good a prediction is does not count here: that is measured afterwards.
 
     Args:
         renderer: renderer of the space.
@@ -361,6 +363,7 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
     if refusal is not None:
         return refusal
     for group in renderer.plan.groups:
+        # A group with the estimator "image" changes only the finished image.
         if group.control in varying or group.estimator == "image":
             continue
         if renderer.inputs_by_group.get(group.name, frozenset()) != {COLOR_INPUT}:
@@ -386,7 +389,8 @@ def find_scene_refusal(renderer: Renderer) -> Refusal | None:
     """
     description = renderer.scene.description_and_filter[0]
     mesh_part = description.meshes[OBJECT]
-    if mesh_part.mesh.repeats or mesh_part.surface is not None:
+    has_mitsuba_surface = mesh_part.surface is not None
+    if mesh_part.mesh.repeats or has_mitsuba_surface:
         return Refusal(
             "the object's surface repeats its texture, or is one of Mitsuba's own"
         )

@@ -74,8 +74,9 @@ class LitTexels:
 def join_texels(surfaces: Sequence[LitTexels]) -> LitTexels:
     """Join the texels of several surfaces, each with one grid.
 
-    The cells and texels of a surface get the numbers that follow those of the surface
-    before it.
+    A grid has cells, and the cells on a chart of the mesh are its texels. Both are
+    numbered on from surface to surface: the indices of a surface are shifted by the
+    number of cells or texels of all surfaces before it.
     """
     # Indices of the first texel and the first cell of each surface. The last entries
     # are the total numbers, as in `LitTexels.first_texels`.
@@ -152,13 +153,15 @@ def make_ground_texels(
     Args:
         name: name of the ground.
         height: height of the plane, in object sizes.
-        half_width: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no texels.
+        half_width: half the plane's width; what is beyond `MAX_GROUND_REACH` gets no
+            texels.
         center: x and y of the object's center.
     """
     half_width = min(half_width, MAX_GROUND_REACH)
-    # At the center the slope of scale * sinh(rate * p) is scale * rate; with equal
-    # texels it would be the reach. Their ratio is sinh(rate) / rate, and the texel at
-    # the center gets the width `MIN_TEXEL_WIDTH`.
+    # The width of a texel is in proportion to the slope of the position. At the center
+    # the slope is scale * rate, and for equal texels it would be `half_width`, which is
+    # scale * sinh(rate). So the center's texel is narrower than an equal one by the
+    # ratio sinh(rate) / rate: the rate is the one for which it is `MIN_TEXEL_WIDTH`.
     equal_width = 2.0 * half_width / GROUND_TEXELS
     rate = _find_warp_rate(equal_width / MIN_TEXEL_WIDTH)
     scale = half_width / math.sinh(rate)
@@ -239,7 +242,7 @@ def _weigh_neighbours(
     def weigh(row: IntArray, column: IntArray, texel: IntArray) -> Float64Array:
         """Return the weights (N,) of the neighbours at rows and columns.
 
-        An index of -1 reads the last texel, and `is_used` sets its weight to 0.
+        A neighbour outside of the charts has the index -1, and gets the weight 0.
         """
         grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * GRID_SIGMA**2)
         offset = texels.positions[texel] - points
@@ -249,6 +252,7 @@ def _weigh_neighbours(
         # lets it count for half at 24 degrees, and for nothing at a right angle.
         similarity = np.clip(cosine, 0.0, 1.0) ** 8
         weight = np.exp(-grid_distance - distance) * similarity
+        # The look-ups with -1 have read the last texel, which has no effect.
         is_used = (texel >= 0) & ~buried[texel]
         return np.where(is_used, weight, 0.0)
 
@@ -345,11 +349,12 @@ def make_lookup_matrix(
         texel_width=texel_width,
         buried=buried,
     )
+    # Points without any weight are changed in `texel_index` and `weights`.
     _use_nearest_texel(texels, charts, grid_position, texel_index, weights)
     weights /= weights.sum(axis=1, keepdims=True)
 
     n_fine_cells = shape[0] * shape[1]
-    n_texels = texels.first_texels[1]  # number of texels of the first surface
+    _first, n_texels = texels.first_texels[:2]  # of the first surface
     fine_cell = rows * shape[1] + columns
     return _make_sparse(fine_cell, texel_index, weights, (n_fine_cells, n_texels))
 
@@ -421,7 +426,7 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     Returns:
         Sparse, (texels, texels).
     """
-    width = ground.grids[0].shape[0]
+    width, _height = ground.grids[0].shape  # the grid of a ground is square
     if not sees_sky.any():
         sees_sky = np.ones_like(sees_sky)
     is_used = sees_sky.reshape(width, width)
@@ -439,7 +444,9 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     entries_per_row = np.diff(weights.indptr)
     row_sum_of_entry = np.repeat(weights.sum(axis=1), entries_per_row)
     weights.data /= np.maximum(row_sum_of_entry, 1e-12)
-    return to_torch_csr(weights.astype(np.float32)[nearest_used])
+    # The row of a texel that is not used is that of the nearest one that is.
+    rows = weights.astype(np.float32)[nearest_used]
+    return to_torch_csr(rows)
 
 
 def _interpolate(
@@ -515,9 +522,10 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     """Prepare an environment's map (H, W + 2, 3) for look-ups.
 
     A texel's light above `HOT_FACTOR` times the mean, such as that of the sun, is hot.
-    It gets rays of its own, since the coarse cells of the sky would blur its shadows;
-    the rest stays in the cells. If no more than `MIN_HOT_FRACTION` of all light is hot,
-    nothing is treated so. `SkyLight.coarse_map`, which gloss reflects, has all light.
+    It gets rays of its own, since the coarse cells of the sky would blur its shadows.
+    The rest stays in the cells (`cell_radiance`). If no more than `MIN_HOT_FRACTION` of
+    all light is hot, all of it stays there. `coarse_map`, which gloss reflects, has all
+    light in any case.
     """
     radiance = padded[:, 1:-1].detach()
     n_rows, n_columns = radiance.shape[:2]
@@ -563,8 +571,8 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         radiance: (H, W, 3) radiance of the hot light.
-        power: (H, W) luminance times solid angle; a texel at the horizon has the solid
-            angle 1.
+        power: (H, W) luminance times solid angle, in units of the solid angle of a
+            texel at the horizon.
 
     Returns:
         (k, 3) unit directions in the map's axes, and (k, 3) radiance times solid angle;
@@ -583,8 +591,9 @@ def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
     # The steps of the lattice are taken modulo its size, and scaled to [0, 1].
     row_offset = _to_tent((index * HOT_LATTICE[0] % HOT_RAYS + 0.5) / HOT_RAYS)
     column_offset = _to_tent((index * HOT_LATTICE[1] % HOT_RAYS + 0.5) / HOT_RAYS)
-    # The first and last row are centered at the poles. A row begins at azimuth 0 with
-    # the left edge of its first texel.
+    # The first and last row are centered at the poles: row i has the polar angle
+    # i pi / (n_rows - 1). A row begins at azimuth 0 with the left edge of its first
+    # texel, whose center is 0.5 columns further.
     polar = ((row + row_offset) * (math.pi / (n_rows - 1))).clamp(0.0, math.pi)
     azimuth = (column + 0.5 + column_offset) * (2.0 * math.pi / n_columns)
     # solid angle of a texel at the horizon, in steradians
@@ -639,10 +648,10 @@ def _average_cells(
 def blur_map(radiance: Tensor) -> Tensor:
     """Blur a map (h, w, 3) by each of `BLUR_WIDTHS`.
 
-    A width is the root mean square of the angle by which light is spread, in radians.
-    Its square is the sum of the variances over two directions, so that the Gaussian of
-    each has a sigma of the width / sqrt(2). Columns are blurred first, over the polar
-    angle; then rows, over the angle along them.
+    The blur is a Gaussian over two directions: first along columns, over the polar
+    angle, then along rows. A width is the root mean square of the angle by which light
+    is spread, in radians. Each of the two directions has half of its square as the
+    variance, so that sigma is the width / sqrt(2).
 
     Returns:
         (n_widths, h, w, 3) one blurred map for each width.
@@ -654,12 +663,12 @@ def blur_map(radiance: Tensor) -> Tensor:
     for blur_width in BLUR_WIDTHS:
         sigma = blur_width / math.sqrt(2.0)
         exponent = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
-        # rows near the poles have less solid angle, and count less
+        # Each row is weighted by its solid angle, which is small near the poles.
         column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
         column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
-        # A row is periodic, and so is blurred in the frequency domain, where a Gaussian
-        # is a Gaussian too. A row spans an angle proportional to the sine of its polar
-        # angle: an angle sigma along the row is an azimuth of sigma / sine.
+        # A row is periodic, so that it is blurred in the frequency domain: there the
+        # factor is exp(-(frequency s)^2 / 2), where s is the sigma of the azimuth. Near
+        # a pole, an angle sigma along the row is a large azimuth: s = sigma / sine.
         row_filter = torch.exp(
             -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
         )
@@ -725,7 +734,8 @@ def make_view_matrices(
         met_cells: (n, rays) what each ray met. Below `len(texel_of_cell)` it is a cell
             of the grids; from there on a cell of the sky; and a negative value is
             something that does not shine.
-        texel_of_cell: index of the texel that gives each cell its light.
+        texel_of_cell: for each cell of the grids, the index of the texel whose light it
+            has; a grid also has cells that are no texels.
         n_texels: number of texels of all grids.
     """
     count, n_rays = met_cells.shape
@@ -737,7 +747,10 @@ def make_view_matrices(
     def make_matrix(
         mask: BoolArray, column: npt.NDArray[np.integer[Any]], width: int
     ) -> Tensor:
-        """Return a matrix in which each ray of a mask counts pi / n_rays."""
+        """Return a matrix in which each ray of a mask counts pi / n_rays.
+
+        `column` has an entry for each True of the mask.
+        """
         values = np.full(len(column), math.pi / n_rays, dtype=np.float32)
         entries = (values, (row[mask], column))
         return to_torch_csr(scipy.sparse.coo_matrix(entries, (count, width)).tocsr())

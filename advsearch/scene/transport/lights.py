@@ -129,13 +129,14 @@ def find_light_groups(renderer: Renderer) -> LightGroups:
             effect = _measure_effect(renderer, group, reference, base_inputs)
             if effect is None:  # the group changes more than light
                 continue
-            changes_light = not effect.changed <= IMAGE_INPUTS
+            only_changes_image = effect.changed <= IMAGE_INPUTS
+            changes_light = not only_changes_image
             if changes_light and has_fixed_lights(renderer):
                 continue
             groups[group.name] = effect.changed
             if effect.is_harmonic:
-                # Basis maps of its own represent what it adds: the map of the
-                # environment itself need not be bright.
+                # The light that it adds has basis maps of its own, so that the map of
+                # the environment itself need not be bright.
                 harmonic_groups.add(group.name)
             elif ENVIRONMENT_INPUT in effect.changed:
                 brightest = effect.brightest[group.coordinates]
@@ -144,7 +145,7 @@ def find_light_groups(renderer: Renderer) -> LightGroups:
 
 
 class _Effect(NamedTuple):
-    """Effect of a group of coordinates that changes only light or the finished image."""
+    """Effect of a group of coordinates on light or on the finished image."""
 
     changed: frozenset[str]  # names of the inputs that it changes
     is_harmonic: bool  # whether it adds spherical harmonics to the environment
@@ -158,7 +159,8 @@ def _measure_effect(
     """Return the effect of a group of coordinates; None if it changes more than light.
 
     Several configurations, which differ from `reference` in this group only, are
-    compared with `base_inputs`, the scene inputs at `reference`.
+    compared with `base_inputs`, the scene inputs at `reference`. The kinds of changes
+    are those of `_Change`.
     """
     changed: set[str] = set()
     is_harmonic = False
@@ -215,7 +217,7 @@ class _Change(Enum):
 
     NONE = "not at all"
     POWER = "in power and color"
-    HARMONICS = "by spherical harmonics"
+    HARMONICS = "by spherical harmonics"  # smooth patterns over all directions
     OTHER = "in more than light"
 
 
@@ -266,9 +268,10 @@ def _find_change(
 def _is_weighted_sum(target: Tensor, basis: Tensor) -> bool:
     """Return whether a map (H, W, 3) is a weighted sum of basis maps (k, H, W, 3).
 
-    Where a sum with harmonics is negative, the map is 0 instead. So only texels count
-    in which the map is positive, and the first basis map too: that is the environment
-    before harmonics were added, which may have been cut off in the same manner.
+    Where a sum with harmonics is negative, the map is 0 instead, and the fit would not
+    hold. So only texels are compared in which the target is positive. For the same
+    reason the first basis map has to be positive there: that is the environment before
+    a change, to which other harmonics may have been added already.
     """
     is_lit = ((basis[0] > 0.0) & (target > 0.0)).to(torch.float32)
     basis_maps = BasisMaps(basis * is_lit)
@@ -393,8 +396,8 @@ class LightBasis:
         dark_values = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
 
-        # The first light: all that does not change, and the patterns of projectors,
-        # which have matrices of their own if they change.
+        # The first light: all that does not change, and the patterns of projectors. A
+        # pattern that changes has a matrix of its own under this light.
         fixed_values = {
             name: value
             for name, value in values.items()
@@ -409,8 +412,8 @@ class LightBasis:
         if self._has_fixed_light:
             self.inputs_of_light.append({**dark_values, **fixed_values})
 
-        # Lamps. Their weight is their light itself, so that their image is that of a
-        # radiance or intensity of 1.
+        # Lamps. Each is rendered with a radiance or intensity of 1, so that its weight
+        # is its radiance or intensity.
         self._lamps = sorted(changed_lights - {ENVIRONMENT_INPUT})
         for name in self._lamps:
             self.inputs_of_light.append({**dark_values, name: torch.ones(3)})
@@ -426,7 +429,10 @@ class LightBasis:
                 )
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
-        """Return the factor (lights, 3) of each light, differentiable in the inputs."""
+        """Return the factor (lights, 3) of each light, differentiable in the inputs.
+
+        The order is that of `inputs_of_light`.
+        """
         weights = [torch.ones(1, 3)] if self._has_fixed_light else []
         weights += [inputs[name].reshape(1, 3) for name in self._lamps]
         if self._basis_maps is not None:
@@ -467,8 +473,9 @@ def _make_basis_maps(
         return first[None]
     start_inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
     start_map = start_inputs[ENVIRONMENT_INPUT]
-    # A texel in which the sum with harmonics was negative is cut off at zero: it is
-    # black in `first`, but not at the start. Harmonics are added to all others.
+    # A texel of `first` is black for one of two reasons. It may be black in the
+    # environment itself, and so at the start, too. Or its sum with harmonics was
+    # negative and was cut off: there no harmonics are added.
     is_added = first > 0.0
     if start_map.shape == first.shape:
         is_always_black = start_map <= 0.0
@@ -489,7 +496,7 @@ class BasisRenderer(Predictor):
         changing: result of `find_light_groups`, which is called if this is None.
 
     Attributes:
-        non_finite: how many numbers were not finite, and were replaced by 0.
+        n_non_finite: how many numbers were not finite, and were replaced by 0.
     """
 
     def __init__(
@@ -513,7 +520,7 @@ class BasisRenderer(Predictor):
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_light_groups(traced)
-            # The basis map of the environment is its brightest: other environments are
+            # The first basis map is the environment at its brightest. Others are
             # predicted by scaling its image, which fails if a channel of it is black.
             brightest = u.detach().clone()
             for coordinates, values in changing.brightest_values:
@@ -548,7 +555,8 @@ class BasisRenderer(Predictor):
         }
         renderers = []
         for index, light_inputs in enumerate(self._lights.inputs_of_light):
-            # `LightBasis` has put all projectors into the first light.
+            # All projectors are in the first light of `LightBasis`, so that only there
+            # their patterns have an effect, and need a matrix.
             has_projectors = index == 0
             renderers.append(
                 LinearRenderer(
@@ -577,12 +585,14 @@ class BasisRenderer(Predictor):
 
         Coverage is the same under any light.
         """
+        # Each renderer takes the base colors of the inputs, and ignores their light.
         images = [renderer.predict_radiance(inputs) for renderer in self._renderers]
         weights = self._lights.compute_weights(inputs)
         basis = torch.stack(images)[..., :3]
         # l: lights, c: channels
         radiance = torch.einsum("lc,lhwc->hwc", weights, basis)
-        return torch.cat([radiance, images[0][..., 3:]], dim=-1)
+        further_channels = images[0][..., 3:]  # the same for all lights
+        return torch.cat([radiance, further_channels], dim=-1)
 
 
 HAZE = Refusal("there is haze", RefusalCause.HAZE)
@@ -644,6 +654,7 @@ def _find_group_refusal(
     changed_inputs = renderer.inputs_by_group.get(group.name, frozenset())
     parts = renderer.scene.description_and_filter[0].parts
     haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
+    # whether it changes haze and nothing else
     is_haze = bool(changed_inputs) and all(
         name.startswith(haze_prefixes) for name in changed_inputs
     )
@@ -697,8 +708,8 @@ def make_predictor(
 ) -> Predictor:
     """Make the predictor of images of a renderer's space, at a configuration.
 
-    It is a `BasisRenderer` if light changes, and else a `LinearRenderer`, whose
-    arguments it takes.
+    It is a `BasisRenderer` if light changes, and else a `LinearRenderer`. The arguments
+    are the first ones of both.
     """
     lighting = find_light_groups(renderer)
     if lighting.changed_inputs:
@@ -718,9 +729,9 @@ def count_lights(renderer: Renderer) -> int:
 def count_samples(renderer: Renderer) -> int:
     """Return the samples per pixel that are traced before anything can be predicted.
 
-    Under each light, there is a matrix for each base color that is searched. Each
-    matrix needs the samples of all its passes. Without a matrix, the light needs those
-    of one image.
+    Under each light, there is a matrix for each base color that a group may change.
+    Each matrix needs the samples of all its passes. Without a matrix, the light needs
+    those of one image.
     """
     changed_inputs: set[str] = set()
     for group in renderer.plan.groups:

@@ -122,8 +122,8 @@ class ColoredRows:
         # Until `finish`: the sums of what was added. They are released then.
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         self._colors: Float32Array = np.zeros((rows, 3), dtype=np.float32)
-        # After `finish`: the fractions, packed if small, and else a matrix with its
-        # transpose; and the colors.
+        # After `finish`: the fractions, packed if small (then there is no pair), and
+        # else as a matrix and its transpose; and the colors.
         self._packed: _PackedRows | None = None
         self._csr_pair: tuple[Tensor, Tensor] | None = None
         self._stored_colors = PackedImage(torch.zeros(0))
@@ -140,7 +140,7 @@ class ColoredRows:
         n_rows, n_columns = self._shape
         if self._small:
             return (2 + self._column_type.itemsize) * self.entries + (4 + 6) * n_rows
-        row_bytes = 4 + 6 + 12
+        row_bytes = 4 + 6 + 12  # start, and color in 16 bits and in float32
         transposed_row_bytes = 4
         return (
             2 * (4 + 4) * self.entries
@@ -176,6 +176,7 @@ class ColoredRows:
         first_entries = first_samples * columns.shape[1]
         # A color may be negative, as a derivative; its magnitude counts.
         brightness = np.abs(colors).mean(axis=1, keepdims=True)
+        # scipy takes the values, their columns, and the first entry of each row.
         added_matrix = scipy.sparse.csr_matrix(
             (
                 (fractions * brightness).ravel(),
@@ -203,7 +204,8 @@ class ColoredRows:
             smooth: function that removes the noise from the image (H, W, 3) of all
                 rows' colors; None leaves it as it is.
         """
-        self._store_fractions(self._compute_fractions(), self._sum)
+        fractions = self._compute_fractions()  # of `_sum`, before it is released
+        self._store_fractions(fractions, self._sum)
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         colors = torch.from_numpy(self._colors).reshape(*image_shape, 3)
         if smooth is not None:
@@ -233,9 +235,9 @@ class ColoredRows:
         """
         if self._small:
             self._packed = _PackedRows(
-                fractions.astype(np.float16),
-                like.indices.astype(self._column_type),
-                like.indptr,
+                fractions=fractions.astype(np.float16),
+                columns=like.indices.astype(self._column_type),
+                row_starts=like.indptr,
             )
             return
         matrix = scipy.sparse.csr_matrix(
@@ -251,6 +253,7 @@ class ColoredRows:
             product = matrix @ values
         else:
             product = torch.from_numpy(self._unpack() @ values.numpy())
+        # The rows of fractions times the colors of the rows: the full matrix.
         return product.mul_(self._stored_colors().reshape(-1, 3))
 
     def multiply_transposed(self, values: Tensor) -> Tensor:
@@ -353,7 +356,7 @@ class TextureTransport:
             )
             scattered = vertex.select(~vertex.is_sharp)
             uv = scattered.uv.numpy() % 1.0  # the texture repeats
-            # The limit is for a coordinate that rounding makes 1.
+            # Rounding may make a coordinate 1, whose cell would be outside.
             column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
             column = column.clip(0, n_columns - 1)
             row = np.floor(uv[:, 1] * n_rows).astype(np.int64).clip(0, n_rows - 1)
@@ -370,9 +373,8 @@ class TextureTransport:
 
         Args:
             smooth: function that removes the noise from the colors of a matrix's rows.
-                These are an image: since the fractions of a row add up to one, its
-                color is the change of the pixel if all texels change by one. None
-                leaves the noise in them.
+                The color of a row is the change of its pixel if all texels change by
+                one, so that the colors are an image. None leaves the noise in them.
         """
         self._sharp.finish(self._image_shape, smooth)
         self._scattered.finish(self._image_shape, smooth)
@@ -573,7 +575,7 @@ class LinearRenderer(Predictor):
     Attributes:
         linearized_at: values of the inputs with a matrix, at which the image is
             linearized, by name.
-        non_finite: how many numbers were not finite, and were replaced by 0.
+        n_non_finite: how many numbers were not finite, and were replaced by 0.
 
     Raises:
         TransportTooLargeError: the matrices would take more than `MAX_BYTES`.
@@ -641,7 +643,7 @@ class LinearRenderer(Predictor):
         Args:
             space: copy of the space that does not refer to the scene.
         """
-        # The scene is removed from a copy: others may use the same renderer.
+        # The scene is removed from a copy: other objects may use the same renderer.
         self.path_renderer = self.path_renderer.copy_with()
         del self.path_renderer.scene
         self.path_renderer.space = space
@@ -661,7 +663,7 @@ class LinearRenderer(Predictor):
         crop = self.path_renderer.crop
         for name, transport in self.collected.transport_by_input.items():
             color_change = inputs[name] - self.linearized_at[name]
-            change = transport(color_change)
+            change = transport(color_change)  # the product with the matrix
             if crop is not None:
                 # The matrix covers the window of the crop, the base the full image.
                 change = crop.window.pad(change, (base.shape[0], base.shape[1]))
@@ -710,7 +712,7 @@ def _collect(
     """
     # The renderer counts the values of all calls; those of this call are the increase.
     non_finite_before = renderer.n_non_finite
-    # `find_front_axis` adds which part of a photograph is in front of the object.
+    # This also replaces the depth of a photograph by what is in front of the object.
     inputs = renderer.replace_photograph_depth(
         renderer.scene.input_assembler(renderer.space.inputs(u))
     )
@@ -769,8 +771,8 @@ def _trace_matrices(
 ) -> Tensor:
     """Fill and finish empty matrices, and return the base image of the same paths.
 
-    A renderer that has a crop traces its window only, and the rest of the image is
-    pasted around it.
+    A renderer with a crop traces only the crop's window. The result is pasted into the
+    crop's image of the surroundings.
 
     Args:
         renderer: renderer of the scene.
@@ -823,8 +825,7 @@ def _append_plane_change(
     """
     if renderer.scene.plane_radiance is None:
         return base
-    has_backdrop = True
-    image = renderer.render_radiance(scene_inputs, seed, spp, has_backdrop)
+    image = renderer.render_radiance(scene_inputs, seed, spp, hide_environment=True)
     if renderer.crop is not None:
         image = renderer.crop.window.crop_image(image)
     # The first channels are radiance and coverage, which `base` has already.
@@ -842,8 +843,8 @@ def _fill_transports(
 ) -> TracedPaths:
     """Trace paths for each matrix and add them; return the mean images of all.
 
-    The paths differ only in the texture at whose vertices they collect weights, and in
-    their noise. So all of them are samples of the same image.
+    The paths of one matrix collect weights at the vertices on its texture. But for
+    that, and for the noise, all paths are the same: samples of the same image.
 
     The vertices of a pass are released when they are added, so that memory holds one
     pass at a time. `tick` is called with the samples per pixel of each pass.
@@ -851,7 +852,7 @@ def _fill_transports(
     Raises:
         TransportTooLargeError: all matrices together take more than `MAX_BYTES`.
     """
-    samples, n_passes = plan_passes(renderer, spp)
+    samples_per_pass, n_passes = plan_passes(renderer, spp)
     height, width = _get_traced_size(renderer)
     base_image_bytes = 2 * 4 * height * width  # up to four channels of 16 bits
     images: list[TracedPaths] = []
@@ -859,7 +860,7 @@ def _fill_transports(
         for index in range(n_passes):
             noise_seed = seeds.derive_seed(seed, f"transport {name}", index)
             paths = renderer.scene.collect_paths(
-                scene_inputs, name, noise_seed, samples
+                scene_inputs, name, noise_seed, samples_per_pass
             )
             transport.add_pass(paths.vertices, pass_weight=1.0 / n_passes)
             matrix_bytes = sum(filled.n_bytes for filled in transports.values())
@@ -868,7 +869,7 @@ def _fill_transports(
                     f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
                 )
             images.append(replace(paths, vertices=[]))
-            tick(samples)
+            tick(samples_per_pass)
     return average_passes(images)
 
 
@@ -884,9 +885,9 @@ def _denoise_base(
         renderer: renderer of the scene.
         radiance: (H, W, 3) base image with its noise.
         paths: images of the same paths, with the guides of the denoiser.
-        quick: whether the function multiplies by the ratio of the denoised and the
-            noisy base image, within a factor `MAX_CORRECTION` either way. Otherwise it
-            runs the denoiser, guided by the normals and by the outlines of surfaces.
+        quick: whether the function only multiplies by a ratio: the denoised base image
+            over the noisy one, from 1 / `MAX_CORRECTION` to `MAX_CORRECTION`. Otherwise
+            it runs the denoiser, guided by normals and by the outlines of surfaces.
     """
     if renderer.formation.denoiser != "oidn":
         return radiance, None
@@ -896,9 +897,9 @@ def _denoise_base(
     ratio = (clean / radiance.clamp_min(1e-12)).clamp(
         1.0 / MAX_CORRECTION, MAX_CORRECTION
     )
-    # The denoiser retains the edges of its guides. The colors of a matrix do not show
-    # the pattern of the base color, but the change by it. So the guide shows none
-    # either: it is 1 on all surfaces.
+    # The denoiser retains the edges of its guides, one of which is usually the base
+    # color. The pattern of the base color is not in the colors of a matrix. So here the
+    # guide is the same on all surfaces: 1.
     is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
     even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
 
