@@ -697,15 +697,15 @@ class GltfSurfaces:
             becomes that of the padded one, scale * t + shift.
         """
         sizes = [image.shape[axis] for image in images]
-        # Pads must have the same width in texture coordinates in all images, and an
-        # integer number of texels. So each image is divided into the same number of
-        # units, the greatest common divisor of the sizes, and pads consist of units.
-        # A unit is an integer number of texels in each image.
+        # All images have the same texture coordinates, so that their pads must be the
+        # same fraction of an image. A pad must also be an integer number of texels. So
+        # pads are measured in units: each image is divided into the same number of
+        # units, the greatest common divisor of the sizes.
         n_units = int(np.gcd.reduce(sizes))
         units_before, units_after = _count_pad_units(n_units, bounds)
         padded_units = n_units + units_before + units_after
-        largest_padded_size = padded_units * (max(sizes) // n_units)
-        if largest_padded_size > 2 * self._images.max_side:
+        max_unit_texels = max(sizes) // n_units
+        if padded_units * max_unit_texels > 2 * self._images.max_side:
             self.notes.warn_that_file(EDGES_NOTE)
             return images, 1.0, 0.0
         padded = []
@@ -724,7 +724,10 @@ class GltfSurfaces:
                     border=border,
                 )
             )
-        return padded, n_units / padded_units, units_before / padded_units
+        # The old image covers `n_units` of the padded one, after `units_before`.
+        scale = n_units / padded_units
+        shift = units_before / padded_units
+        return padded, scale, shift
 
 
 def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Array:

@@ -382,29 +382,31 @@ def make_part_from_corners(
 def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntArray:
     """Return one number for each corner, which is equal for corners with equal values.
 
-    The rows of a corner's values become the digits of the number. The base of a digit
-    is the column's number of values plus 1; the digit 0 stands for a missing value (row
-    -1).
+    A corner refers to each list of values by a row. The number is built from these
+    rows as from digits: for points and normals it is point row * base + normal row,
+    where the base is the number of rows that normals may have. Rows count from 1 here;
+    0 stands for a missing value.
 
     Args:
         triangles: (T,) indices of the triangles.
-        columns: values of the corners, such as points and normals; None is skipped.
+        *columns: values of the corners, such as points and normals; None is skipped.
 
     Returns:
         (3 T,) numbers, corner by corner.
     """
     corner_number = np.zeros(3 * len(triangles), dtype=np.int64)
     bound = 1  # all numbers are smaller than this
-    for indexed in filter(None, columns):
+    for indexed in columns:
+        if indexed is None:
+            continue
         base = len(indexed.values) + 1
-        # Replace the numbers by consecutive ones, so that the next digit does not
-        # overflow 64 bits.
-        if bound * base >= 2**63:
+        would_overflow = bound * base >= 2**63
+        if would_overflow:
+            # Equal numbers are replaced by equal smaller ones, which count from 0.
             _, corner_number = np.unique(corner_number, return_inverse=True)
             corner_number = corner_number.reshape(-1)
             bound = len(corner_number)
-        corner_number = (
-            corner_number * base + indexed.row_of_corner[triangles].reshape(-1) + 1
-        )
+        digit = indexed.row_of_corner[triangles].reshape(-1) + 1
+        corner_number = corner_number * base + digit
         bound *= base
     return corner_number

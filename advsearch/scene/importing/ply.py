@@ -228,7 +228,7 @@ class _RowReader:
             name: self._view_from_any_byte(kind)
             for name, kind in element.count_types.items()
         }
-        # A list begins with its count, and a scalar is its value.
+        # A list begins with its count. A property without counts is a scalar.
         self.widths = {
             name: self.counts.get(name, values).itemsize
             for name, values in self.values.items()
@@ -250,28 +250,34 @@ class _RowReader:
         # check that the file is long enough at least for their scalars and counts.
         self._check_end(position + self.element.count * sum(self.widths.values()))
         # Rows are first assumed to be as long as the first one, which is fast. If the
-        # lists at these positions differ in length, rows are walked one by one.
+        # rows would end beyond the file, or the lists at these positions differ in
+        # length, that is wrong, and rows are walked one by one.
         starts, end = self._find_even_rows(position)
-        lists_differ = end > len(self.cells) or any(
+        rows_differ = end > len(self.cells) or any(
             np.ptp(count_at_byte[starts[name]]) != 0
             for name, count_at_byte in self.counts.items()
         )
-        if lists_differ:
+        if rows_differ:
             starts, end = self._walk_rows(position, self.element.count)
         self._store_values(starts)
         return end
 
     def _view_from_any_byte(self, kind: np.dtype[np.generic]) -> Numbers:
-        """Return the numbers of a type that begin at each byte.
+        """View the bytes as numbers of a type, one for each byte.
 
-        No byte is copied: number i of the view is made of the bytes from i on.
+        Number i is read from byte i and those after it. So successive numbers overlap,
+        and any of them can be read, wherever it begins. No byte is copied.
+
+        Args:
+            kind: type of the numbers in a binary file. The numbers of an ASCII file are
+                stored as float64, whatever their type is.
         """
-        if self.text:  # the numbers of an ASCII file
+        is_ascii = bool(self.text)
+        if is_ascii:
             kind = np.dtype(np.float64)
-        n_starts = max(0, len(self.cells) - kind.itemsize + 1)
-        # The stride is one byte.
+        n_numbers = max(0, len(self.cells) - kind.itemsize + 1)
         numbers: Numbers = np.ndarray(
-            (n_starts,), kind, buffer=self.cells, offset=0, strides=(1,)
+            (n_numbers,), kind, buffer=self.cells, offset=0, strides=(1,)
         )
         return numbers
 
@@ -298,7 +304,8 @@ class _RowReader:
             for name, width in self.widths.items():
                 starts[name].append(byte)
                 self._check_end(byte + width)
-                if name in self.counts:
+                is_list = name in self.counts
+                if is_list:  # `width` is that of its count, which is before its values
                     length = self._read_length(name, byte)
                     byte += self.values[name].itemsize * length
                 byte += width
@@ -908,12 +915,16 @@ def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
         counts: (S,) how many vertices each strip has.
     """
     is_end_mark = vertices < 0
-    # One entry more than there are vertices, for an end mark that is the last vertex.
+    # Strips start at the beginning of each list, and after each end mark. An end mark
+    # may be the last vertex, and an empty list may be the last one: then the start is
+    # beyond the last vertex, and there is one entry more for it.
     is_strip_start = np.zeros(len(vertices) + 1, dtype=np.bool_)
-    is_strip_start[np.cumsum(counts) - counts] = True  # the first vertex of each strip
-    is_strip_start[1:][is_end_mark] = True
+    list_starts = np.cumsum(counts) - counts
+    is_strip_start[list_starts] = True
+    is_strip_start[np.flatnonzero(is_end_mark) + 1] = True
+    # (N,) for each vertex its index, the index of its strip's first vertex, and its
+    # position in the strip
     index = np.arange(len(vertices))
-    # for each vertex the index at which its strip began, and its position in the strip
     strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
     position = index - strip_start
     # Every vertex of a strip, except the first two, is the last one of a triangle.

@@ -472,12 +472,15 @@ def _find_light_unit(
 ) -> tuple[float, str]:
     """Return how many candela are one unit of radiant intensity, and a note on it.
 
-    glTF states lamps in candela and surfaces in nit (candela per square meter); a nit
-    of a surface is one unit of radiance here. Exporters write watts times `LUMENS` for
-    lamps. So if there are only lamps, `LUMENS` candela are one unit. If surfaces emit
-    light, too, lamps must have the right brightness in comparison with them. By glTF's
-    definition one candela is one unit. But Blender does not multiply surfaces by
-    `LUMENS`, so that in its files `LUMENS` candela are one unit.
+    glTF states lamps in candela, and surfaces in nit (candela per square meter). A nit
+    is one unit of radiance here. The unit of lamps depends on the file:
+
+    - Only lamps emit light: `LUMENS` candela are one unit, since exporters multiply the
+      watts of lamps by `LUMENS`.
+    - Surfaces emit light, too: one candela is one unit, as glTF defines it, so that
+      lamps have the right brightness in comparison with surfaces.
+    - The same, but Blender wrote the file: `LUMENS` candela are one unit, since it
+      multiplies lamps by `LUMENS`, but not surfaces.
 
     Args:
         header: header of the file.

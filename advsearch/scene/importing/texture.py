@@ -208,10 +208,11 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     )
     # Smallest and largest material on each texel: if they differ, it is shared. Texels
     # without a face have a largest one of -1.
+    texel = row * size + column
     first_material = np.full(size * size, len(uvs))  # more than any index
     last_material = np.full(size * size, -1)
-    np.minimum.at(first_material, row * size + column, material[face])
-    np.maximum.at(last_material, row * size + column, material[face])
+    np.minimum.at(first_material, texel, material[face])
+    np.maximum.at(last_material, texel, material[face])
     n_shared = (last_material > first_material).sum()
     return bool(n_shared > _MAX_SHARED * (last_material >= 0).sum())
 
@@ -884,11 +885,11 @@ def convert_normals(
     normal = normalize_vectors(np.einsum("tk,tkc->tc", weights, old_soup.normals[face]))
     old_tangent = _compute_tangents(old_soup, normal, face)
     new_tangent = _compute_tangents(replace(old_soup, uvs=new_uvs), normal, face)
-    # The file's bitangent points up the image. That is normal x tangent, or its
-    # opposite where UVs are mirrored.
+    # The bitangents have different definitions. In the file it points up the image, which
+    # is normal x tangent, or its opposite where UVs are mirrored. The result is for the
+    # renderer, in which it is always normal x tangent.
     mirror_sign = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
     old_bitangent = np.cross(normal, old_tangent) * mirror_sign
-    # The renderer's bitangent is always normal x tangent.
     new_bitangent = np.cross(normal, new_tangent)
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)  # decoded
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
