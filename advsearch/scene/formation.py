@@ -460,8 +460,8 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
 
     N is the number of pixels that show the object, which nothing else hides. A pixel
     has a normal of the face nearest to the camera, interpolated between its corners, in
-    world space. Normals are reversed if they point away from the camera. The image has `METERING_SIZE` pixels
-    along its longer side.
+    world space. Normals are reversed if they point away from the camera. The image has
+    `METERING_SIZE` pixels along its longer side.
     """
     camera = camera_to_world(scene)
     camera_axes = camera[:3, :3]
@@ -526,13 +526,7 @@ def _compute_unrotated_light(
     height, width = environment.radiance.shape[:2]
     rows = _find_block_starts(height, METERING_ROWS)
     columns = _find_block_starts(width, 2 * METERING_ROWS)
-    # (H + 1,) angle from straight up at the borders of the rows. The center of row r is
-    # at r * pi / (height - 1), and its borders are half a row before and after it. Half
-    # of the first and of the last row is beyond a pole, and is cut off.
-    border_rows = np.arange(height + 1) - 0.5
-    border_angle = np.clip(border_rows / (height - 1), 0.0, 1.0) * math.pi
-    # solid angle (H,) of a texel in each row
-    solid_angle = -np.diff(np.cos(border_angle)) * (2.0 * math.pi / width)
+    solid_angle = _compute_texel_solid_angles(height, width)
     # The fourth channel, of ones, becomes the solid angle.
     ones = np.ones((height, width, 1))
     padded_radiance = np.concatenate([environment.radiance, ones], axis=2)
@@ -544,6 +538,18 @@ def _compute_unrotated_light(
     block_solid_angle = sums[:, 3]
     directions = _compute_block_directions(rows, columns, (height, width))
     return directions, block_solid_angle, block_power
+
+
+def _compute_texel_solid_angles(height: int, width: int) -> Float64Array:
+    """Return the solid angle (H,) of a texel in each row of an environment map.
+
+    The center of row r is at the angle r * pi / (height - 1) from straight up, and its
+    borders are half a row before and after it. Half of the first and of the last row is
+    beyond a pole, and is cut off.
+    """
+    border_row = np.arange(height + 1) - 0.5
+    border_angle = np.clip(border_row / (height - 1), 0.0, 1.0) * math.pi
+    return np.asarray(-np.diff(np.cos(border_angle)) * (2.0 * math.pi / width))
 
 
 def _compute_block_directions(
