@@ -440,8 +440,8 @@ class CameraPreset:
 
 PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
     {
-        # Behind the windscreen of a car, in the lane of the object. Effects of the glass
-        # and the dashboard on the picture are not modeled.
+        # Behind the windscreen of a car, in the lane of the object. Effects of the
+        # glass and the dashboard on the picture are not modeled.
         "dashcam": CameraPreset(
             height=1.3,
             fov=75.0,

@@ -522,7 +522,8 @@ def _select_lens(
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ]
     if not lenses:
-        # A file without frames states its lens outside of them, and no frame adds to it.
+        # A file without frames states its lens outside of them, and no frame adds to
+        # it.
         lenses = [{}]
     first_lens: dict[str, Any] = lenses[0]
     if not camera_name and all(lens == first_lens for lens in lenses):

@@ -179,8 +179,9 @@ class CameraModel:
         radius = distorted.norm(dim=-1)
         # 0 for the center, which has no direction
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
-        # Angles are solved up to the fold, not only up to the edge of the view. So points
-        # just outside the view have a direction, too, and a margin a little below 0.
+        # Angles are solved up to the fold, not only up to the edge of the view. So
+        # points just outside the view have a direction, too, and a margin a little
+        # below 0.
         max_solved_angle = min(self.fold_angle_radians, math.pi)
         angle, converged = self._invert_radial(radius, max_solved_angle)
         directions = torch.cat(
@@ -213,8 +214,8 @@ class CameraModel:
             undistorted, converged = self._invert_distortion(
                 undistorted, distorted, max_visible
             )
-            # `_compute_edge_radius` is without decentering, and so must be the radius that
-            # is compared with it.
+            # `_compute_edge_radius` is without decentering, and so must be the radius
+            # that is compared with it.
             radius = (distorted - self._compute_decentering(undistorted)).norm(dim=-1)
         directions = torch.cat(
             [undistorted, torch.ones_like(undistorted[..., :1])], dim=-1
@@ -321,8 +322,8 @@ class CameraModel:
             max_radius: largest radius of a solution; finite.
 
         Returns:
-            The solutions (N, 2); and which of them have converged, (N,). Solutions beyond
-        the fold of the lens, or outside of the circle, do not count.
+            The solutions (N, 2); and which of them have converged, (N,). Solutions
+            beyond the fold of the lens, or outside of the circle, do not count.
         """
         converged = torch.zeros_like(undistorted[..., 0], dtype=torch.bool)
         for _ in range(MAX_STEPS_2D):
@@ -415,8 +416,8 @@ class CameraModel:
         """Return the shifts (N, 2) of undistorted points that are not radial.
 
         They are the tangential distortion (p1 and p2: the lens stands off the axis) and
-        that of a thin prism (s1 to s4), in focal lengths. The formulas are at the top of
-        this module.
+        that of a thin prism (s1 to s4), in focal lengths. The formulas are at the top
+        of this module.
         """
         # the last six of `NUMBER_NAMES`
         p1, p2, s1, s2, s3, s4 = self.intrinsics[NUMBER_NAMES.index("p1") :]
@@ -693,8 +694,8 @@ def _clip_margin(margin: Tensor, converged: Tensor) -> Tensor:
         margin: (N,) focal lengths from each point to the edge of the view, positive
             inside the view.
         converged: (N,) whether the inversion of the distortion has found a ray. If not,
-            a positive margin is replaced by a tiny negative one. A negative margin stays
-            as it is, so that margins pass continuously through zero at the edge.
+            a positive margin is replaced by a tiny negative one. A negative margin
+            stays as it is, so that margins pass continuously through zero at the edge.
     """
     is_valid = converged | (margin <= 0.0)
     just_outside = torch.full_like(margin, -1e-6)

@@ -220,8 +220,9 @@ OMISSIONS: Mapping[str, str] = {
 Each step can be put back by its name. None of them changes the result: images and
 gradients agree to within their noise with and without it, and to within rounding if the
 random numbers are the same; `advsearch check` verifies that for a scene. Omitting
-bounces of light is different (`engine.gradients.planning`), since it has a bias. So only
-the search does it, within a measured bound, and the verification renders all bounces.
+bounces of light is different (`engine.gradients.planning`), since it has a bias. So
+only the search does it, within a measured bound, and the verification renders all
+bounces.
 """
 
 ALL_OMISSIONS = frozenset(OMISSIONS)
@@ -232,11 +233,11 @@ NO_OMISSIONS: frozenset[str] = frozenset()
 # ----------------------------------------------------------------------------------
 # Exposure: an incident-light meter at the visible surface of the object.
 #
-# The irradiance of every visible piece of the object's surface is computed, and averaged
-# over the image. It has light from the environment, from the ground plane (which the
-# environment lights), from lamps, and from surroundings that emit light. The material
-# of the object is ignored, so that a black object stays black. So are shadows, which
-# would need a render.
+# The irradiance of every visible piece of the object's surface is computed, and
+# averaged over the image. It has light from the environment, from the ground plane
+# (which the environment lights), from lamps, and from surroundings that emit light. The
+# material of the object is ignored, so that a black object stays black. So are shadows,
+# which would need a render.
 #
 # Camera, pose and rotation of the environment have their default values while the
 # exposure is metered. So a configuration has the same exposure whether its camera is a
@@ -418,8 +419,8 @@ def _compute_emitted_light(
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
     mean_radiance = look_up_texture(emission, column, row).mean(axis=1)
-    # The direction points to the face, so that a face turned to the point has a negative
-    # product. The back of a face emits nothing.
+    # The direction points to the face, so that a face turned to the point has a
+    # negative product. The back of a face emits nothing.
     projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
     # the form factor of a disk: area / (distance^2 + area / pi)
     disk_divisor = squared_distance + np.linalg.norm(area, axis=1) / math.pi
@@ -477,7 +478,8 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     # as the camera's coordinates do. That changes no normal. The frame is symmetric, so
     # that the image begins at the same tangents in these directions.
     from_first_corner = tangents - (frame.left, frame.low)
-    # The raster's coordinates are 0 at the center of its first pixel, not at the border.
+    # The raster's coordinates are 0 at the center of its first pixel, not at the
+    # border.
     pixel_coordinates = from_first_corner / pixel_width - 0.5
     face, row, column, weights = rasterize_triangles(pixel_coordinates, shape)
     # 1 / depth, unlike depth, may be interpolated linearly over the image
@@ -596,11 +598,12 @@ def _find_block_starts(size: int, count: int) -> IntArray:
 # Times at which the rows of an image are exposed: an open shutter (motion blur), and
 # rows that are read one after the other (rolling shutter).
 #
-# Each row is exposed for `shutter` seconds. Rows are read within `rolling` seconds, from
-# the top, or from the bottom if `rolling` is negative. The middle of the image's
-# exposure is the time of the configuration. A sensor adds up light, so a row is the mean
-# of linear radiance over its exposure, before the denoiser and the tone curve. The mean
-# is taken over moments, evenly spaced, of which each row has those in its own exposure.
+# Each row is exposed for `shutter` seconds. Rows are read within `rolling` seconds,
+# from the top, or from the bottom if `rolling` is negative. The middle of the image's
+# exposure is the time of the configuration. A sensor adds up light, so a row is the
+# mean of linear radiance over its exposure, before the denoiser and the tone curve. The
+# mean is taken over moments, evenly spaced, of which each row has those in its own
+# exposure.
 
 MIN_MOMENTS = 8
 MAX_MOMENTS = 64

@@ -164,8 +164,8 @@ def compute_framing_distance(
     axes = torch.from_numpy(compute_camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
     (half_width, half_height) = edge_tangents * FRAME_FILL
-    # A camera at the distance d sees a vertex at the tangent left / (d - outwards). That
-    # is at most half_width if d >= outwards + left / half_width.
+    # A camera at the distance d sees a vertex at the tangent left / (d - outwards).
+    # That is at most half_width if d >= outwards + left / half_width.
     from_default_view = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
@@ -403,8 +403,8 @@ def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
     """Return a part of a scene in the pose that the settings and the camera define.
 
     A mesh gets the pose and the material of its settings. A lamp with a beam gets its
-    pose from its carrier, which is a mesh, or the car of a camera that is mounted on
-    one. Other parts are returned as they are.
+    pose from its carrier: a mesh, or the car on which the camera is mounted. Other
+    parts are returned as they are.
     """
     if not isinstance(part, BeamLamp):
         # `scene.meshes` has the settings applied. Only meshes are in it.
@@ -482,9 +482,9 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
 
     This is Rodrigues' formula, R = 1 + sin(a) / a K + (1 - cos(a)) / a^2 K^2, where K
     is the matrix of the cross product with the vector. Near a = 0, where the quotients
-    are NaN, they are replaced by series, so that value and derivative are right.
-    `torch.where` passes on the NaN derivative of the branch that it does not take: in
-    that branch the angle is 1 instead.
+    are NaN, they are replaced by series, so that value and derivative are right. The
+    derivative of `torch.where` would be NaN even if only the branch that is not taken
+    is NaN. So the quotients are computed with an angle of 1 there.
     """
     vector = degrees * (math.pi / 180.0)
     squared_angle = vector.square().sum()
@@ -576,8 +576,8 @@ def find_overlap_interval(
     # positions (corners, k) of the corners along each normal
     first_positions = first.outline @ normals.T
     second_positions = second.outline @ normals.T
-    # (k,) how far the first has to move along each normal until its projection begins to
-    # overlap that of the second, and until it no longer overlaps
+    # (k,) how far the first has to move along each normal until its projection begins
+    # to overlap that of the second, and until it no longer overlaps
     distance_to_begin = second_positions.min(axis=0) - first_positions.max(axis=0)
     distance_to_end = second_positions.max(axis=0) - first_positions.min(axis=0)
     # (k,) how far a shift of 1 moves the first along each normal

@@ -299,7 +299,8 @@ class Person:
             )
             lowest_heights[side] = shoe_points[:, 2].amin()
             contacts[side] = compute_contact(number_by_name["walk"] + phase_shift)
-        # A small stride, with which a person almost stands, has a part of the correction.
+        # A small stride, with which a person almost stands, has a part of the
+        # correction.
         fraction = (number_by_name["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
         return _compute_rises(lowest_heights, contacts, fraction)
 
@@ -426,8 +427,8 @@ class Person:
             The points, and the joints in the order of bones.
         """
         device = mixture.device
-        # A body is the mean body plus R displacements of all points, each times a factor.
-        # Each extreme body has its R factors, "shares".
+        # A body is the mean body plus R displacements of all points, each times a
+        # factor. Each extreme body has its R factors, "shares".
         shape_factors = torch.einsum(
             "gawh,gawhr->r", mixture, self._get_tensor("shares", device)
         )
@@ -607,8 +608,9 @@ def compute_contact(phase: Tensor) -> Tensor:
     `LOWERED`, and stands again at 360.
     """
     degrees = torch.remainder(phase, 360.0)
-    # `lifted` rises from 0 to 1 while the foot is lifted, `lowered` while it is lowered.
-    # Contact depends on their difference: 0 in stance, 1 in the swing, 0 at 360.
+    # `lifted` rises from 0 to 1 while the foot is lifted, `lowered` while it is
+    # lowered. Contact depends on their difference: 0 in stance, 1 in the swing, 0 at
+    # 360.
     lifted = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
     lowered = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
     return 0.5 + 0.5 * torch.cos(np.pi * (lifted - lowered))

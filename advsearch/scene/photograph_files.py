@@ -1,8 +1,8 @@
 """Photographs with a camera file beside them, and folders of such photographs.
 
 ``desk.yaml`` beside ``desk.jpg`` is a camera file in any supported format. It may have
-further entries (`VIEW_KEYS`): the pose of the object, the part of the photograph to use,
-settings of the scene, and a mask of what is in front of the object.
+further entries (`VIEW_KEYS`): the pose of the object, the part of the photograph to
+use, settings of the scene, and a mask of what is in front of the object.
 """
 
 from __future__ import annotations

@@ -89,12 +89,12 @@ class PhotographedGround:
             [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
             axis=-1,
         )
-        # Rows of the map are counted at their centers: row 0 is straight up, and the last
-        # one straight down.
+        # Rows of the map are counted at their centers: row 0 is straight up, and the
+        # last one straight down.
         angle_from_up = math.pi - np.arctan(radius)
         map_row = angle_from_up / math.pi * (self._map_rows - 1)
-        # Row 0 of the texture is `_horizon_row` of the map. v is 1 at the upper border of
-        # row 0, half a row above its center.
+        # Row 0 of the texture is `_horizon_row` of the map. v is 1 at the upper border
+        # of row 0, half a row above its center.
         texture_row = map_row - self._horizon_row
         n_texture_rows = self._map_rows - self._horizon_row
         v = 1.0 - (texture_row + 0.5) / n_texture_rows

@@ -128,8 +128,8 @@ def _find_touched_cells(
         shape: height and width of the texture.
     """
     height, width = shape
-    # Cell i covers the texel coordinates i - 1 to i. After adding 1 it covers i to i + 1,
-    # so that a point's cell is its coordinate rounded down.
+    # Cell i covers the texel coordinates i - 1 to i. After adding 1 it covers i to i +
+    # 1, so that a point's cell is its coordinate rounded down.
     cell_corners = corners + 1.0
     # (F,) first and last row of cells that each triangle touches
     first_row = np.floor(cell_corners[..., 1].min(axis=1) - PIXEL_TOLERANCE)
@@ -333,7 +333,8 @@ class Charts:
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         texel_corners = _to_texel_coordinates(self.mesh, self.is_covered.shape)
-        # Both are twice an area, on the surface and in texels. Only their ratio is used.
+        # Both are twice an area, on the surface and in texels. Only their ratio is
+        # used.
         doubled_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
         doubled_texels = np.abs(compute_doubled_areas(texel_corners))
         area_per_texel = np.where(
@@ -423,8 +424,8 @@ def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64
     for next_corner, previous_corner in ((1, 2), (2, 0), (0, 1)):
         a = corners[:, next_corner] - points
         b = corners[:, previous_corner] - points
-        # twice the signed area between the point and the side opposite of the corner, as
-        # a fraction of the triangle's, which has the same sign for points inside
+        # twice the signed area between the point and the side opposite of the corner,
+        # as a fraction of the triangle's, which has the same sign for points inside
         corner_weights.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / divisor)
     weights = np.maximum(np.stack(corner_weights, axis=1), 0.0)
     total = weights.sum(axis=1, keepdims=True)
@@ -579,7 +580,8 @@ class MeshSurface:
         Returns:
             (F,) bool.
         """
-        # offset from the point to each face's bounding box, 0 along axes where they overlap
+        # offset from the point to each face's bounding box, 0 along axes where they
+        # overlap
         box_gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
         is_near = np.linalg.norm(box_gap, axis=1) <= radius
         is_inside = is_near & (self.normals @ normal > 0.0)

@@ -250,8 +250,8 @@ class SkeletonRig:
         """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
         angles = {f"{name}.{axis}": 0.0 for name in self.node_of_joint for axis in AXES}
-        # If targets have the same name, the weight of the first is used: it is written
-        # last.
+        # If targets have the same name, the weight of the first is used. In the
+        # reversed order it comes last, and replaces the others.
         weights = {
             f"{target.name}.{WEIGHT}": target.rest_weight
             for target in reversed(self._targets)
@@ -535,28 +535,45 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
     is_rotation = track.path == "rotation"
     # the first key after the time; 0 or the number of keys outside of the track
     end_key = int(torch.searchsorted(times, seconds.detach(), right=True))
-    if track.interpolation == "STEP" or not 0 < end_key < len(times):
+    is_between_keys = 0 < end_key < len(times)
+    if track.interpolation == "STEP" or not is_between_keys:
         value = keys[max(0, end_key - 1), value_index]
         return value / value.norm() if is_rotation else value
     start_key = end_key - 1
     span = times[end_key] - times[start_key]
     fraction = (seconds - times[start_key]) / span
+    if track.interpolation == "CUBICSPLINE":
+        spline = _interpolate_spline(keys[start_key], keys[end_key], fraction, span)
+        return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
     start_value = keys[start_key, value_index]
     end_value = keys[end_key, value_index]
-    if track.interpolation == "CUBICSPLINE":
-        square = fraction**2
-        cube = fraction**3
-        # Tangents are per second: the span in seconds makes them per interval.
-        spline = (
-            (2.0 * cube - 3.0 * square + 1.0) * start_value
-            + span * (cube - 2.0 * square + fraction) * keys[start_key, 2]
-            + (3.0 * square - 2.0 * cube) * end_value
-            + span * (cube - square) * keys[end_key, 0]
-        )
-        return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
     if is_rotation:
         return slerp(start_value, end_value, fraction)
     return start_value + fraction * (end_value - start_value)
+
+
+def _interpolate_spline(
+    start_key: Tensor, end_key: Tensor, fraction: Tensor, span: Tensor
+) -> Tensor:
+    """Return the value (W,) of a cubic Hermite spline between two keys.
+
+    Args:
+        start_key: (3, W) of the first key the tangent before it, its value, and the
+            tangent after it. Tangents are per second.
+        end_key: (3, W) the same of the second key.
+        fraction: () 0 at the first key and 1 at the second.
+        span: () seconds between the keys.
+    """
+    _, start_value, tangent_after_start = start_key
+    tangent_before_end, end_value, _ = end_key
+    square = fraction**2
+    cube = fraction**3
+    return (
+        (2.0 * cube - 3.0 * square + 1.0) * start_value
+        + span * (cube - 2.0 * square + fraction) * tangent_after_start
+        + (3.0 * square - 2.0 * cube) * end_value
+        + span * (cube - square) * tangent_before_end
+    )
 
 
 def slerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:

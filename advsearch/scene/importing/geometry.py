@@ -93,10 +93,13 @@ class TriangleSoup:
 def compute_rotation(up: str, front: str) -> Float64Array:
     """Return the rotation (3, 3) from a file's axes to ours (front +x, up +z).
 
-    `up` is "y" or "z", `front` one of `FRONT_AXES` along another axis.
+    Args:
+        up: "y" or "z".
+        front: one of `FRONT_AXES`, such as "-y", but not along `up`.
     """
-    front_axis = np.eye(3)["xyz".index(front[1])]
-    front_axis = front_axis * (-1.0 if front[0] == "-" else 1.0)
+    sign, letter = front
+    front_axis = np.eye(3)["xyz".index(letter)]
+    front_axis = front_axis * (-1.0 if sign == "-" else 1.0)
     up_axis = np.eye(3)["xyz".index(up)]
     side_axis = np.cross(up_axis, front_axis)
     # Adding 0 turns -0.0 into 0.0.
@@ -255,12 +258,13 @@ def list_used_vertices(parts: Sequence[ImportedPart]) -> list[Float64Array]:
 def compute_extent(parts: Sequence[ImportedPart]) -> float:
     """Return the largest extent of all faces along an axis, in the file's unit.
 
-    It is infinite if it is too large for float64. Halves are subtracted, so that the
-    difference itself does not overflow.
+    It is infinite if it is too large for float64.
     """
     used_vertices = list_used_vertices(parts)
     lower = np.min([points.min(axis=0) for points in used_vertices], axis=0)
     upper = np.max([points.max(axis=0) for points in used_vertices], axis=0)
+    # Halves are subtracted, since numpy would warn about a difference that overflows.
+    # Python's multiplication yields infinity without a warning.
     return float((upper / 2 - lower / 2).max()) * 2
 
 
@@ -295,9 +299,10 @@ def repair_soup(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
 def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     """Return the soup as a mesh, and the stored vertex of each of its vertices.
 
-    Corners become one vertex if they have the same point, normal and UV, and also the
-    same stored vertex, where that is known. The stored vertex is the index of the
-    vertex in the file's concatenated parts; without it the second value is None.
+    The stored vertex of a corner is the index of its vertex in the file's concatenated
+    parts. It is known if `soup.stored_vertices` is not None; otherwise the second value
+    is None. Corners become one vertex of the mesh if they have the same point, normal
+    and UV, and also the same stored vertex if that is known.
     """
     # Adding 0 turns -0.0 into 0.0, which has other bits.
     normals = (soup.normals.astype(np.float32) + np.float32(0.0)).reshape(-1, 3)
@@ -561,7 +566,8 @@ def _compute_normal_agreement(
 ) -> Float64Array:
     """Return how far the file's normals agree with the faces of each shell, (S,).
 
-    It is positive if normals are on the fronts of faces, and 0 without normals.
+    It is a sum of cosines weighted by area: positive if most normals are on the fronts
+    of faces, negative if most are on the backs, and 0 without normals.
 
     Args:
         soup: the faces.
@@ -652,8 +658,9 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     """Compute unit normals of corners (F, 3, 3), smooth except across creases.
 
     At each point, faces share one normal if they are connected by edges whose angle is
-    below the crease angle. It is the mean of their normals, weighted by their angles at
-    that point (Thuermer and Wuethrich 1998).
+    below the crease angle. It is the mean of the faces' normals. Each is weighted by
+    the angle between the two sides of the face that meet at the point (Thuermer and
+    Wuethrich 1998).
     """
     face_normals = normalize_vectors(soup.compute_area_vectors())
     smoothing_group = _find_smoothing_groups(soup, face_normals)
@@ -666,10 +673,10 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
         axis=1,
     )
     smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
-    # The face's own normal where the mean is not on its front. False also for NaN,
-    # where normals cancel.
-    is_valid = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
-    return np.where(is_valid, smooth_normals, face_normals[:, None])
+    # A mean that is not on the front of a face is replaced by the face's normal. So is
+    # a mean of NaN, where normals cancel.
+    cosine = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True)
+    return np.where(cosine > 0.0, smooth_normals, face_normals[:, None])
 
 
 def _find_smoothing_groups(soup: TriangleSoup, face_normals: Float64Array) -> IntArray:
@@ -884,7 +891,8 @@ def _project_to_planes(corners: Float64Array) -> Float64Array:
     corners = corners / np.maximum(sizes, 1e-300)  # never by 0
     normal = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    # the axis that is the least parallel to the normal
+    # The axis that is the least parallel to the normal has the most accurate cross
+    # product with it.
     other_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
     x_axis = np.cross(other_axis, normal)
     x_axis /= np.maximum(np.linalg.norm(x_axis, axis=1, keepdims=True), 1e-300)
@@ -1031,6 +1039,7 @@ def _cut_ears(flat: Float64Array, budget: int) -> tuple[IntArray, int, int]:
     cutter = _EarCutter(flat)
     while len(cutter.active):
         cutter.step(budget)
+    # Corners are scaled to about 1, so that an area is compared with that of a square.
     is_wrong = cutter.is_failed & (cutter.area > _MIN_AREA_FRACTION)
     return cutter.triangles, int(is_wrong.sum()), cutter.n_compared
 

@@ -1,7 +1,7 @@
 """Reader of Wavefront OBJ files.
 
-Statements with numbers (``v``, ``vt``, ``vn``, ``f``) are parsed as arrays, since a file
-may have millions of lines. All other statements are parsed line by line.
+Statements with numbers (``v``, ``vt``, ``vn``, ``f``) are parsed as arrays, since a
+file may have millions of lines. All other statements are parsed line by line.
 """
 
 from __future__ import annotations
@@ -551,8 +551,8 @@ _CONTINUATION = re.compile(rb"\\[ \t]*\n")
 _CONTINUED_COMMENT = re.compile(rb"^([ \t]*#[^\n]*?)\\[ \t]*\n", re.MULTILINE)
 _CORNER = re.compile(r"[-+]?\d+(?:/(?:[-+]?\d+)?){0,2}")
 _NEWLINE, _HASH, _SLASH = b"\n#/"
-# (256,) bool tables over all bytes: whether a byte is blank, and whether it may occur in
-# the corners of faces.
+# (256,) bool tables over all bytes: whether a byte is blank, and whether it may occur
+# in the corners of faces.
 _IS_BLANK, _IS_IN_CORNERS = (
     np.isin(np.arange(256), np.frombuffer(characters, np.uint8))
     for characters in (b" \t\n\v\f", b"+-/0123456789 \t\n\v\f")
@@ -862,8 +862,8 @@ def _normalize_lines(data: bytes) -> bytes:
         data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         + b"\n"
     )
-    # A backslash at the end of a line joins it with the next one, but not if the line is
-    # a comment. So backslashes at the end of comments are removed first.
+    # A backslash at the end of a line joins it with the next one, but not if the line
+    # is a comment. So backslashes at the end of comments are removed first.
     if _CONTINUATION.search(text):
         without_continued_comments = _CONTINUED_COMMENT.sub(rb"\1\n", text)
         text = _CONTINUATION.sub(b" ", without_continued_comments)
@@ -907,8 +907,8 @@ def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntAr
     column = n_slashes.copy()
     # slashes before the previous number, if it is in the same corner
     column[1:] += np.where(is_first[1:], 0, n_slashes[:-1])
-    # slashes before the number before that, if it is in the same corner: a number is the
-    # second of its corner if the previous one is the first
+    # slashes before the number before that, if it is in the same corner: a number is
+    # the second of its corner if the previous one is the first
     is_second = is_first[1:-1]
     column[2:] += np.where(is_first[2:] | is_second, 0, n_slashes[:-2])
     return np.asarray(column)
