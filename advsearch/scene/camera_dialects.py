@@ -206,10 +206,11 @@ def translate_entries(
     stella_camera = data.get("Camera")
     if isinstance(stella_camera, dict) and "model" in stella_camera:
         return _translate_stella(stella_camera)
-    if "ppx" in data:
+    if "ppx" in data:  # RealSense's name of cx
         return _translate_realsense(data)
-    has_projection = data.get("projection") in METASHAPE_KINDS
-    if has_projection or ("projection" in data and "f" in data):
+    # A projection that is not supported is Metashape's, too, if there is an f.
+    has_known_projection = data.get("projection") in METASHAPE_KINDS
+    if has_known_projection or ("projection" in data and "f" in data):
         return _translate_metashape(path, data)
     return None
 
@@ -238,7 +239,7 @@ def _translate_orbslam(
     """Translate a camera of ORB-SLAM, whose entries are `Camera.fx` or `Camera1.fx`.
 
     Entries of other cameras, and those that are not about the lens, are left out.
-    Entries of no camera keep their names.
+    Names without a camera before a dot stay as they are.
 
     Args:
         path: the file, for messages.
@@ -276,11 +277,11 @@ def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
     """
     cameras = dict[str, str]()
     for name, value in data.items():
-        # KITTI separates numbers by blanks, which YAML reads as a string. A list is of
-        # another tool: P1 may be of a stereo pair of OpenCV.
+        # KITTI separates numbers by blanks, which YAML reads as a string. A list was
+        # written by another tool: OpenCV, for example, names a matrix P1, too.
         if not isinstance(value, str):
             continue
-        if KITTI_PROJECTION.fullmatch(name):
+        if KITTI_PROJECTION.fullmatch(name):  # "P2" is the camera and its matrix
             cameras[name] = name
             continue
         match = KITTI_RAW.fullmatch(name) or KITTI_RECTIFIED.fullmatch(name)
@@ -333,9 +334,10 @@ def _translate_kitti(
     }
     raw_match = KITTI_RAW.fullmatch(matrix_name)
     if raw_match:
+        camera_number = raw_match[1]
         entries["camera_matrix"] = _read_numbers(path, data, matrix_name, 9)
         entries["distortion_coefficients"] = _read_numbers(
-            path, data, f"D_{raw_match[1]}", 5
+            path, data, f"D_{camera_number}", 5
         )
     else:
         # The projection (3, 4) is K [R | t]. A rectified camera has R = 1, so that the
@@ -362,14 +364,15 @@ def _translate_kitti(
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate the intrinsics of RealSense.
 
-    Its inverse and its modified Brown-Conrady model are not supported. If all their
-    coefficients are 0 they are the same as a pinhole, and are translated to "none".
+    Its models "inverse Brown-Conrady" and "modified Brown-Conrady" are not supported
+    and keep their names, which the reader rejects. But if all coefficients are 0, both
+    are the same as a pinhole, and are translated to "none".
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
     # "distortion.brown_conrady" and "Brown Conrady" become "brown_conrady".
     stated_model = str(data.get("model", "none"))
-    last_word = stated_model.rpartition(".")[2].strip().lower()
-    model = re.sub(r"[-\s]+", "_", last_word)
+    model_name = stated_model.rpartition(".")[2].strip().lower()
+    model = re.sub(r"[-\s]+", "_", model_name)
     coefficients = data.get("coeffs")
     is_undistorted = isinstance(coefficients, list) and not any(coefficients)
     if model in ("kannala_brandt4", "kannala_brandt"):
@@ -446,7 +449,8 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """Translate a camera of Agisoft Metashape (manual, appendix "Camera models").
 
     Metashape's p1 is OpenCV's p2, and vice versa. k4 is the fourth coefficient of the
-    radial polynomial. OpenCV has such a term only for a fisheye.
+    radial polynomial. OpenCV has such a term only for a fisheye. Other coefficients,
+    such as k1 to k3, have the same meaning, and stay as they are.
 
     Args:
         path: the file, for messages.
@@ -468,6 +472,7 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
         for name, entry in data.items()
         if name not in (*value_by_name, "projection", "width", "height")
     }
+    # A type that is not supported keeps its name, and is rejected later.
     kind = METASHAPE_KINDS.get(stated_type, stated_type)
     entries |= {"distortion_model": kind, "image_width": width, "image_height": height}
     if kind == "equirectangular":

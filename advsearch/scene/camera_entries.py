@@ -65,14 +65,15 @@ class CameraEntries:
     """
 
     def __init__(self, path: str, values: Mapping[str, Any]) -> None:
-        """Store the entries by plain names.
+        """Store the entries by their keys as `normalize_key` writes them.
 
-        Raises FileFormatError if two entries have the same plain name.
+        Raises FileFormatError if two entries have the same normalized key.
         """
         self.path = path
         self._keys: TrackedKeys[Any] = TrackedKeys(values, fold=normalize_key)
         if self._keys.repeated:
             key = self._keys.repeated[0]
+            # the spelling of the last entry with the same normalized key
             later_key = self._keys.get_spelling(normalize_key(key))
             raise FileFormatError(
                 f"{path}: has {format_name(key)} and {format_name(later_key)}; leave "
@@ -86,7 +87,12 @@ class CameraEntries:
         return self._keys.get(*names)
 
     def require(self, name: str, aliases: Sequence[str] = ()) -> Any:
-        """Return an entry that is required, or the first of several names for it.
+        """Return the value of an entry that is required.
+
+        Args:
+            name: name of the entry.
+            aliases: the normalized names that the entry may have, of which the first
+                with a value is used; by default only that of `name`.
 
         Raises:
             FileFormatError: there is none.
@@ -106,8 +112,8 @@ class CameraEntries:
         Args:
             name: name of the entry.
             default: value if there is no such entry; None if the entry is required.
-            aliases: other names for the entry, as `normalize_key` writes them; by
-                default the entry has one name.
+            aliases: the normalized names that the entry may have, of which the first
+                with a value is used; by default only that of `name`.
 
         Raises:
             FileFormatError: it is no number, or is required and missing.
@@ -166,7 +172,9 @@ class CameraEntries:
             value = self._keys.peek(name)
             if not self._is_image_changing_entry(name, value):
                 unread.append(prefix + spelling)
-            elif not has_no_effect(value):
+                continue
+            is_neutral = has_no_effect(value)
+            if not is_neutral:
                 raise FileFormatError(
                     f"{self.path}: expected no {format_name(prefix + spelling)}, got "
                     f"{format_name(str(value))}: it changes the picture and is not "
@@ -175,15 +183,15 @@ class CameraEntries:
         return unread
 
     def _is_image_changing_entry(self, name: str, value: object) -> bool:
-        """Return whether an entry belongs to those that change the image when read.
+        """Return whether an entry describes the image of this camera.
 
-        Entries about rectified images do not, nor do those of the second camera of a
-        stereo pair: M2 if there is an M1.
+        Entries about rectified images do not. Nor do entries of the second camera of a
+        stereo pair, such as the matrix M2 if there is an M1. (But k2 with a single
+        number is the second distortion coefficient of the first camera.)
 
         Args:
-            name: plain name of the entry.
-            value: its value. A single number k2 is a coefficient of the same camera as
-                k1; a list or a matrix k2 is of the second camera.
+            name: normalized key of the entry.
+            value: its value.
         """
         if not IMAGE_CHANGING_KEYS.fullmatch(name):
             return False
@@ -229,7 +237,8 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
 def has_no_effect(value: object) -> bool:
     """Return whether an entry changes nothing: it is missing, 0, "", false or "none".
 
-    A matrix, a list or a mapping is neutral if all of its values are.
+    A number may also be a string, such as "0.0". A matrix, a list or a mapping changes
+    nothing if all of its values change nothing.
     """
     if isinstance(value, Mapping):
         all_values = list(value.values())
@@ -346,7 +355,12 @@ def make_camera_model(
     numbers = tuple(
         number / unit_by_name.get(name, 1.0) for name, number in value_by_name.items()
     )
-    return CameraModel(kind, numbers, spec, (int(height), int(width)))
+    return CameraModel(
+        kind=kind,
+        intrinsics=numbers,
+        name=spec,
+        calibrated_shape=(int(height), int(width)),
+    )
 
 
 def _check_numbers(
@@ -426,8 +440,8 @@ class CameraPreset:
 
 PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
     {
-        # Behind the windscreen of a car, in the lane of the object. Effects of the glass
-        # and the dashboard on the picture are not modeled.
+        # Behind the windscreen of a car, in the lane of the object. Effects of the
+        # glass and the dashboard on the picture are not modeled.
         "dashcam": CameraPreset(
             height=1.3,
             fov=75.0,

@@ -461,9 +461,12 @@ def _read_projection(path: str, entries: CameraEntries) -> str:
             f"got {format_name(name)}, which is another projection; calibrate with one "
             "of these"
         )
-    if entries.get("isfisheye"):
+    if entries.get("isfisheye"):  # whatever the name is
         return FISHEYE
-    return COLMAP_MODELS[name][0] if name in COLMAP_MODELS else BROWN_CONRADY
+    if name == "PERSPECTIVE":
+        return BROWN_CONRADY
+    kind, _ = COLMAP_MODELS[name]
+    return kind
 
 
 def _read_focal_lengths(
@@ -519,7 +522,9 @@ def _select_lens(
         {key: frame[key] for key in frame if key in LENS_KEYS} for frame in frames
     ]
     if not lenses:
-        lenses = [{}]  # the entries outside of the frames describe the full lens
+        # A file without frames states its lens outside of them, and no frame adds to
+        # it.
+        lenses = [{}]
     first_lens: dict[str, Any] = lenses[0]
     if not camera_name and all(lens == first_lens for lens in lenses):
         return first_lens
@@ -604,7 +609,8 @@ def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
     unread_roi_keys = _check_roi(entries, (height, width))
     numbers = _read_opencv_distortion(entries, kind) | _name_matrix_entries(matrix)
     y_binning, x_binning = _read_binning(entries)
-    # Pixels that fill no bin are cut off; the model is in fractions of the rest.
+    # Pixels at the end that fill no bin are cut off. The model stores lengths as
+    # fractions of the size without them.
     used_size = (height - height % y_binning, width - width % x_binning)
     model = make_camera_model(spec, kind, used_size, numbers, FIRST_PIXEL_CENTER)
     binned_size = (int(height // y_binning), int(width // x_binning))
@@ -616,17 +622,20 @@ def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
 def _find_opencv_kind(path: str, entries: CameraEntries) -> str:
     """Return the kind of model that a camera of OpenCV or ROS states.
 
-    Without an entry that states it, it is Brown's and Conrady's. The flag
-    `fisheye_model` of OpenCV overrides the other entries.
+    Without an entry that states it, it is Brown's and Conrady's. If OpenCV's flag
+    `fisheye_model` is set, the camera is a fisheye, whatever the other entries state.
+    These must agree with each other all the same.
 
     Raises FileFormatError: two entries contradict each other, or the model is not
     supported.
     """
+    # `entries` has keys in lower case, without underscores.
     keys = ("distortionmodel", "cameramodel", "modeltype")
     models = [entries.get(key) for key in keys]
     kinds = {_find_kind(path, model) for model in models if model is not None}
     is_fisheye = not has_no_effect(entries.get("fisheyemodel"))
-    if len(kinds) > 1:
+    are_contradictory = len(kinds) > 1
+    if are_contradictory:
         raise FileFormatError(
             f"{path}: expected one model, got a camera_model that contradicts the "
             "distortion_model"
@@ -656,9 +665,11 @@ def _read_camera_matrix(path: str, entries: CameraEntries) -> list[float]:
             "which ROS writes for a camera that is not calibrated; calibrate it, and "
             "use the file that this writes"
         )
-    # Open3D and ARKit write the matrix by columns: cx and cy are in the last row, where
-    # a camera matrix has zeros, and zeros are where it has the skew, cx and cy.
-    is_by_columns = not any(matrix[index] for index in (1, 2, 5)) and any(matrix[6:8])
+    # A camera matrix is fx, skew, cx, 0, fy, cy, 0, 0, 1. Open3D and ARKit write it by
+    # columns: fx, 0, 0, skew, fy, 0, cx, cy, 1.
+    lacks_center_in_rows = not (matrix[1] or matrix[2] or matrix[5])
+    has_center_in_last_row = bool(matrix[6] or matrix[7])
+    is_by_columns = lacks_center_in_rows and has_center_in_last_row
     if is_by_columns:
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
@@ -690,8 +701,8 @@ def _read_distortion(
             the model is "none".
     """
     distortion = entries.get(*DISTORTION_KEYS)
-    # A list of zeros leaves the coefficients to single entries; a matrix (a mapping)
-    # does not.
+    # If the list is missing or all zeros, the coefficients are single entries, such as
+    # k1. An OpenCV matrix, which is a mapping, is always used.
     has_list = isinstance(distortion, Mapping) or not has_no_effect(distortion)
     if not has_list:
         coefficients = _read_optional_numbers(entries, names)
@@ -787,7 +798,8 @@ def _check_roi(entries: CameraEntries, size: tuple[float, float]) -> list[str]:
     roi.get("dorectify")  # marks it as read: it changes nothing in a full image
     offset = (numbers["x_offset"], numbers["y_offset"])
     roi_size = (numbers["height"], numbers["width"])
-    if offset != (0.0, 0.0) or roi_size not in ((0.0, 0.0), size):
+    is_full_image = offset == (0.0, 0.0) and roi_size in ((0.0, 0.0), size)
+    if not is_full_image:
         raise FileFormatError(
             f"{entries.path}: expected a camera_info of full pictures, got one of a "
             "part (roi); set it to 0"
@@ -798,10 +810,11 @@ def _check_roi(entries: CameraEntries, size: tuple[float, float]) -> list[str]:
 def _find_kind(path: str, model: object) -> str:
     """Return the kind of a distortion model by the name that a tool gives it."""
     name = re.sub(r"[-\s]", "_", str(model or "").strip().lower())
-    if name == "pinhole":  # its distortion is Brown's and Conrady's, or none
+    # A pinhole may have Brown's and Conrady's distortion.
+    if name == "pinhole":
         return BROWN_CONRADY
     if name not in KIND_OF_DISTORTION:
-        # "" is among the names, for a model that is not stated.
+        # The name "", of a model that is not stated, is left out of the message.
         supported_names = ", ".join(key for key in KIND_OF_DISTORTION if key)
         advice = describe_projection(name) or "; calibrate with one of these"
         raise FileFormatError(

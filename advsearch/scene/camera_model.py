@@ -179,8 +179,9 @@ class CameraModel:
         radius = distorted.norm(dim=-1)
         # 0 for the center, which has no direction
         radial_direction = distorted / radius.clamp_min(1e-300)[..., None]
-        # The limit is the fold, not the visible angle: points just outside the view
-        # get a solution as well, and the margin passes through 0 at its edge.
+        # Angles are solved up to the fold, not only up to the edge of the view. So
+        # points just outside the view have a direction, too, and a margin a little
+        # below 0.
         max_solved_angle = min(self.fold_angle_radians, math.pi)
         angle, converged = self._invert_radial(radius, max_solved_angle)
         directions = torch.cat(
@@ -213,7 +214,8 @@ class CameraModel:
             undistorted, converged = self._invert_distortion(
                 undistorted, distorted, max_visible
             )
-            # The edge of the view is a radius without decentering.
+            # `_compute_edge_radius` is without decentering, and so must be the radius
+            # that is compared with it.
             radius = (distorted - self._compute_decentering(undistorted)).norm(dim=-1)
         directions = torch.cat(
             [undistorted, torch.ones_like(undistorted[..., :1])], dim=-1
@@ -270,6 +272,7 @@ class CameraModel:
         upper = torch.full_like(target, self._find_upper_bound(target, max_value))
         radius = torch.minimum(target, upper)
         for _ in range(MAX_STEPS):
+            # one derivative (N,), since the values have one column
             values, (slope,) = _evaluate_with_jacobian(distort_to_column, radius)
             residual = values[..., 0] - target
             is_solved = (residual.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
@@ -298,7 +301,8 @@ class CameraModel:
             reached_target = self._distort_radius(
                 torch.tensor(bound, dtype=torch.float64)
             )
-            must_grow = float(reached_target) < float(target.max())  # False for NaN
+            # False if either is NaN, so that the loop ends.
+            must_grow = float(reached_target) < float(target.max())
             if not must_grow:
                 break
             bound = min(2.0 * bound, max_value)
@@ -318,7 +322,8 @@ class CameraModel:
             max_radius: largest radius of a solution; finite.
 
         Returns:
-            The solutions (N, 2); and which have converged before the lens folds.
+            The solutions (N, 2); and which of them have converged, (N,). Solutions
+            beyond the fold of the lens, or outside of the circle, do not count.
         """
         converged = torch.zeros_like(undistorted[..., 0], dtype=torch.bool)
         for _ in range(MAX_STEPS_2D):
@@ -335,12 +340,11 @@ class CameraModel:
             if bool(converged.all()):
                 break
             updated = undistorted - step
-            # the factor below is 1 inside the circle, and leads back to it from outside
             radius = updated.norm(dim=-1, keepdim=True)
+            # 1 inside the circle, and less outside, so that points move onto the circle
+            shrinking = max_radius / radius.clamp_min(max_radius)
             updated = torch.where(
-                torch.isfinite(radius),
-                updated * (max_radius / radius.clamp_min(max_radius)),
-                undistorted,
+                torch.isfinite(radius), updated * shrinking, undistorted
             )
             undistorted = torch.where(converged[..., None], undistorted, updated)
         return undistorted, converged
@@ -366,16 +370,17 @@ class CameraModel:
         # polynomial in s, is (n + 2 s n') d - 2 s n d'. The lens folds at the smallest
         # positive root of that, or at a pole, a root of d.
         numerator, denominator = self._polynomials
-        double_square = Polynomial([0.0, 2.0])  # 2 r^2
-        slope = (
-            numerator + double_square * numerator.deriv()
-        ) * denominator - double_square * (numerator * denominator.deriv())
-        roots = np.concatenate([slope.roots(), denominator.roots()])
+        doubled_s = Polynomial([0.0, 2.0])  # 2 s
+        slope_numerator = (
+            numerator + doubled_s * numerator.deriv()
+        ) * denominator - doubled_s * (numerator * denominator.deriv())
+        roots = np.concatenate([slope_numerator.roots(), denominator.roots()])
         is_real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)
         positive_roots = roots.real[is_real & (roots.real > 0.0)]
         if not positive_roots.size:
             return math.inf
         radius = math.sqrt(float(positive_roots.min()))
+        # r is the angle of a fisheye, and the tangent of the angle of another lens.
         return radius if self.kind == FISHEYE else math.atan(radius)
 
     @cached_property
@@ -411,8 +416,8 @@ class CameraModel:
         """Return the shifts (N, 2) of undistorted points that are not radial.
 
         They are the tangential distortion (p1 and p2: the lens stands off the axis) and
-        that of a thin prism (s1 to s4), in focal lengths. The formulas are at the top of
-        this module.
+        that of a thin prism (s1 to s4), in focal lengths. The formulas are at the top
+        of this module.
         """
         # the last six of `NUMBER_NAMES`
         p1, p2, s1, s2, s3, s4 = self.intrinsics[NUMBER_NAMES.index("p1") :]
@@ -476,7 +481,9 @@ class CameraModel:
     def _compute_border_tangent(
         self, center: Tensor, axis: int, border: float
     ) -> float:
-        """Return the largest tangent on the line from the axis to an image border.
+        """Return the largest tangent of the rays between the axis and an image border.
+
+        The rays are those of points on a line parallel to an axis of the image.
 
         Args:
             center: (1, 2) image coordinates of the axis.
@@ -490,8 +497,9 @@ class CameraModel:
         directions, margin = self.compute_rays(line_points)
         # A z of 0.1 is at about 84 degrees from the axis: rays farther out do not
         # count, since their tangents would be huge.
-        is_visible = (margin > 0.0) & (directions[:, 2] > 0.1)
-        tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
+        min_z = 0.1
+        is_visible = (margin > 0.0) & (directions[:, 2] > min_z)
+        tangents = directions[:, axis].abs() / directions[:, 2].clamp_min(min_z)
         return float(
             torch.where(is_visible, tangents, torch.zeros_like(tangents)).max()
         )
@@ -537,6 +545,7 @@ class CameraModel:
             return ()
         (model_height, model_width) = self.calibrated_shape
         (height, width) = resolution
+        # scale along y over scale along x
         stretch = model_width * height / (model_height * width)
         stretch_text = ""
         if abs(stretch - 1.0) > 0.005:
@@ -557,9 +566,10 @@ def make_pinhole(fov: float, aspect: float) -> CameraModel:
         fov: field of view of the larger side, degrees.
         aspect: width divided by height.
     """
-    # In units of the larger side. Half of that side is at half the angle from the axis.
+    # As a fraction of the larger side. Half of that side is at half the angle from the
+    # axis.
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
-    # Lengths along x are in image widths, those along y in image heights.
+    # as fractions of width and height, of which the smaller one has the larger fraction
     fx = focal * max(1.0, 1.0 / aspect)
     fy = focal * max(1.0, aspect)
     cx = cy = 0.5
@@ -574,8 +584,10 @@ def make_bundled_models(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     The fisheye has a circle of 180 degrees that fills the smaller side; the panorama
     has all directions.
     """
-    focal = 1.0 / math.pi  # an angle of pi / 2 reaches half of the side
-    # focal lengths as fractions of width and height
+    # As a fraction of the smaller side. A fisheye has the radius focal * angle, so that
+    # an angle of pi / 2 reaches half of that side.
+    focal = 1.0 / math.pi
+    # as fractions of width and height, of which the larger one has the smaller fraction
     focal_x = focal * min(1.0, 1.0 / aspect)
     focal_y = focal * min(1.0, aspect)
     no_distortion = [0.0] * len(COEFFICIENTS)
@@ -662,7 +674,8 @@ def _evaluate_with_jacobian(
         at: the points, (N, ...).
 
     Returns:
-        The values (N, k), and the derivatives of each of the k by the points.
+        The values (N, k); and for each of the k columns its derivative by the points,
+        of the shape of `at`.
     """
     with torch.enable_grad():
         points = at.detach().requires_grad_()
@@ -675,11 +688,14 @@ def _evaluate_with_jacobian(
 
 
 def _clip_margin(margin: Tensor, converged: Tensor) -> Tensor:
-    """Return margins (N,) in [-1, 1], below zero if an inversion has not converged.
+    """Return margins (N,) in [-1, 1], below zero for points without a ray.
 
-    A margin is positive inside the view. Where the inversion has not converged, a
-    positive margin is replaced by a tiny negative one. A negative margin stays as it is,
-    so that margins pass continuously through zero at the edge of the view.
+    Args:
+        margin: (N,) focal lengths from each point to the edge of the view, positive
+            inside the view.
+        converged: (N,) whether the inversion of the distortion has found a ray. If not,
+            a positive margin is replaced by a tiny negative one. A negative margin
+            stays as it is, so that margins pass continuously through zero at the edge.
     """
     is_valid = converged | (margin <= 0.0)
     just_outside = torch.full_like(margin, -1e-6)

@@ -220,8 +220,9 @@ OMISSIONS: Mapping[str, str] = {
 Each step can be put back by its name. None of them changes the result: images and
 gradients agree to within their noise with and without it, and to within rounding if the
 random numbers are the same; `advsearch check` verifies that for a scene. Omitting
-bounces of light is different (`engine.gradients.planning`), since it has a bias. So only
-the search does it, within a measured bound, and the verification renders all bounces.
+bounces of light is different (`engine.gradients.planning`), since it has a bias. So
+only the search does it, within a measured bound, and the verification renders all
+bounces.
 """
 
 ALL_OMISSIONS = frozenset(OMISSIONS)
@@ -232,11 +233,11 @@ NO_OMISSIONS: frozenset[str] = frozenset()
 # ----------------------------------------------------------------------------------
 # Exposure: an incident-light meter at the visible surface of the object.
 #
-# The irradiance of every visible piece of the object's surface is computed, and averaged
-# over the image. It has light from the environment, from the ground plane (which the
-# environment lights), from lamps, and from surroundings that emit light. The material
-# of the object is ignored, so that a black object stays black. So are shadows, which
-# would need a render.
+# The irradiance of every visible piece of the object's surface is computed, and
+# averaged over the image. It has light from the environment, from the ground plane
+# (which the environment lights), from lamps, and from surroundings that emit light. The
+# material of the object is ignored, so that a black object stays black. So are shadows,
+# which would need a render.
 #
 # Camera, pose and rotation of the environment have their default values while the
 # exposure is metered. So a configuration has the same exposure whether its camera is a
@@ -352,19 +353,21 @@ def _compute_distant_light(
     """
     directions, solid_angle, power = compute_environment_light(scene)
     is_up = directions[:, 2] > 0.0
-    # irradiance of level ground, where the cosine is the z of the direction
-    on_ground = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
+    # Irradiance is radiance times solid angle times cosine. On level ground the cosine
+    # is the z of the direction.
+    ground_irradiance = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
     albedo = srgb_to_linear(np.array(scene.ground_color, np.float32))
-    reflected_radiance = albedo * on_ground / math.pi
-    # The offset from the middle of the ground at which a direction meets the height 0.
-    # It has no meaning for directions that point up, which are left out below.
+    reflected_radiance = albedo * ground_irradiance / math.pi
+    # (N, 2) distances along x and y from the middle of the ground at which a direction
+    # meets the height 0. They have no meaning for directions that point up, which are
+    # left out below.
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
     # A photographed or paved ground is a part of the environment map: the light from
     # below is in its lower half.
     has_plain_ground = scene.photograph is None and not is_paved(scene)
-    is_above_square = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
-    hits_ground = has_plain_ground & ~is_up & is_above_square
+    is_on_square = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
+    hits_ground = has_plain_ground & ~is_up & is_on_square
     power = np.where(
         hits_ground[:, None], reflected_radiance * solid_angle[:, None], power
     )
@@ -377,7 +380,8 @@ def compute_environment_light(
     """Return the environment's light in a coarse map.
 
     Returns:
-        Unit directions (N, 3), solid angles (N,), and radiance times these (N, 3).
+        Unit directions (N, 3) to the light, solid angles (N,), and radiance times solid
+        angle (N, 3).
     """
     directions, solid_angle, power = _compute_unrotated_light(scene.environment)
     turn = make_rotation(scene.get_number("environment.rotation"), 0.0, 0.0)
@@ -399,8 +403,8 @@ def _compute_emitted_light(
         point: (3,) in world space.
 
     Returns:
-        Unit directions (F, 3) to the faces, and the irradiance (F, 3) of a surface that
-        faces each.
+        Unit directions (F, 3) to the faces; and for each face the irradiance (F, 3)
+        that it causes on a surface turned towards it.
     """
     corners = compute_base_vertices(part)[part.mesh.faces]
     area = compute_area_vectors(corners) / 2.0  # (F, 3) along the normals
@@ -415,6 +419,8 @@ def _compute_emitted_light(
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
     mean_radiance = look_up_texture(emission, column, row).mean(axis=1)
+    # The direction points to the face, so that a face turned to the point has a
+    # negative product. The back of a face emits nothing.
     projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
     # the form factor of a disk: area / (distance^2 + area / pi)
     disk_divisor = squared_distance + np.linalg.norm(area, axis=1) / math.pi
@@ -432,18 +438,20 @@ def _choose_metering_shape(frame: Frame) -> tuple[float, tuple[int, int]]:
 def _find_nearest(
     nearness: Float64Array, row: IntArray, column: IntArray, shape: tuple[int, int]
 ) -> IntArray:
-    """Return the index of the nearest sample in each pixel that has one.
+    """Return the index of the nearest sample in each pixel that has one, (K,).
+
+    The pixels are in the order of the image, row by row.
 
     Args:
-        nearness: (S,) one over the depth of each sample, larger for nearer ones.
+        nearness: (S,) 1 / depth of each sample, which is larger for nearer ones.
         row: (S,) row of the pixel of each sample.
         column: (S,) column of the pixel of each sample.
         shape: height and width of the image.
     """
     order = np.argsort(nearness, kind="stable")
     front_sample = np.full(shape, -1)
-    # Samples are written from the farthest to the nearest, which overwrites the others
-    # in its pixel.
+    # Samples are written from the farthest to the nearest, so that the nearest sample
+    # of a pixel overwrites the others.
     front_sample[row[order], column[order]] = order
     return np.asarray(front_sample[front_sample >= 0])
 
@@ -452,34 +460,36 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     """Return the object's unit normals (N, 3) in the pixels of a small image.
 
     N is the number of pixels that show the object, which nothing else hides. A pixel
-    has the normal of the face nearest to the camera, in world space. Normals are
-    reversed if they point away from the camera. The image has `METERING_SIZE` pixels
-    along its longer side.
+    has a normal of the face nearest to the camera, interpolated between its corners, in
+    world space. Normals are reversed if they point away from the camera. The image has
+    `METERING_SIZE` pixels along its longer side.
     """
     camera = camera_to_world(scene)
-    # in the camera's coordinates: left, up and ahead
-    points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
+    camera_axes = camera[:3, :3]
+    # (V, 3) in the camera's coordinates: left, up and ahead
+    points = (scene.base_vertices - camera[:3, 3]) @ camera_axes
     faces = scene.object.mesh.faces.astype(np.int64)
-    faces = faces[(points[faces][..., 2] > MIN_DEPTH).all(axis=1)]
+    is_ahead = (points[faces][..., 2] > MIN_DEPTH).all(axis=1)
+    faces = faces[is_ahead]
     frame = Frame.from_fov(scene.get_number("camera.fov"), scene.aspect)
     pixel_width, shape = _choose_metering_shape(frame)
     tangents = points[faces][..., :2] / points[faces][..., 2:]
-    # Columns run to the left and rows up, as the camera's coordinates do. The frame is
-    # symmetric, so that its bounds hold for these directions, too.
-    from_corner = tangents - (frame.left, frame.low)
-    # minus half a pixel, since the raster's coordinates are 0 at the center of its
-    # first pixel
-    face, row, column, weights = rasterize_triangles(
-        from_corner / pixel_width - 0.5, shape
-    )
+    # The image is mirrored and upside down: its columns go to the left and its rows up,
+    # as the camera's coordinates do. That changes no normal. The frame is symmetric, so
+    # that the image begins at the same tangents in these directions.
+    from_first_corner = tangents - (frame.left, frame.low)
+    # The raster's coordinates are 0 at the center of its first pixel, not at the
+    # border.
+    pixel_coordinates = from_first_corner / pixel_width - 0.5
+    face, row, column, weights = rasterize_triangles(pixel_coordinates, shape)
     # 1 / depth, unlike depth, may be interpolated linearly over the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)
     visible = _find_nearest(nearness, row, column, shape)
 
-    visible_face = face[visible]
-    corners = faces[visible_face]
+    corners = faces[face[visible]]
     normals = _interpolate_normals(scene, corners, weights[visible])
-    from_camera = points[corners].mean(axis=1) @ camera[:3, :3].T
+    # from the camera to the middle of the visible face, in world space
+    from_camera = points[corners].mean(axis=1) @ camera_axes.T
     is_back_facing = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
     return np.asarray(np.where(is_back_facing, -normals, normals))
 
@@ -506,7 +516,8 @@ def _compute_unrotated_light(
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Return an environment's light without its rotation; z is up.
 
-    The map is divided into blocks of texels. The light of each block is summed up.
+    The map is divided into blocks of texels: up to `METERING_ROWS` rows of blocks, and
+    twice as many columns. The light of each block is summed up.
 
     Returns:
         For N blocks: unit directions (N, 3), solid angles (N,) in steradians, and
@@ -517,20 +528,30 @@ def _compute_unrotated_light(
     height, width = environment.radiance.shape[:2]
     rows = _find_block_starts(height, METERING_ROWS)
     columns = _find_block_starts(width, 2 * METERING_ROWS)
-    # The angle from straight up at the borders between rows. The first and the last row
-    # have their centers at the poles, so that half of each is missing.
-    polar = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0.0, 1.0) * math.pi
-    # solid angle (H,) of a texel in each row
-    solid_angle = -np.diff(np.cos(polar)) * (2.0 * math.pi / width)
-    # a fourth channel of ones sums up the solid angles
+    solid_angle = _compute_texel_solid_angles(height, width)
+    # The fourth channel, of ones, becomes the solid angle.
     ones = np.ones((height, width, 1))
-    weighted_texels = np.concatenate([environment.radiance, ones], axis=2)
-    weighted_texels = weighted_texels * solid_angle[:, None, None]
+    padded_radiance = np.concatenate([environment.radiance, ones], axis=2)
+    weighted_texels = padded_radiance * solid_angle[:, None, None]
+    # Blocks are summed over their rows, and then over their columns.
     row_sums = np.add.reduceat(weighted_texels, rows, axis=0)
     sums = np.add.reduceat(row_sums, columns, axis=1).reshape(-1, 4)
-
+    block_power = sums[:, :3]
+    block_solid_angle = sums[:, 3]
     directions = _compute_block_directions(rows, columns, (height, width))
-    return directions, sums[:, 3], sums[:, :3]
+    return directions, block_solid_angle, block_power
+
+
+def _compute_texel_solid_angles(height: int, width: int) -> Float64Array:
+    """Return the solid angle (H,) of a texel in each row of an environment map.
+
+    The center of row r is at the angle r * pi / (height - 1) from straight up, and its
+    borders are half a row before and after it. Half of the first and of the last row is
+    beyond a pole, and is cut off.
+    """
+    border_row = np.arange(height + 1) - 0.5
+    border_angle = np.clip(border_row / (height - 1), 0.0, 1.0) * math.pi
+    return np.asarray(-np.diff(np.cos(border_angle)) * (2.0 * math.pi / width))
 
 
 def _compute_block_directions(
@@ -549,15 +570,18 @@ def _compute_block_directions(
     height, width = shape
     row_ends = np.append(rows[1:], height)
     column_ends = np.append(columns[1:], width)
-    # The center of row r is at the angle r * pi / (height - 1) from straight up. The
-    # rows of a block, from start to end - 1, have the mean (start + end - 1) / 2.
-    theta = (rows + row_ends - 1)[:, None] * (0.5 * math.pi / (height - 1))
-    # The center of column c is at (c + 0.5) * 2 pi / width. The mean of c + 0.5 over a
-    # block is (start + end) / 2.
-    azimuth = 0.5 * math.pi - (columns + column_ends) * (math.pi / width)
-    z = np.broadcast_to(np.cos(theta), (len(rows), len(columns)))
-    x = np.sin(theta) * np.cos(azimuth)
-    y = np.sin(theta) * np.sin(azimuth)
+    # Angle from straight up: row r is at r * pi / (height - 1). The rows of a block,
+    # from start to end - 1, have the mean (start + end - 1) / 2.
+    doubled_row = rows + row_ends - 1
+    polar_angle = doubled_row[:, None] * (0.5 * math.pi / (height - 1))
+    # Angle from +y towards +x: column c is at (c + 0.5) * 2 pi / width. The mean of
+    # c + 0.5 over a block is (start + end) / 2.
+    doubled_column = columns + column_ends
+    # An azimuth is measured from +x towards +y.
+    azimuth = 0.5 * math.pi - doubled_column * (math.pi / width)
+    z = np.broadcast_to(np.cos(polar_angle), (len(rows), len(columns)))
+    x = np.sin(polar_angle) * np.cos(azimuth)
+    y = np.sin(polar_angle) * np.sin(azimuth)
     return np.stack([x, y, z], axis=-1).reshape(-1, 3)
 
 
@@ -574,11 +598,12 @@ def _find_block_starts(size: int, count: int) -> IntArray:
 # Times at which the rows of an image are exposed: an open shutter (motion blur), and
 # rows that are read one after the other (rolling shutter).
 #
-# Each row is exposed for `shutter` seconds. Rows are read within `rolling` seconds, from
-# the top, or from the bottom if `rolling` is negative. The middle of the image's
-# exposure is the time of the configuration. A sensor adds up light, so a row is the mean
-# of linear radiance over its exposure, before the denoiser and the tone curve. The mean
-# is taken over moments, evenly spaced, of which each row has those in its own exposure.
+# Each row is exposed for `shutter` seconds. Rows are read within `rolling` seconds,
+# from the top, or from the bottom if `rolling` is negative. The middle of the image's
+# exposure is the time of the configuration. A sensor adds up light, so a row is the
+# mean of linear radiance over its exposure, before the denoiser and the tone curve. The
+# mean is taken over moments, evenly spaced, of which each row has those in its own
+# exposure.
 
 MIN_MOMENTS = 8
 MAX_MOMENTS = 64
@@ -617,8 +642,7 @@ def divide_exposure(
         rolling: seconds within which rows are read one after the other. If it is
             negative, the lowest row comes first.
         height: height of the image.
-        count: M, number of moments. Without a shutter, and with as many moments as
-            rows, each row has its own moment.
+        count: M, number of moments.
 
     Returns:
         (M,) seconds from the middle of the exposure to each moment; (M, H) the weight
@@ -627,32 +651,35 @@ def divide_exposure(
     """
     is_from_bottom = rolling < 0.0
     rolling = abs(rolling)
-    duration = (shutter + rolling) / count
-    starts = torch.arange(count, dtype=torch.float64) * duration
-    # (H,) when each row opens, seconds after the first
-    opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    if shutter < duration:
+    moment_duration = (shutter + rolling) / count
+    moment_starts = torch.arange(count, dtype=torch.float64) * moment_duration
+    # (H,) when each row opens, in seconds. The time of reading is divided into one part
+    # for each row, and each row opens in the middle of its part.
+    row_opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    if shutter < moment_duration:
         # A row is exposed for less than a moment, and belongs to only one: that in
         # which the middle of its exposure is.
-        moment = ((opens + shutter / 2.0) / duration).long().clamp_max(count - 1)
-        fractions = torch.nn.functional.one_hot(moment, count).T.double()
+        row_middle = row_opens + shutter / 2.0
+        moment = (row_middle / moment_duration).long().clamp_max(count - 1)
+        weights = torch.nn.functional.one_hot(moment, count).T.double()
     else:
         # (M, H) seconds for which moment and row overlap
-        overlap_start = torch.maximum(starts[:, None], opens)
-        overlap_end = torch.minimum(starts[:, None] + duration, opens + shutter)
-        fractions = (overlap_end - overlap_start).clamp_min(0.0)
-    fractions = fractions / fractions.sum(dim=0)
+        moment_ends = moment_starts + moment_duration
+        overlap_start = torch.maximum(moment_starts[:, None], row_opens)
+        overlap_end = torch.minimum(moment_ends[:, None], row_opens + shutter)
+        weights = (overlap_end - overlap_start).clamp_min(0.0)
+    weights = weights / weights.sum(dim=0)
     if is_from_bottom:
         row_dimension = 1
-        fractions = fractions.flip(row_dimension)
+        weights = weights.flip(row_dimension)
     # from the middle of the exposure to the middle of each moment
-    offsets = starts + duration / 2.0 - (shutter + rolling) / 2.0
-    # A row overlaps with shutter / duration moments, each of which takes this fraction
-    # of its samples. Without a shutter one moment takes all of them.
+    offsets = moment_starts + moment_duration / 2.0 - (shutter + rolling) / 2.0
+    # A row overlaps with shutter / moment_duration moments, each of which takes this
+    # fraction of its samples. Without a shutter one moment takes all of them.
     sample_fraction = 1.0
     if shutter:
-        sample_fraction = min(1.0, duration / shutter)
-    return offsets, fractions.float(), sample_fraction
+        sample_fraction = min(1.0, moment_duration / shutter)
+    return offsets, weights.float(), sample_fraction
 
 
 # ----------------------------------------------------------------------------------
@@ -726,12 +753,12 @@ class Surfaces:
         """
         channels: dict[str, Tensor] = {}
         for name in aovs:
-            value = (
-                self.visible_mask(mask).float()
-                if name == "mask"
-                else getattr(self, name)
-            )
-            planes = value[..., None] if value.ndim == 2 else value
+            if name == "mask":
+                layer = self.visible_mask(mask).float()
+            else:
+                layer = getattr(self, name)
+            lacks_channel_axis = layer.ndim == 2
+            planes = layer[..., None] if lacks_channel_axis else layer
             for index, channel in enumerate(CHANNELS[name]):
                 channels[f"{name}.{channel}"] = planes[..., index]
         return channels

@@ -164,8 +164,8 @@ def compute_framing_distance(
     axes = torch.from_numpy(compute_camera_axes(azimuth, elevation, roll)).T.to(offsets)
     (left, up, outwards) = offsets.matmul(axes).unbind(dim=1)
     (half_width, half_height) = edge_tangents * FRAME_FILL
-    # A vertex is seen at the tangent left / (distance - outwards). That is at most the
-    # edge's if distance >= outwards + left / edge.
+    # A camera at the distance d sees a vertex at the tangent left / (d - outwards).
+    # That is at most half_width if d >= outwards + left / half_width.
     from_default_view = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
@@ -226,11 +226,12 @@ def _compute_framing_distance_all_around(
         left     = rho sin(a)
         up       = z cos(e) - rho sin(e) cos(a)
 
-    It is inside an edge of the image if the distance is at least outwards +
-    left / tangent, or outwards + up / tangent for the top edge, and likewise with -left
-    and -up. The largest value of A sin(a) + B cos(a) over all a is sqrt(A^2 + B^2).
-    The result is the largest distance over all vertices and edges, in the unit of the
-    offsets.
+    From a camera at the distance d, the vertex has the tangent left / (d - outwards).
+    So it is within the left edge if d >= outwards + left / tangent, and within the top
+    edge if d >= outwards + up / tangent. For the right and the bottom edge, left and up
+    have the opposite sign. Each of these limits is A sin(a) + B cos(a) + C, whose
+    largest value over all a is sqrt(A^2 + B^2) + C. The result is the largest limit
+    over all vertices and edges, in the unit of the offsets.
 
     Args:
         offsets: (V, 3) from the middle of the object to its vertices.
@@ -244,16 +245,16 @@ def _compute_framing_distance_all_around(
     inverse_width = 1.0 / tangents[0]
     inverse_height = 1.0 / tangents[1]
 
-    # outwards + left / tangent: terms with sin(a) and cos(a), and a constant. With
-    # -left the largest value is the same.
+    # Left edge: A = rho / tangent, B = rho cos(e), C = z sin(e). The right edge has the
+    # opposite A, and so the same largest value.
     sides_amplitude = rho * torch.sqrt(inverse_width**2 + cosine**2)
     distance_for_sides = sides_amplitude + z * sine
 
-    # outwards + up / tangent: a term with cos(a) alone, and a constant.
+    # Top edge: A = 0, B = rho (cos(e) - sin(e) / tangent).
     top_amplitude = rho * (cosine - sine * inverse_height).abs()
     distance_for_top = top_amplitude + z * (sine + cosine * inverse_height)
 
-    # outwards - up / tangent
+    # Bottom edge: as for the top, with the opposite sign of `up`.
     bottom_amplitude = rho * (cosine + sine * inverse_height).abs()
     distance_for_bottom = bottom_amplitude + z * (sine - cosine * inverse_height)
 
@@ -342,9 +343,10 @@ def project_points(
     model = description.camera_model
     if model is not None:
         if "camera.lens" in inputs:
-            # A model stores floats, so that there is no derivative by the lens.
+            # A lens model computes with plain floats, without derivatives.
             model = model.with_intrinsics(inputs["camera.lens"].detach())
         positions, is_visible = model.project(points)
+        # from [0, 1] over the image to pixels from its middle
         return (positions - 0.5) * image_size, is_visible
     fov = (
         inputs.get("camera.fov", torch.tensor(description.get_number("camera.fov")))
@@ -401,8 +403,8 @@ def get_positioned_part(scene: SceneData, part: ScenePart) -> Any:
     """Return a part of a scene in the pose that the settings and the camera define.
 
     A mesh gets the pose and the material of its settings. A lamp with a beam gets its
-    pose from its carrier, which is a mesh, or the car of a camera that is mounted on
-    one. Other parts are returned as they are.
+    pose from its carrier: a mesh, or the car on which the camera is mounted. Other
+    parts are returned as they are.
     """
     if not isinstance(part, BeamLamp):
         # `scene.meshes` has the settings applied. Only meshes are in it.
@@ -480,9 +482,9 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
 
     This is Rodrigues' formula, R = 1 + sin(a) / a K + (1 - cos(a)) / a^2 K^2, where K
     is the matrix of the cross product with the vector. Near a = 0, where the quotients
-    are NaN, they are replaced by series, so that value and derivative are right.
-    `torch.where` passes on the NaN derivative of the branch that it does not take: in
-    that branch the angle is 1 instead.
+    are NaN, they are replaced by series, so that value and derivative are right. The
+    derivative of `torch.where` would be NaN even if only the branch that is not taken
+    is NaN. So the quotients are computed with an angle of 1 there.
     """
     vector = degrees * (math.pi / 180.0)
     squared_angle = vector.square().sum()
@@ -570,36 +572,40 @@ def find_overlap_interval(
     has_common_height = min(first.upper, second.upper) > max(first.lower, second.lower)
     if not has_common_height:
         return never
-    edges = np.concatenate(
-        [
-            np.roll(points, -1, axis=0) - points
-            for points in (first.outline, second.outline)
-        ]
-    )
-    # normals (k, 2) of the edges, without those between two corners at one point
-    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
+    normals = _compute_edge_normals(first, second)
     # positions (corners, k) of the corners along each normal
     first_positions = first.outline @ normals.T
     second_positions = second.outline @ normals.T
-    # (2, k) how far the first has to move along each normal until it overlaps the
-    # second, and until it no longer does
-    separations = np.stack(
-        [
-            second_positions.min(axis=0) - first_positions.max(axis=0),
-            second_positions.max(axis=0) - first_positions.min(axis=0),
-        ]
-    )
+    # (k,) how far the first has to move along each normal until its projection begins
+    # to overlap that of the second, and until it no longer overlaps
+    distance_to_begin = second_positions.min(axis=0) - first_positions.max(axis=0)
+    distance_to_end = second_positions.max(axis=0) - first_positions.min(axis=0)
     # (k,) how far a shift of 1 moves the first along each normal
     speeds = normals @ direction
-    # Along a normal at a right angle to the shift nothing moves. The projections on it
-    # overlap at every shift, if 0 is between the separations, or at none.
+    # Along a normal at a right angle to the shift the first does not move. If its
+    # projection does not overlap before the shift, it never does.
     is_still = speeds == 0.0
-    is_separated = (separations[0] >= 0.0) | (separations[1] <= 0.0)
+    is_separated = (distance_to_begin >= 0.0) | (distance_to_end <= 0.0)
     if (is_still & is_separated).any():
         return never
-    # Distance over speed is the shift at which an overlap begins and ends. A negative
-    # speed swaps the two, and so they are sorted.
-    intervals = np.sort(separations[:, ~is_still] / speeds[~is_still], axis=0)
-    start = float(intervals[0].max())
-    end = float(intervals[1].min())
+    # Distance over speed is the shift. A negative speed swaps the shifts at which an
+    # overlap begins and ends, and so they are sorted.
+    distances = np.stack([distance_to_begin, distance_to_end])
+    shifts = np.sort(distances[:, ~is_still] / speeds[~is_still], axis=0)
+    # All projections overlap after the last begin and before the first end.
+    start = float(shifts[0].max())
+    end = float(shifts[1].min())
     return (start, end) if start < end else never
+
+
+def _compute_edge_normals(first: Footprint, second: Footprint) -> Float64Array:
+    """Return the normals (k, 2) of the edges of two outlines.
+
+    Edges between two corners at the same point have no normal, and are left out.
+    """
+    outlines = (first.outline, second.outline)
+    edges = np.concatenate(
+        [np.roll(outline, -1, axis=0) - outline for outline in outlines]
+    )
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+    return np.asarray(normals[edges.any(axis=1)])

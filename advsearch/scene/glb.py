@@ -111,7 +111,8 @@ class GlbBuffer:
         """Return the complete .glb file: a header, then JSON, then binary data.
 
         Args:
-            header: the glTF document. The entries that describe the buffer are added.
+            header: the glTF document. The entries that describe the buffer are added to
+                this dictionary.
         """
         header |= {
             "accessors": self.accessors,
@@ -119,7 +120,7 @@ class GlbBuffer:
             "buffers": [{"byteLength": len(self.data)}],
         }
         text = json.dumps(header).encode()
-        text += b" " * (-len(text) % 4)
+        text += b" " * (-len(text) % 4)  # a chunk has a multiple of 4 bytes
         binary = bytes(self.data)
         # The file's header has 12 bytes, and that of each of the two chunks 8. The two
         # numbers below are the chunk types "JSON" and "BIN".
@@ -167,18 +168,18 @@ def encode_web_glb(
     """
     buffer = GlbBuffer()
     document = _make_document(buffer, [*adversarial, *clean], _encode_jpeg)
-    # The columns of the pose as rows (4, 3): the camera's axes to the left, up and
-    # ahead, then its position. All four are vectors that `_to_y_up` can rotate.
+    # (4, 3) vectors: the camera's axes to the left, up and ahead, then its position.
+    # These are the columns of the pose.
     pose_columns = camera[:3].T.astype(np.float32)
     # glTF's cameras look along their -z, with +x to the right. So the axes to the left
     # and ahead are reversed.
     signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
-    # The format stores matrices by columns, which are the rows here.
-    camera_matrix = np.eye(4)
-    camera_matrix[:, :3] = _to_y_up(pose_columns * signs)
+    # glTF stores a matrix column by column, so that its columns are rows here.
+    transposed_matrix = np.eye(4)
+    transposed_matrix[:, :3] = _to_y_up(pose_columns * signs)
     document["cameras"] = [CAMERA_ENTRY]
     document["nodes"].append(
-        {"name": "camera", "camera": 0, "matrix": camera_matrix.ravel().tolist()}
+        {"name": "camera", "camera": 0, "matrix": transposed_matrix.ravel().tolist()}
     )
     n_adversarial = len(adversarial)
     camera_node = len(document["nodes"]) - 1

@@ -55,14 +55,16 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     sigmas = []
     for channel in range(levels.shape[2]):
         values = levels[..., channel].astype(np.float64)
+        # The filter reaches beyond the image at its outermost pixels, which are left
+        # out.
         residual = np.abs(ndimage.convolve(values, RESIDUAL)[1:-1, 1:-1])
         is_clipped = ((values == 0.0) | (values == 255.0))[1:-1, 1:-1]
-        by_block = _split_blocks(residual)
-        clipped = _split_blocks(is_clipped).mean(axis=1)
-        usable = by_block[clipped <= MAX_CLIPPED]
+        block_residuals = _split_blocks(residual)  # (blocks, pixels)
+        clipped_fraction = _split_blocks(is_clipped).mean(axis=1)
+        usable_blocks = block_residuals[clipped_fraction <= MAX_CLIPPED]
         sigma = 0.0
-        if len(usable):
-            medians = np.median(usable, axis=1)
+        if len(usable_blocks):
+            medians = np.median(usable_blocks, axis=1)
             sigma = MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
         # The variance that rounding to integer levels adds is subtracted.
         sigmas.append(np.sqrt(max(0.0, sigma**2 - ROUNDING_VARIANCE)))
@@ -92,10 +94,10 @@ def make_noise(sigma: Float64Array, size: tuple[int, int], seed: int) -> Tensor:
 
 
 def measure_blur(image: Float32Array) -> float:
-    """Return by how much an image is blurred beyond a rendered one, in pixels.
+    """Return the blur of an image in comparison with a rendered one, in pixels.
 
     It is the standard deviation of a Gaussian blur, 0 if there are too few edges. The
-    measurement is corrected by a table of measurements of edges with known blurs.
+    measurement is looked up in a table of what edges with known blurs measure.
 
     Args:
         image: (H, W) linear luminance.
@@ -117,27 +119,32 @@ def _measure_edges(image: Float64Array) -> float | None:
     """
     row_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(1, 0)))
     column_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(0, 1)))
-    narrow = np.hypot(row_slope, column_slope)
-    wide = ndimage.gaussian_gradient_magnitude(image, WIDE)
+    narrow_slope = np.hypot(row_slope, column_slope)
+    wide_slope = ndimage.gaussian_gradient_magnitude(image, WIDE)
     # Only the steepest pixel across an edge is used.
-    is_steepest_row = narrow >= ndimage.maximum_filter(narrow, size=(3, 1))
-    is_steepest_column = narrow >= ndimage.maximum_filter(narrow, size=(1, 3))
-    is_edge = np.where(row_slope > column_slope, is_steepest_row, is_steepest_column)
+    is_steepest_in_column = narrow_slope >= ndimage.maximum_filter(
+        narrow_slope, size=(3, 1)
+    )
+    is_steepest_in_row = narrow_slope >= ndimage.maximum_filter(
+        narrow_slope, size=(1, 3)
+    )
+    is_edge_along_row = row_slope > column_slope  # it changes from row to row
+    is_edge = np.where(is_edge_along_row, is_steepest_in_column, is_steepest_in_row)
     # Weak edges are left out. The quantile estimates the steepest slope of the image,
     # without outliers.
-    is_edge &= narrow > MIN_SLOPE * float(np.quantile(narrow, 0.995))
+    is_edge &= narrow_slope > MIN_SLOPE * float(np.quantile(narrow_slope, 0.995))
     # Within this margin the filters reach beyond the border of the image.
     margin = int(3 * WIDE)
-    is_edge[:margin] = is_edge[-margin:] = False
-    is_edge[:, :margin] = is_edge[:, -margin:] = False
+    is_inside = np.zeros_like(is_edge)
+    is_inside[margin:-margin, margin:-margin] = True
+    is_edge &= is_inside
     if is_edge.sum() < MIN_EDGES:
         return None
-    ratio = (narrow[is_edge] / np.maximum(wide[is_edge], 1e-12)) ** 2
-    # The ratio of an edge without blur is the upper bound. That of a very blurred edge
-    # goes to 1, where the solution below would be infinite: hence 1.01.
+    ratio = (narrow_slope[is_edge] / np.maximum(wide_slope[is_edge], 1e-12)) ** 2
+    # An edge blurred by s has the ratio (s^2 + WIDE^2) / (s^2 + NARROW^2). It is at
+    # most (WIDE / NARROW)^2, for s = 0. For a very blurred edge it goes to 1, where the
+    # solution for s^2 would be infinite: hence 1.01.
     ratio = np.clip(ratio, 1.01, (WIDE / NARROW) ** 2)
-    # An edge blurred by s has the ratio (s^2 + WIDE^2) / (s^2 + NARROW^2): solved for
-    # s^2.
     squared_blur = (WIDE**2 - ratio * NARROW**2) / (ratio - 1.0)
     return float(np.sqrt(np.quantile(squared_blur, SHARP_FRACTION)))
 
@@ -162,9 +169,10 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
         )
         for index, blur in enumerate(blurs):
             image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
-            # It is never None here, since an edge across the image has enough pixels;
-            # "or" is for the type.
-            measured_blur = _measure_edges(image) or 0.0
+            measured_blur = _measure_edges(image)
+            assert (
+                measured_blur is not None
+            )  # an edge across the image has enough pixels
             measured_blurs[index] += measured_blur / len(CALIBRATION_ANGLES)
     # An interpolation needs strictly rising values: equal ones get tiny differences.
     tiny_steps = 1e-9 * np.arange(len(blurs))

@@ -255,15 +255,16 @@ class Person:
         weights = self._get_tensor("weights", device)
         posed = skin_points(points, weights, rotations, translations)
         if bool(number_by_name["stride"] > 0.0):
-            raised = self._compute_leg_corrections(points, joints, number_by_name)
-            posed = self._correct_legs(posed, rotations, translations, joints, raised)
-        # the origin: below the pelvis (the first bone), at the height of the lowest
-        # point
+            foot_rises = self._compute_leg_corrections(points, joints, number_by_name)
+            posed = self._correct_legs(
+                posed, rotations, translations, joints, foot_rises
+            )
+        # The origin is below the pelvis (the first bone), at the height of the lowest
+        # point.
         pelvis = translations[0] + rotations[0] @ joints[0]
         origin = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
-        return (scale * (posed - origin)).index_select(
-            0, self._get_tensor("index", device)
-        )
+        point_of_vertex = self._get_tensor("index", device)
+        return (scale * (posed - origin)).index_select(0, point_of_vertex)
 
     def _compute_leg_corrections(
         self, points: Tensor, joints: Tensor, number_by_name: Mapping[str, Tensor]
@@ -283,8 +284,8 @@ class Person:
             The rise of the left foot, "l", and of the right one, "r".
         """
         zero = torch.zeros_like(number_by_name["walk"])
-        without_joints = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
-        joint_angles = add_walk({**number_by_name, **without_joints})
+        zero_angles = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
+        joint_angles = add_walk({**number_by_name, **zero_angles})
         rotations, translations = self._pose_bones(joints, joint_angles)
         weights = self._get_tensor("weights", points.device)
         lowest_heights = dict[str, Tensor]()
@@ -298,6 +299,8 @@ class Person:
             )
             lowest_heights[side] = shoe_points[:, 2].amin()
             contacts[side] = compute_contact(number_by_name["walk"] + phase_shift)
+        # A small stride, with which a person almost stands, has a part of the
+        # correction.
         fraction = (number_by_name["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
         return _compute_rises(lowest_heights, contacts, fraction)
 
@@ -312,9 +315,9 @@ class Person:
         """Return posed points (P, 3) with raised feet and legs stretched to them.
 
         A point of the foot rises by the foot's rise. A point of the leg rises by a
-        fraction of it, from 0 at the hip to 1 at the ankle. Each rise is multiplied by
-        the point's skinning weight for these bones, so that the rest of the body does
-        not move.
+        fraction of it, from 0 at the hip to 1 at the ankle. Both are multiplied by the
+        weight with which the bones of the foot, or of the leg, move the point. So the
+        rest of the body does not move.
 
         Args:
             posed: (P, 3) points after skinning.
@@ -390,25 +393,26 @@ class Person:
         age_weights = compute_interpolation_weights(
             number_by_name["age"], number_by_name["age"].new_tensor(AGES)
         )
-        # the extremes are thin, average and heavy, at equal steps of the parameter
-        weight_weights = compute_interpolation_weights(
+        # The "weight" of a body is 0 if it is thin, 0.5 if average and 1 if heavy.
+        body_weight_weights = compute_interpolation_weights(
             number_by_name["weight"],
             number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
         )
         # The mixture (G, A, W) without the height, and the heights (H,) in meters of
         # the shortest, the average and the tallest body of that mixture.
         mixture = torch.einsum(
-            "g,a,w->gaw", gender_weights, age_weights, weight_weights
+            "g,a,w->gaw", gender_weights, age_weights, body_weight_weights
         )
         statures = torch.einsum(
             "gaw,gawh->h", mixture, self._get_tensor("stature", mixture.device)
         )
         requested_height = number_by_name["height"]
+        # A mixture has at least the height of the shortest extreme, and at most that of
+        # the tallest. A body beyond these is scaled.
         clamped_height = torch.minimum(
             torch.maximum(requested_height, statures[0]), statures[2]
         )
         height_weights = compute_interpolation_weights(clamped_height, statures)
-        # Beyond the extremes the body is scaled.
         mixed_height = (height_weights * statures).sum()
         return mixture[..., None] * height_weights, requested_height / mixed_height
 
@@ -423,7 +427,8 @@ class Person:
             The points, and the joints in the order of bones.
         """
         device = mixture.device
-        # the factors of R shapes, each of which moves all points
+        # A body is the mean body plus R displacements of all points, each times a
+        # factor. Each extreme body has its R factors, "shares".
         shape_factors = torch.einsum(
             "gawh,gawhr->r", mixture, self._get_tensor("shares", device)
         )
@@ -477,8 +482,8 @@ class Person:
         """Return the rotations (3, 3) of limbs from the rest pose to all angles 0.
 
         A bone goes from its joint to the next one. Its rotation is the smallest that
-        rotates it to its direction in `STRAIGHT`. Hands follow the forearm, and are
-        also rotated by 60 degrees about the vertical.
+        rotates it to its direction in `STRAIGHT`. Hands are rotated like the forearm,
+        and then by 60 degrees about the vertical.
 
         Args:
             joints: (J, 3) positions in the rest pose.
@@ -523,15 +528,14 @@ def compute_interpolation_weights(value: Tensor, nodes: Tensor) -> Tensor:
     """
     # how far the value is through each of the n - 1 intervals
     fraction = (value - nodes[:-1]) / (nodes[1:] - nodes[:-1])
-    # 1 for intervals before the value, 0 for those after it. At a node the derivative
-    # is that of one side, not the sum of both.
+    # 1 for intervals before the value, 0 for those after it. These constants, unlike
+    # `clamp`, have no derivative at a node: there it is only that of the next interval.
     is_within = (fraction >= 0.0) & (fraction < 1.0)
     fraction = torch.where(is_within, fraction, (fraction >= 1.0).to(fraction.dtype))
-    # A node's weight is the fraction of the interval before it (1 for the first node)
-    # minus that of the interval after it (0 for the last).
-    return torch.cat([torch.ones_like(fraction[:1]), fraction]) - torch.cat(
-        [fraction, torch.zeros_like(fraction[:1])]
-    )
+    # for each node the fraction of the interval before it, and of that after it
+    fraction_before = torch.cat([torch.ones_like(fraction[:1]), fraction])
+    fraction_after = torch.cat([fraction, torch.zeros_like(fraction[:1])])
+    return fraction_before - fraction_after
 
 
 def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -575,15 +579,16 @@ def _compute_gait_angle(
     """Return an angle of the gait, degrees, at a phase.
 
     The ten samples of a cycle are interpolated by their Fourier series, which is smooth
-    and periodic. It has waves of the orders 0 to 5. The last is left out, since ten
-    samples do not determine its phase.
+    and periodic. It has waves of the orders 0 to 5. The wave of the order 5 is left
+    out, since ten samples do not determine its phase.
 
     Args:
         tenths: degrees at each tenth of the cycle.
         phase: () radians of the left side's cycle.
         phase_shift: radians, pi for the right side.
     """
-    waves = np.fft.rfft(tenths)[:5] / len(tenths)
+    n_orders = 5  # 0 to 4
+    waves = np.fft.rfft(tenths)[:n_orders] / len(tenths)
     swing = phase.new_tensor(float(waves[0].real))
     for order, wave in enumerate(waves[1:], 1):
         argument = order * (phase + phase_shift)
@@ -603,7 +608,9 @@ def compute_contact(phase: Tensor) -> Tensor:
     `LOWERED`, and stands again at 360.
     """
     degrees = torch.remainder(phase, 360.0)
-    # `lifted` rises from 0 to 1 while the foot is lifted, `lowered` while it is lowered
+    # `lifted` rises from 0 to 1 while the foot is lifted, `lowered` while it is
+    # lowered. Contact depends on their difference: 0 in stance, 1 in the swing, 0 at
+    # 360.
     lifted = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
     lowered = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
     return 0.5 + 0.5 * torch.cos(np.pi * (lifted - lowered))
@@ -639,9 +646,10 @@ def _compute_rises(
     """Return by how many meters each foot has to rise to touch the ground.
 
     The ground is assumed at the mean height of both feet, weighted by contact. A foot
-    with full contact is moved to the ground. A foot without contact keeps its height
-    above the ground, but is not left below it. With a partial contact, it keeps a
-    proportional part of its height. A negative rise lowers the foot.
+    with full contact is moved to the ground. A foot without contact stays at its
+    height, or is moved up to the ground if it is below. With a partial contact, the
+    foot keeps a proportional part of its height above the ground. A negative rise
+    lowers the foot.
 
     Args:
         lowest: height in meters of the lowest point of each foot, "l" and "r".
@@ -656,7 +664,8 @@ def _compute_rises(
     for side, height in lowest.items():
         height_above_ground = (height - ground_height).clamp(min=0.0)
         clearance = height_above_ground * (1.0 - contact[side])
-        rises[side] = fraction * (ground_height + clearance - height)
+        corrected_height = ground_height + clearance
+        rises[side] = fraction * (corrected_height - height)
     return rises
 
 
@@ -669,13 +678,14 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Args:
         angle: degrees by parameter, such as "left_knee".
     """
-    # The back bends in three equal parts; neck and head bend by half of the angle each.
+    # Each of three bones of the back has a third of the angle, and neck and head have a
+    # half each.
     spine, side, turn = (
         angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
     )
     spine_rotation = (
         make_axis_rotation("y", spine)
-        @ make_axis_rotation("x", -side)
+        @ make_axis_rotation("x", -side)  # "spine_side" bends to the left
         @ make_axis_rotation("z", turn)
     )
     neck_rotation = make_axis_rotation(
@@ -699,8 +709,8 @@ def _compute_limb_turns(
     """Return the rotations (3, 3) of the bones of one arm and one leg, by bone.
 
     With all angles 0 a limb hangs down. A rotation about y (to the left) by a negative
-    angle raises it to the front. One about x (ahead) by a positive angle raises the
-    left limb to its side.
+    angle moves its lower end to the front. The knee bends to the back. A rotation about
+    x (ahead) by a positive angle raises the left limb to its side.
 
     Args:
         angle_by_joint: degrees by parameter, such as "left_knee".

@@ -1,8 +1,8 @@
 """Photographs with a camera file beside them, and folders of such photographs.
 
 ``desk.yaml`` beside ``desk.jpg`` is a camera file in any supported format. It may have
-further entries (`VIEW_KEYS`): the pose of the object, the part of the photograph to use,
-settings of the scene, and a mask of what is in front of the object.
+further entries (`VIEW_KEYS`): the pose of the object, the part of the photograph to
+use, settings of the scene, and a mask of what is in front of the object.
 """
 
 from __future__ import annotations
@@ -169,8 +169,9 @@ def read_photograph_folder(
             directory, n_pixels, MAX_FOLDER_PIXELS, "photographs of at most {} pixels"
         )
         view = read_photograph_view(path)
-        first = next(iter(views.values()), view)
-        _check_same_statements(view, first)
+        # The first view is compared with itself, which never fails.
+        first_view = next(iter(views.values()), view)
+        _check_same_statements(view, first_view)
         views[path.name] = view
     return views
 
@@ -206,14 +207,15 @@ def _check_inside(path: Path, folder: Path) -> None:
 
 
 def _check_same_statements(view: PhotographView, first: PhotographView) -> None:
-    """Raise FileFormatError unless two camera files state the same names.
+    """Raise FileFormatError unless the camera files of two views state the same names.
 
     Values that only one of the files states would be unknown for the other photograph.
     """
     for checked_view, other_view in ((view, first), (first, view)):
         missing = sorted(other_view.stated_names - checked_view.stated_names)
         if missing:
-            # A photograph without a camera file is named itself.
+            # The message names the camera file, or the photograph if it has none. The
+            # other view states something, so that it has a camera file.
             path = checked_view.file or checked_view.spec
             raise FileFormatError(
                 f"{path}: expected {missing[0]}, which {Path(other_view.file).name} "

@@ -89,12 +89,12 @@ class PhotographedGround:
             [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
             axis=-1,
         )
-        # The center of the map's first row is straight up, that of its last row
-        # straight down.
+        # Rows of the map are counted at their centers: row 0 is straight up, and the
+        # last one straight down.
         angle_from_up = math.pi - np.arctan(radius)
         map_row = angle_from_up / math.pi * (self._map_rows - 1)
-        # The texture's rows begin at the horizon. Its rows have borders half a row from
-        # their centers: v is 1 at the upper border of row 0.
+        # Row 0 of the texture is `_horizon_row` of the map. v is 1 at the upper border
+        # of row 0, half a row above its center.
         texture_row = map_row - self._horizon_row
         n_texture_rows = self._map_rows - self._horizon_row
         v = 1.0 - (texture_row + 0.5) / n_texture_rows
@@ -113,10 +113,10 @@ class PhotographedGround:
         """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
 
         Row 0 is the horizon, the last row is straight down, and columns are those of
-        the map. The plane was made for a map of some height, and h is half of that: the
-        rows of another map are interpolated. The reflectance is pi * radiance /
-        irradiance, with which the plane looks like the map; it is 0 if no light comes
-        from above. The result is differentiable.
+        the map. h is half of the height of the map for which the plane was made; the
+        rows of a map with another height are interpolated. The reflectance is pi *
+        radiance / irradiance, so that the lit plane looks like the map. It is 0 if no
+        light comes from above. The result is differentiable.
         """
         rows = radiance.shape[0]
         # the rows of the plane's map, as rows of this one
@@ -140,15 +140,17 @@ def _make_ring_faces() -> npt.NDArray[np.uint32]:
 
     Between two rings each sector has two triangles. Vertices are stored ring by ring.
     Each ring has `N_SECTORS` + 1, of which the last is at the position of the first.
-    The first ring has a radius of 0, so that its sectors have one triangle each: the
-    other one would have no area.
+    The first ring of vertices has a radius of 0, so that a sector next to it has only
+    one triangle: the other one would have no area.
     """
     ring_starts = np.arange(N_RINGS)[:, None] * (N_SECTORS + 1)
     inner = (ring_starts + np.arange(N_SECTORS)).ravel()
     outer = inner + N_SECTORS + 1
     outer_triangles = np.stack([outer, inner, outer + 1], axis=1)
-    # without those of the first ring
-    inner_triangles = np.stack([inner, inner + 1, outer + 1], axis=1)[N_SECTORS:]
+    inner_triangles = np.stack([inner, inner + 1, outer + 1], axis=1)
+    inner_triangles = inner_triangles[
+        N_SECTORS:
+    ]  # those of the first ring have no area
     return np.concatenate([outer_triangles, inner_triangles]).astype(np.uint32)
 
 
@@ -166,13 +168,13 @@ def compute_irradiance(radiance: Tensor) -> Tensor:
     the upper half. Row 0 is straight up, the last one straight down. Differentiable.
     """
     rows, columns = radiance.shape[:2]
-    # Angles from straight up at which rows begin and end. The first and the last row
-    # are half as high as the others, since their middle is a pole.
+    # Angles from straight up at which rows begin and end, half a row before and after
+    # their centers. The centers of the first and the last row are the poles.
     row_bounds = (
         torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5
     ) * (math.pi / (rows - 1))
-    # Integral of cos sin (sin is the length of a row) over the angle from straight up;
-    # clamped, as nothing comes from below the horizon.
+    # The integral of cos(a) sin(a) over an angle a is sin(a)^2 / 2, where sin(a) is the
+    # length of a row. Angles are clamped, since light from below does not count.
     antiderivative = row_bounds.clamp(0.0, math.pi / 2.0).sin().square() / 2.0
     weights = (antiderivative.diff() * (2.0 * math.pi / columns)).to(radiance.dtype)
     return (radiance.sum(dim=1) * weights[:, None]).sum(dim=0)

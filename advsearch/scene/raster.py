@@ -54,12 +54,12 @@ def rasterize_triangles(
         For each pixel of each triangle, triangle by triangle, the triangle, row and
         column (N,), and the corners' barycentric weights (N, 3).
     """
-    # The candidates are from a wider range, so that none is missed by rounding. Their
-    # weights decide.
+    # Candidates may miss a triangle by more than the tolerance, so that rounding leaves
+    # none out. Those whose weights are too negative are removed below.
     face, row, column = find_candidate_pixels(corners, shape, 10.0 * PIXEL_TOLERANCE)
     weights = compute_barycentric(corners[face], row, column)
-    inside = (weights >= -tolerance).all(axis=1)
-    return face[inside], row[inside], column[inside], weights[inside]
+    is_inside = (weights >= -tolerance).all(axis=1)
+    return face[is_inside], row[is_inside], column[is_inside], weights[is_inside]
 
 
 def find_candidate_pixels(
@@ -73,16 +73,19 @@ def find_candidate_pixels(
         corners: (F, 3, 2) columns and rows of the triangles' corners, integers at pixel
             centers.
         shape: height and width of the raster.
-        tolerance: pixels along the row or column by which a center may miss a triangle.
+        tolerance: distance, in pixels along a row or column, by which a center may miss
+            a triangle.
 
     Returns:
         Triangle, row and column (N,).
     """
-    face, row = _list_integers_within(
-        corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], tolerance
-    )
+    y = corners[..., 1]
+    height, width = shape
+    # (S,) triangle and row of each span, the part of a triangle in one row of pixels
+    face, row = _list_integers_within(y.min(axis=1), y.max(axis=1), height, tolerance)
     left, right = _cross_rows(corners[face], row, tolerance)
-    span, column = _list_integers_within(left, right, shape[1], tolerance)
+    # (N,) span and column of each pixel
+    span, column = _list_integers_within(left, right, width, tolerance)
     return face[span], row[span], column
 
 
@@ -102,6 +105,8 @@ def find_read_texels(corners: Float64Array, shape: tuple[int, int]) -> BoolArray
     height, width = shape
     cell_row, cell_column = _find_touched_cells(corners, shape)
     is_read = np.zeros(shape, np.bool_)
+    # Cell i is between the texels i - 1 and i. The remainder wraps texels beyond the
+    # border to the opposite one.
     for read_row in (cell_row - 1, cell_row):
         for read_column in (cell_column - 1, cell_column):
             is_read[read_row % height, read_column % width] = True
@@ -113,29 +118,32 @@ def _find_touched_cells(
 ) -> tuple[IntArray, IntArray]:
     """Return the row and the column of each cell that a triangle touches.
 
-    Cell i of a row is between the centers of the texels i - 1 and i. So the cells are 0
-    to the width of the texture. At both ends, one of the two texels is at the opposite
-    edge, since the texture repeats.
+    Cell i of a row is between the centers of the texels i - 1 and i. A row of n texels
+    has n + 1 cells, 0 to n: the first is between the texels -1 and 0, and the last
+    between n - 1 and n. Since the texture repeats, the texel -1 is the texel n - 1, and
+    the texel n is the texel 0.
 
     Args:
         corners: (F, 3, 2) column and row of each corner, integers at texel centers.
         shape: height and width of the texture.
     """
     height, width = shape
-    # In coordinates of cells, cell i is from i to i + 1.
+    # Cell i covers the texel coordinates i - 1 to i. After adding 1 it covers i to i +
+    # 1, so that a point's cell is its coordinate rounded down.
     cell_corners = corners + 1.0
     # (F,) first and last row of cells that each triangle touches
     first_row = np.floor(cell_corners[..., 1].min(axis=1) - PIXEL_TOLERANCE)
     last_row = np.floor(cell_corners[..., 1].max(axis=1) + PIXEL_TOLERANCE)
+    # (S,) triangle and row of each strip, the part of a triangle in one row of cells
     face, row = _list_integers_within(first_row, last_row, height + 1, tolerance=0.0)
-    # Each entry is a triangle in one row of cells. It touches a range of columns.
     left, right = _find_column_span(cell_corners[face], row)
     first_column = np.floor(left - PIXEL_TOLERANCE)
     last_column = np.floor(right + PIXEL_TOLERANCE)
-    entry, column = _list_integers_within(
+    # (N,) strip and column of each cell that a strip touches
+    strip, column = _list_integers_within(
         first_column, last_column, width + 1, tolerance=0.0
     )
-    return row[entry], column
+    return row[strip], column
 
 
 def _find_column_span(
@@ -150,21 +158,21 @@ def _find_column_span(
     Returns:
         (N,) smallest and (N,) largest column; (inf, -inf) where nothing is left.
     """
-    rows = row[:, None]
+    x = corners[..., 0]
     y = corners[..., 1]
-    is_between = (y >= rows - PIXEL_TOLERANCE) & (y <= rows + 1 + PIXEL_TOLERANCE)
-    left = np.where(is_between, corners[..., 0], np.inf).min(axis=1)
-    right = np.where(is_between, corners[..., 0], -np.inf).max(axis=1)
-    for offset in (0, 1):
-        # A triangle that does not cross the row has an empty range: its first column is
-        # larger than its last.
-        first_column, last_column = _cross_rows(corners, row + offset, PIXEL_TOLERANCE)
-        left = np.where(
-            first_column <= last_column, np.minimum(left, first_column), left
-        )
-        right = np.where(
-            first_column <= last_column, np.maximum(right, last_column), right
-        )
+    strip_start = row[:, None]
+    strip_end = strip_start + 1
+    is_in_strip = (y >= strip_start - PIXEL_TOLERANCE) & (
+        y <= strip_end + PIXEL_TOLERANCE
+    )
+    left = np.where(is_in_strip, x, np.inf).min(axis=1)
+    right = np.where(is_in_strip, x, -np.inf).max(axis=1)
+    for border_row in (row, row + 1):
+        first_column, last_column = _cross_rows(corners, border_row, PIXEL_TOLERANCE)
+        # The range of a triangle that does not cross the row is empty.
+        crosses = first_column <= last_column
+        left = np.where(crosses, np.minimum(left, first_column), left)
+        right = np.where(crosses, np.maximum(right, last_column), right)
     return left, right
 
 
@@ -230,28 +238,46 @@ def _cross_rows(
     """Return the first and last column (N,) of triangles (N, 3, 2) on rows (N,).
 
     These are the columns at which the triangle's edges cross its row. An edge that ends
-    less than `tolerance` before the row is regarded as crossing it at that end. Level
-    edges are left out, since the other two edges have the same ends. If no edge crosses
-    the row, the range is empty: the first column is 0 and the last -1.
+    at most `tolerance` before the row counts as crossing it at that end. Level edges
+    are left out, since the other two edges have the same ends. If no edge crosses the
+    row, the range is empty: the first column is 0 and the last -1.
     """
     left = np.full(len(row), np.inf)
     right = np.full(len(row), -np.inf)
     for start_corner, end_corner in ((0, 1), (1, 2), (2, 0)):
-        x0, y0 = corners[:, start_corner].T
-        x1, y1 = corners[:, end_corner].T
-        rise = y1 - y0
-        # fraction of the edge at which the row is; any number for a level edge
-        fraction = np.clip((row - y0) / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
-        crosses = (
-            (np.minimum(y0, y1) - tolerance <= row)
-            & (row <= np.maximum(y0, y1) + tolerance)
-            & (rise != 0.0)
+        x, crosses = _cross_edge(
+            corners[:, start_corner], corners[:, end_corner], row, tolerance
         )
-        x = x0 + fraction * (x1 - x0)
         left = np.where(crosses, np.minimum(left, x), left)
         right = np.where(crosses, np.maximum(right, x), right)
     is_empty = left > right
     return np.where(is_empty, 0.0, left), np.where(is_empty, -1.0, right)
+
+
+def _cross_edge(
+    start: Float64Array, end: Float64Array, row: IntArray, tolerance: float
+) -> tuple[Float64Array, BoolArray]:
+    """Return the column (N,) at which each edge crosses its row, and whether it does.
+
+    Args:
+        start: (N, 2) column and row of the edge's first end.
+        end: (N, 2) column and row of its other end.
+        row: (N,) the row to cross.
+        tolerance: distance by which an edge may end before the row.
+    """
+    x0, y0 = start.T
+    x1, y1 = end.T
+    rise = y1 - y0
+    is_level = rise == 0.0
+    # Fraction of the edge at which the row is. It is clipped to the edge's ends, since
+    # the row may be beyond them by up to the tolerance.
+    fraction = np.clip((row - y0) / np.where(is_level, 1.0, rise), 0.0, 1.0)
+    crosses = (
+        (np.minimum(y0, y1) - tolerance <= row)
+        & (row <= np.maximum(y0, y1) + tolerance)
+        & ~is_level
+    )
+    return x0 + fraction * (x1 - x0), np.asarray(crosses)
 
 
 # Distance from a chart, in texels, up to which texels belong to it: a bilinear look-up
@@ -302,12 +328,13 @@ class Charts:
     def compute_areas(self) -> Float32Array:
         """Return the surface area (h, w) of each texel, in squared mesh units.
 
-        It is the area of the texel's face, divided by the number of texels that the
-        face covers in the texture. It is 0 outside of all charts.
+        It is the area of the texel's face on the surface, divided by the face's area in
+        the texture, in texels. It is 0 outside of all charts.
         """
         corners = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         texel_corners = _to_texel_coordinates(self.mesh, self.is_covered.shape)
-        # Both are twice an area, on the surface and in texels. Only their ratio is used.
+        # Both are twice an area, on the surface and in texels. Only their ratio is
+        # used.
         doubled_areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
         doubled_texels = np.abs(compute_doubled_areas(texel_corners))
         area_per_texel = np.where(
@@ -341,8 +368,8 @@ def find_exclusive_texels(
 def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights of every texel of a texture.
 
-    Where charts overlap, a texel has the last of the faces. A texel outside of all
-    charts has the values of the nearest texel inside one.
+    Where charts overlap, a texel belongs to the face with the largest index. A texel
+    outside of all charts has the values of the nearest texel inside one.
 
     Args:
         mesh: mesh with texture coordinates.
@@ -363,13 +390,22 @@ def rasterize_charts(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     weights = _compute_clipped_weights(corners[face], points)
     face_map = np.zeros(shape, np.int64)
     weight_map = np.zeros((*shape, 3))
-    covered = np.zeros(shape, np.bool_)
+    is_covered = np.zeros(shape, np.bool_)
     face_map[row, column] = face
     weight_map[row, column] = weights
-    covered[row, column] = True
-    distance, indices = ndimage.distance_transform_edt(~covered, return_indices=True)
-    nearest = tuple(indices)
-    return Charts(mesh, face_map[nearest], weight_map[nearest], covered, distance)
+    is_covered[row, column] = True
+    # A covered texel is its own nearest one, at the distance 0.
+    distance, nearest_indices = ndimage.distance_transform_edt(
+        ~is_covered, return_indices=True
+    )
+    nearest = tuple(nearest_indices)  # rows and columns, each (h, w)
+    return Charts(
+        mesh=mesh,
+        face_index=face_map[nearest],
+        weights=weight_map[nearest],
+        is_covered=is_covered,
+        texels_to_covered=distance,
+    )
 
 
 def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64Array:
@@ -382,14 +418,14 @@ def _compute_clipped_weights(corners: Float64Array, points: IntArray) -> Float64
         corners: (N, 3, 2) columns and rows of the corners of each point's triangle.
         points: (N, 2) columns and rows of the points.
     """
-    doubled = compute_doubled_areas(corners)
-    # Without an area all three are 0 here, and 1 / 3 at the end.
-    divisor = np.where(doubled == 0.0, 1.0, doubled)
+    doubled_area = compute_doubled_areas(corners)
+    divisor = np.where(doubled_area == 0.0, 1.0, doubled_area)
     corner_weights = []
     for next_corner, previous_corner in ((1, 2), (2, 0), (0, 1)):
         a = corners[:, next_corner] - points
         b = corners[:, previous_corner] - points
-        # the area between the point and the side opposite of the corner
+        # twice the signed area between the point and the side opposite of the corner,
+        # as a fraction of the triangle's, which has the same sign for points inside
         corner_weights.append((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / divisor)
     weights = np.maximum(np.stack(corner_weights, axis=1), 0.0)
     total = weights.sum(axis=1, keepdims=True)
@@ -452,7 +488,8 @@ class MeshSurface:
         self._lower = self._corners.min(axis=1)
         self._upper = self._corners.max(axis=1)
         # (F, 3) corners of the faces, with one index for all vertices at one position
-        corners = weld_vertices(mesh)[0][mesh.faces]
+        point_of_vertex = weld_vertices(mesh)[0]
+        corners = point_of_vertex[mesh.faces]
         # (3 F, 2) edges in three blocks, each with one edge of all faces
         edges = np.concatenate(
             [corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]
@@ -462,7 +499,7 @@ class MeshSurface:
         edges = np.sort(edges, axis=1)
         order = np.lexsort((edges[:, 1], edges[:, 0]))
         is_same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-        face = order % len(mesh.faces)
+        face = order % len(mesh.faces)  # each block of edges has one edge of every face
         # (E, 2) pairs of faces
         self._neighbours = np.stack([face[:-1][is_same], face[1:][is_same]], axis=1)
 
@@ -531,8 +568,8 @@ class MeshSurface:
 
         Faces are returned if their bounding boxes are within the radius, if they face
         the direction `normal`, and if a chain of such faces, neighbor by neighbor,
-        connects them to the face. So the opposite wall of a cup is left out, and the
-        next slat of a chair.
+        connects them to the face. So a patch on a cup leaves out the opposite wall of
+        the cup, and a patch on a chair's slat leaves out the next slat.
 
         Args:
             face: index of the face at which the chains begin. It is always returned.
@@ -543,13 +580,17 @@ class MeshSurface:
         Returns:
             (F,) bool.
         """
+        # offset from the point to each face's bounding box, 0 along axes where they
+        # overlap
         box_gap = np.maximum(np.maximum(self._lower - point, point - self._upper), 0.0)
         is_near = np.linalg.norm(box_gap, axis=1) <= radius
         is_inside = is_near & (self.normals @ normal > 0.0)
         is_inside[face] = True
-        links_inside = self._neighbours[is_inside[self._neighbours].all(axis=1)]
-        labels = find_components(len(is_inside), *links_inside.T)
-        return np.asarray(is_inside & (labels == labels[face]))
+        # pairs of neighbors that are both inside
+        is_pair_inside = is_inside[self._neighbours].all(axis=1)
+        left_face, right_face = self._neighbours[is_pair_inside].T
+        component = find_components(len(is_inside), left_face, right_face)
+        return np.asarray(is_inside & (component == component[face]))
 
 
 def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:
@@ -568,9 +609,9 @@ def weld_vertices(mesh: Mesh) -> tuple[IntArray, int]:
 def _to_texel_coordinates(mesh: Mesh, shape: tuple[int, int]) -> Float64Array:
     """Return texture coordinates of the faces' corners (F, 3, 2) in texels.
 
-    They are column and row, integers at texel centers (hence the half), with row 0 at
-    v = 1. If the texture repeats, each face is moved by integers, so that its center is
-    in the unit square.
+    They are column and row, with row 0 at v = 1. The center of the first texel is at 0,
+    so half a texel is subtracted. If the texture repeats, each face is moved by
+    integers, so that its center is in the unit square.
     """
     uvs = mesh.uvs[mesh.faces].astype(np.float64)
     if mesh.repeats:

@@ -104,12 +104,10 @@ class RigCamera:
         orbit_rotation[:3, :3] = torch.from_numpy(make_rotation(self.azimuth, 0.0, 0.0))
         # With the shift c - R c, the rotation leaves the center c where it is.
         orbit_rotation[:3, 3] = center - orbit_rotation[:3, :3] @ center
-        camera_inputs = {
-            **inputs,
-            "camera.to_world": orbit_rotation
-            @ inputs.get("camera.to_world", first_pose)
-            @ mount_pose,
-        }
+        first_to_world = inputs.get("camera.to_world", first_pose)
+        # from the right: from the mount to the first camera, to the world, and around
+        to_world = orbit_rotation @ first_to_world @ mount_pose
+        camera_inputs = {**inputs, "camera.to_world": to_world}
         if self.fov is not None:
             camera_inputs["camera.fov"] = torch.tensor([self.fov])
         if self.camera_model is not None:
@@ -143,13 +141,15 @@ def read_rig(spec: str) -> tuple[RigCamera, ...]:
     # only a rig if several are named.
     if Path(path).suffix.lower() == ".json" and "," in camera_names:
         return _read_transforms(path, camera_names)
-    # A single camera is named, or the format has no rigs.
-    if "#" in spec or Path(path).suffix.lower() not in (".yaml", ".yml"):
+    names_single_camera = "#" in spec
+    has_rig_format = Path(path).suffix.lower() in (".yaml", ".yml")
+    if names_single_camera or not has_rig_format:
         return ()
     try:
         data = parse_yaml(read_text(Path(path), "a camera file", MAX_YAML_BYTES))
     except (OSError, ValueError):
-        return ()  # `read_camera` reports the error
+        # The file is then read as that of a single camera, which reports the error.
+        return ()
     if not isinstance(data, dict):
         return ()
     entries = data.get("cameras")
@@ -219,7 +219,8 @@ def read_photograph_cameras(path: str) -> PhotographCameras | None:
     try:
         data = parse_json(read_text(Path(path), "a camera file", MAX_JSON_SIZE))
     except (OSError, ValueError):
-        return None  # `read_camera` reports the error
+        # The file is then read as that of a single camera, which reports the error.
+        return None
     if not isinstance(data, dict) or "frames" not in data:
         return None
     frames = _check_frames(path, data)["frames"]
@@ -268,8 +269,8 @@ def _find_photograph(path: str, files: Mapping[str, str], photograph: Path) -> s
         name: _count_shared_parts(file, photograph) for name, file in files.items()
     }
     largest = max(counts.values(), default=0)
-    # a count of 0 means another file
-    names = [name for name, count in counts.items() if count == largest > 0]
+    # If no path has a part in common, no entry is for this photograph.
+    names = [name for name, count in counts.items() if count == largest and count > 0]
     if len(names) == 1:
         return names[0]
     examples = ", ".join(PurePosixPath(file).name[:40] for file in files.values())
@@ -301,7 +302,7 @@ def _check_mounts(spec: str, mounts: Sequence[RigCamera]) -> None:
     """Raise FileFormatError unless cameras of a rig fit together.
 
     There have to be 2 to `MAX_CAMERAS` with different names. The first is the scene's
-    camera, to which the others are relative: it may have no pose, azimuth or delay.
+    camera, to which the others are relative: it must have no pose, azimuth or delay.
     """
     if not 2 <= len(mounts) <= MAX_CAMERAS:
         raise FileFormatError(
@@ -322,8 +323,8 @@ def _check_mounts(spec: str, mounts: Sequence[RigCamera]) -> None:
 def _read_entry(spec: str, index: int, entry: Any) -> RigCamera:
     """Return the camera of an entry of our own format.
 
-    Any of `ENTRY_KEYS` may be missing. A camera without a pose has the pose of the
-    first camera, and one without a lens has its lens.
+    Any of `ENTRY_KEYS` may be missing. A camera without a pose or a field of view has
+    that of the first camera.
 
     Args:
         spec: the file, for messages.
@@ -531,20 +532,19 @@ def _read_frame_models(
     first_model = read_camera(f"{path}#{names[0]}")
     models = []
     for name, lens in zip(names, lenses, strict=True):
-        # Frames with the same lens share its model.
-        is_same = lens == lenses[0]
-        models.append(first_model if is_same else read_camera(f"{path}#{name}"))
+        # Usually all frames have the same lens, whose model is read only once.
+        has_first_lens = lens == lenses[0]
+        models.append(first_model if has_first_lens else read_camera(f"{path}#{name}"))
     return models
 
 
 def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
-    """Return the factor by which the positions of a transforms.json are scaled already.
+    """Return the factor by which the positions in a transforms.json were multiplied.
 
     It is nerfstudio's `applied_scale`, times the scale within its `applied_transform`.
     The rotation and the shift of that transform are ignored: they move all cameras
     alike, and only poses relative to each other are used. Instant NGP's `scale` and
-    `offset` are ignored, too, since the program that reads the file would apply them:
-    the positions in the file are without them.
+    `offset` are ignored, too: they were not applied to the positions in the file.
 
     Raises:
         FileFormatError: the transform is not composed of rotation, shift and scale, or
@@ -731,10 +731,11 @@ def _measure_scale(path: str, applied_transform: Any) -> float:
     """
     rows = _to_rows(applied_transform)
     cells = [cell for row in rows for cell in row]
-    count = 12 if len(rows) == 3 else 16
+    count = 12 if len(rows) == 3 else 16  # 3 or 4 rows of 4 numbers
     numbers = _parse_numbers(path, "applied_transform", cells, count, MAX_DISTANCE)
     linear = np.reshape(numbers, (-1, 4))[:3, :3]
-    # a rotation times s has the determinant s^3, and times its transpose it is s^2
+    # For a rotation R, the matrix M = s R has the determinant s^3, and M M^T is s^2
+    # times the identity.
     scale = float(abs(float(np.linalg.det(linear))) ** (1.0 / 3.0))
     if not np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-3 * scale**2):
         raise FileFormatError(

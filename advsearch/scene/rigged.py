@@ -140,19 +140,19 @@ class SkeletonRig:
         )
         # The arrays of all parts are concatenated, then rows are selected for the mesh.
         max_joints = max(part.joints.shape[1] for part in parts)
-        node_starts = np.cumsum([0, *(len(part.joint_nodes) for part in parts)])
 
         def pad_joints(values: np.ndarray) -> np.ndarray:
             """Pad arrays (V, n) of joints or weights to a common n."""
             return np.pad(values, ((0, 0), (0, max_joints - values.shape[1])))
 
         points = np.concatenate([part.vertices for part in parts])
-        # `start` is the number of nodes of all parts before this one. `node_starts` has
-        # one more entry than there are parts, the number of all nodes.
+        # index in `_nodes` of the first node of each part
+        node_counts = [len(part.joint_nodes) for part in parts]
+        node_starts = np.cumsum(node_counts) - node_counts
         joints = np.concatenate(
             [
                 pad_joints(part.joints + start)
-                for part, start in zip(parts, node_starts, strict=False)
+                for part, start in zip(parts, node_starts, strict=True)
             ]
         )
         weights = np.concatenate([pad_joints(part.weights) for part in parts])
@@ -170,16 +170,22 @@ class SkeletonRig:
         self._targets: list[_MeshTarget] = []
         self._add_targets(parts, vertices)
         self._nodes_by_depth = _group_by_depth(self.skeleton.parents)
-        self._node_order = torch.argsort(
-            torch.cat([nodes for nodes, _ in self._nodes_by_depth])
-        )
+        # for each node its row among the nodes that are ordered by depth
+        nodes_from_roots = torch.cat([nodes for nodes, _ in self._nodes_by_depth])
+        self._node_order = torch.argsort(nodes_from_roots)
         self._local_matrices = torch.from_numpy(self.skeleton.local_matrices)
-        # The axes of each node at rest: the orthogonal matrix nearest to its matrix,
-        # without scale and shear (polar decomposition). It mirrors if the node does.
-        world = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
-        left, _, right = np.linalg.svd(world)
-        self._axes = torch.from_numpy(left @ right)
+        self._axes = self._compute_rest_axes()
         self._rest = self.pose({})
+
+    def _compute_rest_axes(self) -> Tensor:
+        """Return the axes (N, 3, 3) of each node at rest, in the file's axes.
+
+        They are the orthogonal matrix nearest to the node's matrix, without its scale
+        and shear (polar decomposition). They mirror if the node's matrix does.
+        """
+        linear = self._compute_world(self._local_matrices)[:, :3, :3].numpy()
+        left, _, right = np.linalg.svd(linear)
+        return torch.from_numpy(left @ right)
 
     def _add_targets(self, parts: Sequence[Movable], vertices: IntArray) -> None:
         """Store the morph targets of parts, for the vertices (V,) of the mesh.
@@ -195,26 +201,29 @@ class SkeletonRig:
         """
         start = 0  # index of the part's first vertex among those of all parts
         for part in parts:
-            count = len(part.vertices)
-            is_of_part = (vertices >= start) & (vertices < start + count)
-            mesh_rows = np.flatnonzero(is_of_part)
+            n_vertices = len(part.vertices)
+            # the mesh's vertices that are of this part, and their indices in the part
+            is_of_part = (vertices >= start) & (vertices < start + n_vertices)
+            mesh_vertices = np.flatnonzero(is_of_part)
+            part_vertices = vertices[mesh_vertices] - start
             for index, target in enumerate(part.targets):
-                # for each vertex of the part its row in the target; -1 if it stays
-                row_of_vertex = np.full(count, -1)
-                row_of_vertex[target.rows] = np.arange(len(target.rows))
-                target_rows = row_of_vertex[vertices[mesh_rows] - start]
-                is_moved = target_rows >= 0
+                # for each vertex of the part the row of its offset; -1 if it has none
+                offset_row_in_part = np.full(n_vertices, -1)
+                offset_row_in_part[target.rows] = np.arange(len(target.rows))
+                # the same for each of the mesh's vertices
+                offset_row = offset_row_in_part[part_vertices]
+                is_moved = offset_row >= 0
                 self._targets.append(
                     _MeshTarget(
                         name=target.name,
                         node=part.node,
                         index_in_node=index,
                         rest_weight=float(part.rest_weights[index]),
-                        rows=torch.from_numpy(mesh_rows[is_moved]),
-                        offsets=torch.from_numpy(target.offsets[target_rows[is_moved]]),
+                        rows=torch.from_numpy(mesh_vertices[is_moved]),
+                        offsets=torch.from_numpy(target.offsets[offset_row[is_moved]]),
                     )
                 )
-            start += count
+            start += n_vertices
 
     # ---- Parameters ----
 
@@ -241,8 +250,8 @@ class SkeletonRig:
         """Values of all parameters at rest, by name."""
         time = {TIME.name: 0.0} if self.clips else {}
         angles = {f"{name}.{axis}": 0.0 for name in self.node_of_joint for axis in AXES}
-        # If targets have the same name, the weight of the first is used: it is written
-        # last.
+        # If targets have the same name, the weight of the first is used. In the
+        # reversed order it comes last, and replaces the others.
         weights = {
             f"{target.name}.{WEIGHT}": target.rest_weight
             for target in reversed(self._targets)
@@ -447,11 +456,11 @@ class SkeletonRig:
                         make_axis_rotation(axis, number_by_name[f"{joint}.{axis}"])
                         @ rotation
                     )
-            # The rotation is about the axes of the mesh, but local matrices are in the
-            # axes of the parent node. In other axes a rotation R becomes A^T R A, where
-            # A maps the other axes to the present ones: first the file's axes, then
-            # those of the parent. The latter are those at rest, also if a clip has
-            # moved the parent: so the parent carries the axes of the rotation along.
+            # The rotation is in the axes of the mesh, and is converted to those of the
+            # file, and then to those of the parent node, in which local matrices are.
+            # If A maps vectors from the new axes to the old ones, a rotation R becomes
+            # A^T R A. The parent's axes are those at rest, also if a clip has moved the
+            # parent: so the axis of the rotation moves with the parent.
             rotation = rotation_to_mesh.T @ rotation @ rotation_to_mesh
             parent = int(self.skeleton.parents[node])
             if parent >= 0:
@@ -473,6 +482,8 @@ class SkeletonRig:
         """
         device = local_matrices.device
         world_by_level = list[Tensor]()
+        # `parent_rows` are the positions of the parents among the nodes of the previous
+        # level.
         for nodes, parent_rows in self._nodes_by_depth:
             matrices = local_matrices[nodes.to(device)]
             if world_by_level:
@@ -524,28 +535,45 @@ def sample_track(track: Track, seconds: Tensor) -> Tensor:
     is_rotation = track.path == "rotation"
     # the first key after the time; 0 or the number of keys outside of the track
     end_key = int(torch.searchsorted(times, seconds.detach(), right=True))
-    if track.interpolation == "STEP" or not 0 < end_key < len(times):
+    is_between_keys = 0 < end_key < len(times)
+    if track.interpolation == "STEP" or not is_between_keys:
         value = keys[max(0, end_key - 1), value_index]
         return value / value.norm() if is_rotation else value
     start_key = end_key - 1
     span = times[end_key] - times[start_key]
     fraction = (seconds - times[start_key]) / span
+    if track.interpolation == "CUBICSPLINE":
+        spline = _interpolate_spline(keys[start_key], keys[end_key], fraction, span)
+        return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
     start_value = keys[start_key, value_index]
     end_value = keys[end_key, value_index]
-    if track.interpolation == "CUBICSPLINE":
-        square = fraction**2
-        cube = fraction**3
-        # Tangents are per second: the span in seconds makes them per interval.
-        spline = (
-            (2.0 * cube - 3.0 * square + 1.0) * start_value
-            + span * (cube - 2.0 * square + fraction) * keys[start_key, 2]
-            + (3.0 * square - 2.0 * cube) * end_value
-            + span * (cube - square) * keys[end_key, 0]
-        )
-        return spline / spline.norm().clamp_min(1e-12) if is_rotation else spline
     if is_rotation:
         return slerp(start_value, end_value, fraction)
     return start_value + fraction * (end_value - start_value)
+
+
+def _interpolate_spline(
+    start_key: Tensor, end_key: Tensor, fraction: Tensor, span: Tensor
+) -> Tensor:
+    """Return the value (W,) of a cubic Hermite spline between two keys.
+
+    Args:
+        start_key: (3, W) of the first key the tangent before it, its value, and the
+            tangent after it. Tangents are per second.
+        end_key: (3, W) the same of the second key.
+        fraction: () 0 at the first key and 1 at the second.
+        span: () seconds between the keys.
+    """
+    _, start_value, tangent_after_start = start_key
+    tangent_before_end, end_value, _ = end_key
+    square = fraction**2
+    cube = fraction**3
+    return (
+        (2.0 * cube - 3.0 * square + 1.0) * start_value
+        + span * (cube - 2.0 * square + fraction) * tangent_after_start
+        + (3.0 * square - 2.0 * cube) * end_value
+        + span * (cube - square) * tangent_before_end
+    )
 
 
 def slerp(start: Tensor, end: Tensor, fraction: Tensor) -> Tensor:

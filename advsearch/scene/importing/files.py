@@ -231,6 +231,7 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
     if not file:  # no part is named
         file = str(path)
         part_name = ""
+    # With a suffix that is not supported, the suffix is the problem, and not the part.
     if part_name and Path(file).suffix.lower() in suffixes:
         raise FileFormatError(
             f"{file}: has no parts by name, got "
@@ -309,6 +310,7 @@ def decode_text(data: bytes) -> str:
 def parse_number_array(data: bytes, kind: type) -> npt.NDArray[np.generic]:
     """Parse numbers (N,) separated by blanks, up to the first word that is none."""
     with warnings.catch_warnings():
+        # numpy warns if it stops at such a word
         warnings.simplefilter("ignore")
         try:
             return np.fromstring(data, dtype=kind, sep=" ")

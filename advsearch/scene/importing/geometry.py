@@ -62,6 +62,7 @@ class TriangleSoup:
 
     def select_faces(self, mask: BoolArray) -> TriangleSoup:
         """Return the soup with the faces selected by a mask (F,)."""
+        # All fields but the points have an entry for each face.
         selected = {
             name: values[mask]
             for name, values in vars(self).items()
@@ -72,9 +73,9 @@ class TriangleSoup:
     def flip_faces(self, mask: BoolArray) -> TriangleSoup:
         """Return the soup with the faces of a mask (F,) wound the other way.
 
-        Normals stay as they are.
+        The normals of the corners keep their direction.
         """
-        # Two corners of a flipped face are swapped, with all their attributes.
+        # The last two corners of a flipped face are swapped, with all their attributes.
         order = np.where(mask[:, None], [0, 2, 1], [0, 1, 2])
         rows = np.arange(len(order))[:, None]
         names = ["faces", "normals", "uvs", "colors"]
@@ -92,10 +93,13 @@ class TriangleSoup:
 def compute_rotation(up: str, front: str) -> Float64Array:
     """Return the rotation (3, 3) from a file's axes to ours (front +x, up +z).
 
-    `up` is "y" or "z", `front` one of `FRONT_AXES` along another axis.
+    Args:
+        up: "y" or "z".
+        front: one of `FRONT_AXES`, such as "-y", but not along `up`.
     """
-    front_axis = np.eye(3)["xyz".index(front[1])]
-    front_axis = front_axis * (-1.0 if front[0] == "-" else 1.0)
+    sign, letter = front
+    front_axis = np.eye(3)["xyz".index(letter)]
+    front_axis = front_axis * (-1.0 if sign == "-" else 1.0)
     up_axis = np.eye(3)["xyz".index(up)]
     side_axis = np.cross(up_axis, front_axis)
     # Adding 0 turns -0.0 into 0.0.
@@ -204,7 +208,8 @@ def _weld(vertices: Float64Array) -> tuple[Float64Array, IntArray]:
     from scipy.spatial import cKDTree
 
     # Equal vertices are merged first, which leaves fewer points for the search of near
-    # ones. A chain of near points becomes one cluster; its first point replaces all.
+    # ones. Points that are connected by a chain of near pairs are a cluster. The first
+    # point of a cluster replaces all others.
     first_vertex, point_of_vertex = find_unique_rows(vertices)
     points = vertices[first_vertex]
     pairs = cKDTree(points).query_pairs(WELD_DISTANCE, output_type="ndarray")
@@ -253,12 +258,13 @@ def list_used_vertices(parts: Sequence[ImportedPart]) -> list[Float64Array]:
 def compute_extent(parts: Sequence[ImportedPart]) -> float:
     """Return the largest extent of all faces along an axis, in the file's unit.
 
-    It is infinite if it is too large for float64. Halves are subtracted, so that the
-    difference itself does not overflow.
+    It is infinite if it is too large for float64.
     """
     used_vertices = list_used_vertices(parts)
     lower = np.min([points.min(axis=0) for points in used_vertices], axis=0)
     upper = np.max([points.max(axis=0) for points in used_vertices], axis=0)
+    # Halves are subtracted, since numpy would warn about a difference that overflows.
+    # Python's multiplication yields infinity without a warning.
     return float((upper / 2 - lower / 2).max()) * 2
 
 
@@ -293,9 +299,10 @@ def repair_soup(soup: TriangleSoup, source: str, notes: Notes) -> TriangleSoup:
 def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     """Return the soup as a mesh, and the stored vertex of each of its vertices.
 
-    Corners become one vertex if they have the same point, normal and UV, and also the
-    same stored vertex, where that is known. The stored vertex is the index of the
-    vertex in the file's concatenated parts; without it the second value is None.
+    The stored vertex of a corner is the index of its vertex in the file's concatenated
+    parts. It is known if `soup.stored_vertices` is not None; otherwise the second value
+    is None. Corners become one vertex of the mesh if they have the same point, normal
+    and UV, and also the same stored vertex if that is known.
     """
     # Adding 0 turns -0.0 into 0.0, which has other bits.
     normals = (soup.normals.astype(np.float32) + np.float32(0.0)).reshape(-1, 3)
@@ -338,7 +345,8 @@ def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
             "visible"
         )
     soup = soup.flip_faces(is_turned)
-    is_inside_out = _find_inside_out_shells(soup, shell)[shell]
+    is_shell_inside_out = _find_inside_out_shells(soup, shell)
+    is_inside_out = is_shell_inside_out[shell]
     if is_inside_out.any():
         notes.warn(
             f"{int(is_inside_out.sum())} faces were inside out and have been turned "
@@ -350,78 +358,88 @@ def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
 def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """Find the edges that belong to exactly two faces (F, 3).
 
+    A face has three sides. Side k runs from corner k to the next corner of the face,
+    and is identified by its first corner, which has the index 3 f + k in face f. Two
+    sides with the same ends are one edge.
+
     Returns:
-        For each edge (E,) a corner of its left and of its right face: the corner at
-        which the edge starts, if one goes around that face. Corner k of face f has the
-        index 3 f + k. And (E,) whether both faces run along the edge in the same
-        direction: then they disagree in winding.
+        For each edge (E,) its side in one face, and its side in the other face. And
+        (E,) whether both sides run in the same direction: then the faces disagree in
+        winding.
     """
-    # The side k of a face runs from its corner k to the next one.
     start = faces.reshape(-1)
     end = np.roll(faces, -1, axis=1).reshape(-1)
     lower = np.minimum(start, end)
     upper = np.maximum(start, end)
-    # Sides of faces, sorted by their ends: those that are one edge follow one another.
-    order = np.lexsort((upper, lower))
-    is_new_edge = np.concatenate(
-        [[True], (np.diff(lower[order]) != 0) | (np.diff(upper[order]) != 0)]
+    # Sorted by their ends, the sides of an edge follow one another.
+    sorted_sides = np.lexsort((upper, lower))
+    ends_differ = (np.diff(lower[sorted_sides]) != 0) | (
+        np.diff(upper[sorted_sides]) != 0
     )
-    edge_entry = np.flatnonzero(is_new_edge)
-    edge_counts = np.diff(np.append(edge_entry, len(order)))
-    # positions in the order at which a run of exactly two sides begins
-    pair_entry = edge_entry[edge_counts == 2]
-    left_corner = order[pair_entry]
-    right_corner = order[pair_entry + 1]
+    edge_begin = np.flatnonzero(np.concatenate([[True], ends_differ]))
+    n_sides = np.diff(np.append(edge_begin, len(sorted_sides)))
+    pair_begin = edge_begin[n_sides == 2]
+    left_corner = sorted_sides[pair_begin]
+    right_corner = sorted_sides[pair_begin + 1]
     return left_corner, right_corner, start[left_corner] == start[right_corner]
 
 
 def _link_windings(
     left_face: IntArray, right_face: IntArray, same_direction: BoolArray
 ) -> tuple[IntArray, IntArray]:
-    """Return the two ends (2 E,) of each link of the graph in `_find_turned_faces`.
+    """Link the states of neighboring faces that agree in winding.
 
-    Each face f has two nodes, 2 f for "as it is" and 2 f + 1 for "turned". Each shared
-    edge makes two links. A link joins two nodes of its faces that agree in winding.
+    Each face f has two states, which are nodes of a graph: 2 f for "as it is" and
+    2 f + 1 for "turned". A shared edge links each state of its left face to the state
+    of its right face that agrees with it.
 
     Args:
-        left_face: one face of each shared edge.
-        right_face: the other face.
-        same_direction: whether both run through the edge in the same direction, so that
-            one of them must be turned.
+        left_face: (E,) one face of each shared edge.
+        right_face: (E,) the other face.
+        same_direction: (E,) whether both run along the edge in the same direction, so
+            that one of them must be turned.
+
+    Returns:
+        The first and the second node (2 E,) of each link.
     """
     left_as_is = 2 * left_face
     left_turned = 2 * left_face + 1
-    # `same_direction` is 1 where a left face as it is agrees with the right one turned.
-    right_for_as_is = 2 * right_face + same_direction
-    right_for_turned = 2 * right_face + 1 - same_direction
-    starts = np.concatenate([left_as_is, left_turned])
-    ends = np.concatenate([right_for_as_is, right_for_turned])
-    return starts, ends
+    right_as_is = 2 * right_face
+    right_turned = 2 * right_face + 1
+    match_of_as_is = np.where(same_direction, right_turned, right_as_is)
+    match_of_turned = np.where(same_direction, right_as_is, right_turned)
+    first_node = np.concatenate([left_as_is, left_turned])
+    second_node = np.concatenate([match_of_as_is, match_of_turned])
+    return first_node, second_node
 
 
-def _select_larger_choice(
-    choice_as_is: IntArray, choice_turned: IntArray, area: Float64Array
+def _select_windings(
+    winding_as_is: IntArray, winding_turned: IntArray, area: Float64Array
 ) -> BoolArray:
     """Return which faces (F,) to turn over, so that most area of each shell stays.
 
-    A shell has two consistent windings, its choices. Choices of all shells are numbered
-    from 0. One choice of a shell leaves a face as it is, and the other turns it over.
+    A shell has two consistent windings. The windings of all shells are numbered from 0.
+    One winding of a shell leaves a face as it is, and the other turns it over. The one
+    that leaves more area as it is is selected.
 
     Args:
-        choice_as_is: (F,) index of the choice that leaves the face as it is.
-        choice_turned: (F,) index of the choice that turns the face over.
+        winding_as_is: (F,) index of the winding that leaves the face as it is.
+        winding_turned: (F,) index of the winding that turns the face over.
         area: (F,) twice the area of each face.
     """
-    n_choices = int(max(choice_as_is.max(), choice_turned.max())) + 1
-    # (choices,) the area that each choice leaves as it is
-    unturned_area = np.bincount(choice_as_is, weights=area, minlength=n_choices)
-    area_if_as_is = unturned_area[choice_as_is]
-    area_if_turned = unturned_area[choice_turned]
-    # If both areas are equal, the choice with the lower index is taken. It leaves the
-    # first face of the shell as it is, since that face's node "as it is" comes first.
-    is_lower_choice = choice_turned < choice_as_is
-    is_turned: BoolArray = (area_if_turned > area_if_as_is) | (
-        (area_if_turned == area_if_as_is) & is_lower_choice
+    n_windings = int(max(winding_as_is.max(), winding_turned.max())) + 1
+    # (windings,) the area of the faces that each winding leaves as they are
+    unturned_area = np.bincount(winding_as_is, weights=area, minlength=n_windings)
+    # (F,) for the face's shell, the area that stays if the face stays, or is turned
+    area_if_face_stays = unturned_area[winding_as_is]
+    area_if_face_turned = unturned_area[winding_turned]
+    # If both areas are equal, the winding with the lower index is selected. It leaves
+    # the first face of the shell as it is: windings are numbered in the order of nodes,
+    # and the first face's node "as it is" comes first.
+    is_tie = area_if_face_turned == area_if_face_stays
+    is_turned_lower = winding_turned < winding_as_is
+    is_turned: BoolArray = (area_if_face_turned > area_if_face_stays) | (
+        is_tie & is_turned_lower
     )
     return is_turned
 
@@ -431,9 +449,9 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
 
     Every face f has two nodes in a graph: 2 f for "as it is" and 2 f + 1 for "turned".
     If two neighbours agree, their equal nodes are linked; otherwise the opposite ones.
-    So a connected component is a consistent choice for all faces of a shell, and the
-    shell's other component is the reverse choice. If both are the same component, the
-    shell is one-sided. The choice that turns less area over is made.
+    So a connected component is a consistent winding of all faces of a shell, and the
+    shell's other component is the reverse winding. If both are the same component, the
+    shell is one-sided. The winding that turns less area over is selected.
 
     Returns:
         Which faces (F,) to turn over; the shell of each face (F,); and whether some
@@ -442,15 +460,17 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
     area = np.linalg.norm(soup.compute_area_vectors(), axis=1)
     # Corner c is a corner of face c // 3.
-    starts, ends = _link_windings(left_corner // 3, right_corner // 3, same_direction)
-    component = find_components(2 * len(area), starts, ends)
+    first_node, second_node = _link_windings(
+        left_corner // 3, right_corner // 3, same_direction
+    )
+    component = find_components(2 * len(area), first_node, second_node)
     component_as_is = component[0::2]
     component_turned = component[1::2]
-    is_turned = _select_larger_choice(component_as_is, component_turned, area)
-    # A shell has two components, which are each other's reverse, or is one-sided.
-    _, shell = np.unique(
-        np.minimum(component_as_is, component_turned), return_inverse=True
-    )
+    is_turned = _select_windings(component_as_is, component_turned, area)
+    # A shell has two components, or one if it is one-sided. The lower one identifies
+    # the shell.
+    shell_component = np.minimum(component_as_is, component_turned)
+    _, shell = np.unique(shell_component, return_inverse=True)
     has_moebius_strip = bool((component_as_is == component_turned).any())
     return is_turned, shell.astype(np.int64), has_moebius_strip
 
@@ -489,13 +509,12 @@ def _find_closed_shells(
 def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     """Return for each shell (S,) whether it must be turned over.
 
-    A closed shell, all of whose edges belong to exactly two of its faces, is turned
-    over if its signed volume is negative. An exception is a shell inside another closed
-    shell: it may be the wall of a hollow space, and stays as it is, unless the file's
-    normals point the other way. If the signed volume of all closed shells
-    together is negative, all closed shells are turned over first, and then the same
-    rule is applied to the result. An open sheet is turned over if the file's normals
-    point away from its front.
+    In a closed shell every edge belongs to exactly two faces. Closed shells are handled
+    in two steps. First, if their signed volumes add up to less than 0, all of them are
+    turned over. Second, a shell whose volume is negative then is turned over, too. But
+    if it is inside another closed shell, it may be the wall of a hollow space: it is
+    turned over only if the file's normals point away from its front. An open shell is
+    turned over if the file's normals point away from its front.
 
     Args:
         soup: a soup whose neighbours agree in winding.
@@ -508,21 +527,19 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
     agreement = _compute_normal_agreement(soup, shell, vectors, n_shells)
     bounds = _compute_shell_bounds(soup, shell, n_shells)
-    # First step: all closed shells are turned over if most of the volume is negative.
-    # That reverses the signs of volumes and agreements.
-    is_object_turned = volume[is_closed].sum() < 0.0
-    is_negative = (volume < 0.0) ^ is_object_turned
-    step_agreement = -agreement if is_object_turned else agreement
-    # Second step: single shells are turned over.
-    is_shell_turned = is_negative.copy()
+    # First step. Turning reverses the signs of volumes and agreements.
+    are_all_turned = volume[is_closed].sum() < 0.0
+    is_negative = (volume < 0.0) != are_all_turned
+    agreement_after_step = -agreement if are_all_turned else agreement
+    # Second step
+    is_turned_again = is_negative.copy()
     for index in np.flatnonzero(is_closed & is_negative):
         if _is_enclosed(int(index), is_closed, bounds):
-            # The wall of a hollow space, which stays if the normals agree with it.
-            is_shell_turned[index] = step_agreement[index] < 0.0
+            is_turned_again[index] = agreement_after_step[index] < 0.0
     # A closed shell that is turned over in both steps is as before.
-    is_closed_turned = is_shell_turned ^ is_object_turned
-    is_sheet_turned = agreement < 0.0
-    return np.where(is_closed, is_closed_turned, is_sheet_turned)
+    is_closed_turned = is_turned_again != are_all_turned
+    is_open_turned = agreement < 0.0
+    return np.where(is_closed, is_closed_turned, is_open_turned)
 
 
 def _is_enclosed(
@@ -549,7 +566,8 @@ def _compute_normal_agreement(
 ) -> Float64Array:
     """Return how far the file's normals agree with the faces of each shell, (S,).
 
-    It is positive if normals are on the fronts of faces, and 0 without normals.
+    It is a sum of cosines weighted by area: positive if most normals are on the fronts
+    of faces, negative if most are on the backs, and 0 without normals.
 
     Args:
         soup: the faces.
@@ -573,7 +591,7 @@ def _compute_signed_volumes(
     Args:
         soup: the faces.
         shell: (F,) the shell of each face.
-        vectors: (F, 3) their normals, as long as twice the areas.
+        vectors: (F, 3) normals of the faces, as long as twice the faces' areas.
         face_counts: (S,) the number of faces of each shell.
     """
     corners = soup.points[soup.faces]
@@ -581,6 +599,8 @@ def _compute_signed_volumes(
         np.bincount(shell, weights=coordinate) for coordinate in corners.mean(axis=1).T
     ]
     center = np.stack(coordinate_sums, axis=1) / face_counts[:, None]
+    # The volume is base * height / 3, and a vector is twice the base: so these are six
+    # times the volumes.
     tetrahedra = ((corners[:, 0] - center[shell]) * vectors).sum(axis=1)
     return np.asarray(
         np.bincount(shell, weights=tetrahedra, minlength=len(face_counts))
@@ -638,8 +658,9 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     """Compute unit normals of corners (F, 3, 3), smooth except across creases.
 
     At each point, faces share one normal if they are connected by edges whose angle is
-    below the crease angle. It is the mean of their normals, weighted by their angles at
-    that point (Thuermer and Wuethrich 1998).
+    below the crease angle. It is the mean of the faces' normals. Each is weighted by
+    the angle between the two sides of the face that meet at the point (Thuermer and
+    Wuethrich 1998).
     """
     face_normals = normalize_vectors(soup.compute_area_vectors())
     smoothing_group = _find_smoothing_groups(soup, face_normals)
@@ -652,28 +673,32 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
         axis=1,
     )
     smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
-    # The face's own normal where the mean is not on its front. False also for NaN,
-    # where normals cancel.
-    is_valid = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True) > 0.0
-    return np.where(is_valid, smooth_normals, face_normals[:, None])
+    # A mean that is not on the front of a face is replaced by the face's normal. So is
+    # a mean of NaN, where normals cancel.
+    cosine = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True)
+    return np.where(cosine > 0.0, smooth_normals, face_normals[:, None])
 
 
 def _find_smoothing_groups(soup: TriangleSoup, face_normals: Float64Array) -> IntArray:
     """Return for each corner (3 F,) the group of corners with which it shares a normal.
 
-    Corners are the nodes of a graph, in which an edge without a crease links the two
-    corners at each of its ends. Faces that disagree in winding are not linked.
+    Two faces meet in two corners at each end of their shared edge. These two get the
+    same normal, unless the edge is a crease or the faces disagree in winding. So
+    corners are the nodes of a graph, linked by smooth edges, and its connected
+    components are the groups.
     """
     left_corner, right_corner, same_direction = find_shared_edges(soup.faces)
     cosine = _compute_cosines(face_normals, left_corner, right_corner)
-    is_smooth = cosine >= np.cos(np.radians(CREASE_DEGREES))
-    left_corner = left_corner[is_smooth & ~same_direction]
-    right_corner = right_corner[is_smooth & ~same_direction]
+    is_smooth = (cosine >= np.cos(np.radians(CREASE_DEGREES))) & ~same_direction
+    left_start = left_corner[is_smooth]
+    left_end = _get_next_corner(left_start)
+    right_start = right_corner[is_smooth]
+    right_end = _get_next_corner(right_start)
     # The two faces run along the edge in opposite directions. So the corner at which it
     # starts in one face meets the corner at which it ends in the other.
-    starts = np.concatenate([left_corner, _get_next_corner(left_corner)])
-    ends = np.concatenate([_get_next_corner(right_corner), right_corner])
-    return find_components(soup.faces.size, starts, ends)
+    left_nodes = np.concatenate([left_start, left_end])
+    right_nodes = np.concatenate([right_end, right_start])
+    return find_components(soup.faces.size, left_nodes, right_nodes)
 
 
 def _get_next_corner(corner: IntArray) -> IntArray:
@@ -826,7 +851,8 @@ def _triangulate_equal(
     Args:
         points: (C, 3).
         corners: (P, n) indices into `points`.
-        budget: limit of the comparisons of points with ears.
+        budget: limit of the comparisons of points with ears; once it is reached, the
+            remaining ears are cut off without tests.
 
     Returns:
         The triangles (P, n - 2, 3), the number of polygons that may be wrong, and the
@@ -846,7 +872,8 @@ def _triangulate_equal(
     if not len(concave):
         return fans, 0, 0
     ears, n_failed, n_compared = _cut_ears(projected[concave], budget)
-    # ears are (concave, n - 2, 3) positions in their polygon
+    # `ears` are (concave, n - 2, 3) positions in a polygon. Each is replaced by the
+    # index of the point that the polygon has there.
     polygon_rows = np.arange(len(concave))[:, None, None]
     fans[concave] = corners[concave][polygon_rows, ears]
     return fans, n_failed, n_compared
@@ -864,7 +891,8 @@ def _project_to_planes(corners: Float64Array) -> Float64Array:
     corners = corners / np.maximum(sizes, 1e-300)  # never by 0
     normal = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    # the axis that is the least parallel to the normal
+    # The axis that is the least parallel to the normal has the most accurate cross
+    # product with it.
     other_axis = np.eye(3)[np.abs(normal).argmin(axis=1)]
     x_axis = np.cross(other_axis, normal)
     x_axis /= np.maximum(np.linalg.norm(x_axis, axis=1, keepdims=True), 1e-300)
@@ -942,7 +970,8 @@ class _EarCutter:
         self.tip[active] = c
         self.n_tries[active] += 1
         self._cut(active[is_cut], a[is_cut], b[is_cut], c[is_cut])
-        self.active = active[self.n_cut[active] < self.triangles.shape[1]]
+        n_triangles = self.triangles.shape[1]
+        self.active = active[self.n_cut[active] < n_triangles]
 
     def _decide_cuts(
         self, a: IntArray, b: IntArray, c: IntArray, budget: int
@@ -960,10 +989,12 @@ class _EarCutter:
         active = self.active
         n_left = self.flat.shape[1] - self.n_cut[active]
         is_cut = n_left == 3  # the last triangle
-        is_hopeless = self.n_tries[active] >= n_left
+        is_hopeless = self.n_tries[active] >= n_left  # all corners were tried
         if self.n_compared < budget:
             dent_points = self.dent_points[active]
-            self.n_compared += dent_points.size // 2  # points have two coordinates
+            # Each dent is compared with one triangle.
+            n_dents = dent_points.size // 2  # points have two coordinates
+            self.n_compared += n_dents
             corners = [self.flat[active, corner] for corner in (a, b, c)]
             min_area = _MIN_AREA_FRACTION * self.area[active]
             is_cut |= _is_ear(corners, dent_points, self.is_present[active], min_area)
@@ -983,7 +1014,7 @@ class _EarCutter:
             a, b, c: (N,) the corners of the ear: the tip b and its neighbours.
         """
         self.triangles[rows, self.n_cut[rows]] = np.stack([a, b, c], axis=1)
-        self.is_present[rows] &= self.dent[rows] != b[:, None]
+        self.is_present[rows] &= self.dent[rows] != b[:, None]  # b is cut off
         self.next_corner[rows, a] = c
         self.previous_corner[rows, c] = a
         self.n_tries[rows] = 0  # without b, other corners may be ears
@@ -1008,6 +1039,7 @@ def _cut_ears(flat: Float64Array, budget: int) -> tuple[IntArray, int, int]:
     cutter = _EarCutter(flat)
     while len(cutter.active):
         cutter.step(budget)
+    # Corners are scaled to about 1, so that an area is compared with that of a square.
     is_wrong = cutter.is_failed & (cutter.area > _MIN_AREA_FRACTION)
     return cutter.triangles, int(is_wrong.sum()), cutter.n_compared
 
@@ -1017,8 +1049,8 @@ def _find_dents(
 ) -> tuple[IntArray, BoolArray]:
     """Find the dents of polygons: their corners that are not convex.
 
-    If a triangle of three successive corners contains any corner, it contains a dent.
-    So only dents have to be tested.
+    A triangle of three successive corners is an ear if it contains no other corner. If
+    it contains any, it contains a dent. So only dents have to be tested.
 
     Args:
         flat: (P, n, 2) the corners of the polygons.
@@ -1026,16 +1058,18 @@ def _find_dents(
 
     Returns:
         The indices of the dents (P, d), where d is the largest number of dents in a
-        polygon; polygons with fewer are padded with other corners. And (P, d) which
-        corners are dents, and no padding.
+        polygon; polygons with fewer are padded with other corners. And (P, d) whether
+        an index is that of a dent, and not padding.
     """
     previous = np.roll(flat, 1, axis=1)
     following = np.roll(flat, -1, axis=1)
+    # negative where the polygon turns to the right, which is a dent
     corner_area = _compute_doubled_areas(previous, flat, following)
     is_dent = corner_area <= _MIN_AREA_FRACTION * doubled_area[:, None]
-    # Sorting by `~is_dent` puts dents (False) first, and other corners behind them.
     max_dents = int(is_dent.sum(axis=1).max())
-    dent = np.argsort(~is_dent, axis=1, kind="stable")[:, :max_dents]
+    is_convex = ~is_dent
+    dents_first = np.argsort(is_convex, axis=1, kind="stable")  # False sorts first
+    dent = dents_first[:, :max_dents]
     return dent, np.take_along_axis(is_dent, dent, axis=1)
 
 

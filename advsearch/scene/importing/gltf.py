@@ -87,8 +87,9 @@ def _check_node_lights(path: Path, header: Header, content: dict[str, Any]) -> N
     entries = zip(header.nodes, content.get("nodes", ()), strict=True)
     for index, (node, entry) in enumerate(entries):
         node_extensions = entry.get("extensions") or {}
-        has_light = node_extensions.get("KHR_lights_punctual") is not None
-        if node.lamp is None and has_light:
+        has_extension = node_extensions.get("KHR_lights_punctual") is not None
+        # `lamp` is the index of the light, which the extension has to state.
+        if has_extension and node.lamp is None:
             raise damaged(
                 path,
                 f"glTF with nodes[{index}].extensions.KHR_lights_punctual.light",
@@ -424,13 +425,13 @@ def _check_attributes(
 def _check_tree(path: Path, header: Header) -> None:
     """Check the number of triangles and primitives, and that nodes form trees.
 
-    A mesh counts once for each node that draws it, and once if none does. Nodes must
-    have one parent at most, form no cycles, and be at most `DEEPEST_TREE` deep.
+    Nodes must have one parent at most, form no cycles, and be at most `DEEPEST_TREE`
+    deep.
 
     Raises:
         FileFormatError: nodes are no trees, or a limit is exceeded.
     """
-    children = _find_children(path, header)
+    children = _find_children(path, header)  # all nodes with a parent
     _check_tree_sizes(path, header)
     # From the roots down, level by level. A cycle has no root, so it is never reached.
     level = [index for index in range(len(header.nodes)) if index not in children]
@@ -461,7 +462,8 @@ def _find_children(path: Path, header: Header) -> set[int]:
 def _check_tree_sizes(path: Path, header: Header) -> None:
     """Raise FileFormatError if there are too many triangles, primitives or nodes.
 
-    A mesh counts once for each node that draws it, and at least once.
+    Two sums are limited: over all meshes, and over all nodes with a mesh, in which a
+    mesh counts as often as it is drawn.
     """
     triangles_of_mesh = [
         sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
@@ -610,7 +612,7 @@ class GltfFile:
         """Return the values (count, width) of an accessor as they are stored.
 
         They are those of the buffer view, or zeros if the accessor has none. Sparse
-        values replace some of the rows (section 3.6.2.3).
+        values replace some of the rows (glTF 2.0, section 3.6.2.3).
 
         Raises:
             FileFormatError: they reach beyond their view.
@@ -633,6 +635,7 @@ class GltfFile:
         if accessor.sparse is None or not accessor.sparse.count:
             return values
         values = self._replace_rows(values, accessor, accessor.sparse)
+        # Other values are views of the file's bytes, and need no cache.
         self._sparse_filled[index] = values
         return values
 
@@ -703,6 +706,7 @@ class GltfFile:
         data = self.get_view_bytes(view)
         row_size = shape[1] * kind.itemsize
         row_stride = stride or row_size
+        # There is no gap after the last row.
         end = offset + (shape[0] - 1) * row_stride + row_size
         if end > len(data):
             raise damaged(

@@ -19,8 +19,8 @@ from pydantic import (
     JsonValue,
 )
 
-# Generator of glTF files that were converted from USD. Notes of the converter are in the
-# extras of their asset.
+# Generator of glTF files that were converted from USD. Notes of the converter are in
+# the extras of their asset.
 GENERATOR = "advsearch, of OpenUSD"
 T = TypeVar("T")
 List = Annotated[list[T], FailFast()]

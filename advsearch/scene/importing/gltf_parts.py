@@ -124,7 +124,7 @@ def _note_extensions(header: Header, notes: Notes) -> None:
         notes.warn_that_file(
             f"has Gaussian splats, which are left out: {SPLATS_ADVICE}"
         )
-    # Some supported extensions are read only in part. They have a note, too.
+    # Extensions in `EXTENSION_NOTES` that are supported are read only in part.
     partly_read = used_extensions & set(EXTENSION_NOTES)
     unread = used_extensions - set(SUPPORTED_EXTENSIONS)
     for name in sorted(partly_read | unread):
@@ -146,7 +146,8 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
         roots = header.scenes[default_scene].nodes
     scene_nodes = header.find_descendants(roots)  # with the roots themselves
     materials = header.materials
-    # `shares_layout` is also True for a material without the texture.
+    # `shares_layout` returns whether a texture has the texture coordinates of the base
+    # color. It is also True for a material without that texture.
     return {
         "occlusion map{s}: left out": (
             material.occlusionTexture is not None for material in materials
@@ -207,7 +208,7 @@ def _note_unread(header: Header, notes: Notes) -> None:
         if kind is not None:
             for key in _find_unread_keys(entry):
                 notes.record(kind, key)
-    # Keys that are marked as read are not noted, although they were recorded above.
+    # Recorded keys that are also marked as read are not noted.
     for kind in set(ENTRY_KINDS.values()):
         ignored_keys = set(IGNORED_KEYS)
         # Extras of a material or a texture may change how it looks. Elsewhere they are
@@ -223,13 +224,14 @@ def _note_unread(header: Header, notes: Notes) -> None:
 
 def _find_unread_keys(entry: Entry) -> list[str]:
     """Return the keys of an entry that have no field, also within its extensions."""
-    # The model has no extras for keys with a field, such as `extensions`.
+    # `model_extra` has the keys without a field. `extensions` has a field, but may have
+    # unread keys inside.
     keys = TrackedKeys({**(entry.model_extra or {}), "extensions": entry.extensions})
     extensions = keys.get_nested("extensions")
     for name, read_keys in entry.list_extension_keys().items():
         extension = extensions.get_nested(name)
-        is_entry = not read_keys
-        if is_entry:
+        is_separate_entry = not read_keys
+        if is_separate_entry:
             # `iterate_entries` yields this extension as an entry, and then its unread
             # keys are found. Here all of its keys are marked as read.
             read_keys = {key for key, _ in extension.items()}
@@ -376,7 +378,8 @@ class GltfSurfaces:
             name=name,
         )
         uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
-        return self._fit_images(surface, material, uvs)
+        fitted_surface, scale, shift = self._fit_images(surface, material, uvs)
+        return fitted_surface, scale, shift
 
     def _make_base_color(
         self, material: MaterialEntry
@@ -541,7 +544,8 @@ class GltfSurfaces:
                 return b""
             return bytes(self.file.get_view_bytes(entry.bufferView))
 
-        # Several textures may show the same file, which is decoded once.
+        # Several textures may show the same image, a file or a buffer view. It is
+        # decoded once.
         key = (entry.uri, entry.bufferView)
         return self._images.load_image(key, load_content, kind, name, note_template)
 
@@ -648,11 +652,11 @@ class GltfSurfaces:
         first_wrap = wraps[0]
         if reaches_out and len(set(wraps)) > 1:
             self.notes.warn_that_file(EDGES_NOTE)
-        # Inside [0, 1] the border is not visible.
+        # If coordinates are inside [0, 1], the border is not visible.
         has_border = first_wrap == gltf_entries.BORDER and reaches_out
         if has_border:
-            # Filtering blends the border into half a texel of the image. With smaller
-            # texels that is not visible.
+            # Filtering blends the border into the outer half of the edge's texels. If
+            # texels are small enough, that is not visible.
             images = [_enlarge(image, axis) for image in images]
         if first_wrap == gltf_entries.MIRRORED and reaches_out:
             # The image and its mirror image: old coordinates cover the first half.
@@ -697,15 +701,15 @@ class GltfSurfaces:
             becomes that of the padded one, scale * t + shift.
         """
         sizes = [image.shape[axis] for image in images]
-        # Pads must have the same width in texture coordinates in all images, and an
-        # integer number of texels. So each image is divided into the same number of
-        # units, the greatest common divisor of the sizes, and pads consist of units.
-        # A unit is an integer number of texels in each image.
+        # All images have the same texture coordinates, so that their pads must be the
+        # same fraction of an image. A pad must also be an integer number of texels. So
+        # pads are measured in units: each image is divided into the same number of
+        # units, the greatest common divisor of the sizes.
         n_units = int(np.gcd.reduce(sizes))
         units_before, units_after = _count_pad_units(n_units, bounds)
         padded_units = n_units + units_before + units_after
-        largest_padded_size = padded_units * (max(sizes) // n_units)
-        if largest_padded_size > 2 * self._images.max_side:
+        max_unit_texels = max(sizes) // n_units
+        if padded_units * max_unit_texels > 2 * self._images.max_side:
             self.notes.warn_that_file(EDGES_NOTE)
             return images, 1.0, 0.0
         padded = []
@@ -724,7 +728,10 @@ class GltfSurfaces:
                     border=border,
                 )
             )
-        return padded, n_units / padded_units, units_before / padded_units
+        # The old image covers `n_units` of the padded one, after `units_before`.
+        scale = n_units / padded_units
+        shift = units_before / padded_units
+        return padded, scale, shift
 
 
 def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Array:
@@ -769,7 +776,7 @@ def _average_where_visible(
     if not mapped_parts:
         return np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
     corner_uvs = np.concatenate(
-        # v points up in an image that is averaged, and down in a file.
+        # v points down in the file, and up in `average_over_faces`: it becomes 1 - v.
         [uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped_parts]
     )
     area_vectors = compute_area_vectors(
@@ -986,12 +993,12 @@ def _note_pieces(
 
     Args:
         header: the parsed JSON of the file.
-        keys: indices of all primitives: of the mesh, and of the primitive in it.
-        with_faces: the primitives with faces, by these indices.
+        keys: all primitives, each by the index of its mesh and its index in the mesh.
+        with_faces: the primitives with faces, by the same keys.
         notes: notes about the file, to which sentences are added.
     """
     primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
-    # Gaussian splats have no faces either; `_note_extensions` notes them.
+    # Gaussian splats have no faces either, but are noted in `_note_extensions`.
     n_splats = sum(
         any(map(is_splat_name, find_unread_extensions(primitive)))
         for primitive in primitives
@@ -1034,7 +1041,7 @@ def _make_parts(
         for key, piece in group.items():
             uvs = piece.part.uvs
             if uvs is not None:
-                # v points up in a part.
+                # v points down in the file, and up in a part: it becomes 1 - v.
                 uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
             parts[key] = replace(piece.part, surface=surface, uvs=uvs)
     return parts
@@ -1283,10 +1290,10 @@ def read_primitive(
 def _find_used_vertices(
     file: GltfFile, primitive: Primitive
 ) -> tuple[IntArray, IntArray]:
-    """Return the vertices (V,) that the faces of a primitive have, and the faces.
+    """Return the vertices (V,) that a primitive uses, and its faces (F, 3).
 
-    Primitives may share accessors, so not every vertex is used. Faces (F, 3) are
-    indices into the used vertices.
+    Primitives may share accessors, so not every vertex is used. Faces are indices into
+    the used vertices.
 
     Args:
         file: the glTF file.
@@ -1349,7 +1356,7 @@ def _read_texture_coordinates(
 
 
 def _make_triangles(order: IntArray, mode: int) -> IntArray:
-    """Return the faces (F, 3) of a primitive of a mode (section 3.7.2.1).
+    """Return the faces (F, 3) of a primitive of a mode (glTF 2.0, section 3.7.2.1).
 
     A list has three vertices for each face. A strip or a fan has one vertex for each
     face, after the first two vertices. Every second face of a strip has its last two
@@ -1361,16 +1368,15 @@ def _make_triangles(order: IntArray, mode: int) -> IntArray:
     """
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
-    index = np.arange(max(0, len(order) - 2))
+    index = np.arange(max(0, len(order) - 2))  # of each face
     if mode == STRIP:
         # i, i + 1, i + 2 of an even face, and i, i + 2, i + 1 of an odd one
-        corners = np.stack(
-            [index, index + 1 + index % 2, index + 2 - index % 2], axis=1
-        )
+        is_odd = index % 2
+        corners = np.stack([index, index + 1 + is_odd, index + 2 - is_odd], axis=1)
     else:  # all faces of a fan share the first vertex
         corners = np.stack([index + 1, index + 2, np.zeros_like(index)], axis=1)
     faces = order[corners]
-    # Exporters repeat vertices to join strips that are far apart. The faces with a
-    # repeated vertex have no area, and are left out.
-    is_joint = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    return np.asarray(faces[~is_joint], np.int64)
+    # Faces with a repeated vertex have no area, and are left out. Exporters repeat
+    # vertices on purpose, to join strips that are far apart.
+    has_repeated_vertex = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    return np.asarray(faces[~has_repeated_vertex], np.int64)

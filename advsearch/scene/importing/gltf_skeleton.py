@@ -128,10 +128,12 @@ def read_vertex_joints(
     joints = np.concatenate([joint_set.joints for joint_set in sets], axis=1)
     weights = np.concatenate([joint_set.weights for joint_set in sets], axis=1)
     total = weights.sum(axis=1, keepdims=True)
+    has_weights = total > 0.0
     # A vertex without weights moves with its first joint: (1, 0, 0, ...).
-    only_first = np.eye(1, weights.shape[1])
+    only_first = np.zeros(weights.shape[1])
+    only_first[0] = 1.0
     normalized = np.where(
-        total > 0.0, weights / np.where(total > 0.0, total, 1.0), only_first
+        has_weights, weights / np.where(has_weights, total, 1.0), only_first
     )
     return VertexJoints(joints, normalized)
 
@@ -235,6 +237,8 @@ def pose_part(
         # the rows i + 1 and i + 2.
         cofactors = np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
         normals = np.einsum("vij,vj->vi", cofactors, normals)
+    # Then all faces are turned over. If only some vertices are mirrored, there is no
+    # winding that fits all faces, and it stays as it is.
     are_all_mirrored = bool((np.linalg.det(linear) < 0.0).all())
     return replace_geometry(part, vertices, normals, is_mirrored=are_all_mirrored)
 
@@ -403,8 +407,8 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
                 "different numbers",
             )
         n_targets[node] = max(counts, default=0)
-        # Each primitive stores an inverse bind matrix for each joint of its skin, and
-        # offsets of its vertices for each target.
+        # The limit is for memory: each primitive stores a matrix for each joint of its
+        # skin, and an offset of each vertex for each target.
         if entry.skin is not None:
             n_moves += len(primitives) * len(header.skins[entry.skin].joints)
         n_moves += n_targets[node] * _count_vertices(header, primitives)
@@ -583,7 +587,7 @@ def _read_track(
     shape = (len(times), values_per_key, n_targets)
     keys = _read_keys(file, sampler.output, property_name, shape)
     if property_name == "rotation":
-        # Of three values, the second is no tangent.
+        # The three values of a cubic spline are tangent, value and tangent.
         value_index = 1 if values_per_key == 3 else 0
         quaternions = keys[:, value_index]  # (K, 4)
         lengths = np.linalg.norm(quaternions, axis=1)

@@ -252,12 +252,17 @@ class _Layer(NamedTuple):
 
     @property
     def rank(self) -> tuple[int, bool]:
-        """Rank by the name in `MAIN_LAYER_NAMES`, then by whether it lacks colors."""
+        """Rank for the choice of a layer, the lowest first.
+
+        It is the position of the name in `MAIN_LAYER_NAMES`; then a layer with colors
+        is before one with luminance.
+        """
         last_word = self.name.split(".")[-1].lower()
         name_rank = len(MAIN_LAYER_NAMES)
         if last_word in MAIN_LAYER_NAMES:
             name_rank = MAIN_LAYER_NAMES.index(last_word)
-        return name_rank, "R" not in self.channels
+        lacks_colors = "R" not in self.channels
+        return name_rank, lacks_colors
 
 
 def _select_layer(
@@ -364,7 +369,8 @@ def _convert_luminance(
         planes: luminance "Y", and perhaps chroma "RY" and "BY".
         size: rows and columns of the image; chroma may have fewer, and is interpolated.
     """
-    if "RY" not in planes:
+    has_chroma = "RY" in planes
+    if not has_chroma:
         return dict.fromkeys("RGB", planes["Y"])
     luminance = planes["Y"].astype(np.float32)
     red_ratio = _resample(planes["RY"].astype(np.float32), size)
@@ -546,18 +552,20 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
 def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     """Return the inverse (3,) of all COLORCORR lines, and notes on invalid ones.
 
-    A line has three factors that were applied to the pixels, so that their inverse
-    restores the original. A line that would take the result out of float32's range is
-    invalid, too. EXPOSURE lines are ignored, since metering sets the exposure.
+    A line has three factors by which the pixels were multiplied. So the original pixels
+    are those of the file times the result, which is 1 over the product of all lines. A
+    line that would take the result out of float32's range is invalid, too. EXPOSURE
+    lines are ignored, since metering sets the exposure.
     """
     factors = np.ones(3)
     notes = list[str]()
     for text in re.findall(rb"^COLORCORR=(.*)$", header, re.MULTILINE)[:100]:
         numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
-        corrected = np.full(3, np.nan)
+        corrected = np.full(3, np.nan)  # not in range
         if len(numbers) == 3 and (numbers > 0.0).all():
             corrected = factors / numbers
-        if ((corrected > 1e-20) & (corrected < 1e20)).all():
+        is_in_range = ((corrected > 1e-20) & (corrected < 1e20)).all()
+        if is_in_range:
             factors = corrected
         else:
             line = "COLORCORR=" + text.decode("latin-1")
@@ -650,8 +658,8 @@ def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from pixels of four bytes.
 
     A pixel (1, 1, 1, n) is no color: it repeats the pixel before it n times. If several
-    of these follow one another, they are the bytes of one count, the lowest first: the
-    second one means 256 n times, the third one 65,536 n times.
+    of these follow one another, each next n counts 256 times as much: the second one
+    means 256 n times, the third one 65,536 n times.
 
     Args:
         body: the scanlines' bytes.
@@ -686,7 +694,7 @@ def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
                 raise ValueError("a repeat that does not fit")
             line[n_filled : n_filled + count] = line[n_filled - 1]
             n_filled = n_filled + count
-            # Repeats in a row are the bytes of one count.
+            # If the next pixel is a repeat, too, its n counts 256 times as much.
             count_shift = count_shift + 8
         else:
             line[n_filled] = np.frombuffer(pixel, np.uint8)

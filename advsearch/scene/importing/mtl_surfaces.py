@@ -184,7 +184,7 @@ class MtlReader:
         named_square = parse_udim_square(numbered_name)
         other_squares = [square for square in squares if square != named_square]
         if not other_squares:
-            return []  # the image that the material names is that of all faces
+            return []  # all faces are in the square of the image that is named
         other_names = (
             replace_square(numbered_name, square) for square in other_squares
         )
@@ -295,11 +295,10 @@ class MtlReader:
             uses: its maps by keyword; maps are removed from it.
             first_use: the map whose layout is that of the surface.
         """
+        first_layout = (first_use.scale, first_use.offset)
         for key in [key for key in UV_MAPS if key in uses]:
-            if (uses[key].scale, uses[key].offset) != (
-                first_use.scale,
-                first_use.offset,
-            ):
+            layout = (uses[key].scale, uses[key].offset)
+            if layout != first_layout:
                 statement = (
                     f"{material.spelling[key]} of the material "
                     f"{format_name(material.name)}"
@@ -308,6 +307,7 @@ class MtlReader:
                     f"{statement} has other texture coordinates (-s, -o) than its first "
                     "map; it is left out"
                 )
+                # It is noted here, and needs no note as an unread statement.
                 material.tracked_statements.mark_read(key)
                 del uses[key]
 
@@ -316,9 +316,10 @@ class MtlReader:
     ) -> tuple[Float32Array | None, Float32Array | None]:
         """Return the color (3,) of ``Kd`` and the texture (H, W, 3) of ``map_Kd``.
 
-        A texture is not multiplied by ``Kd``, which in a material with a texture is
-        more often an exporter's default than a tint. The color is None if it is plain
-        white and the material names a texture, even if its file is missing.
+        A texture is not multiplied by ``Kd``: in a material with a texture, ``Kd`` is
+        more often an exporter's default than a tint. The color is used if the texture
+        is missing. It is None if ``Kd`` is no color, or is plain white and the material
+        names a texture.
 
         Args:
             material: the material.
@@ -331,10 +332,8 @@ class MtlReader:
         )
         texture = self._load_image(use, "colours and alpha", note_template)
         if use is not None and texture is not None:
-            if (
-                texture[:, :, 3].min() < 1.0
-                and "map_d" not in material.argument_by_keyword
-            ):
+            has_transparency = texture[:, :, 3].min() < 1.0
+            if has_transparency and "map_d" not in material.argument_by_keyword:
                 self.notes.warn(
                     f"the alpha of {format_name(use.name)} is left out: no map_d "
                     "makes it an opacity"
@@ -384,9 +383,7 @@ class MtlReader:
                 return True
             if key == "pcr":  # the roughness of a clear coat, which may be absent
                 return "pc" in zero_keys
-            if (
-                key == "tf"
-            ):  # a transmission filter; it is grey if all numbers are equal
+            if key == "tf":  # a transmission filter, which is grey if numbers are equal
                 return len(set(argument.split())) == 1
             if key == "map_ka" and base_map is not None:
                 # exporters repeat the image of the color as that of ambient light
@@ -419,9 +416,9 @@ class MtlReader:
         use = parse_map(without_comment(statement))
         use_with_comment = parse_map(statement)
         if use_with_comment is not None and use_with_comment != use:
-            if isinstance(
-                self.references.read_or_explain(use_with_comment.name), bytes
-            ):
+            # the file's bytes, or a text that explains why it cannot be read
+            content = self.references.read_or_explain(use_with_comment.name)
+            if isinstance(content, bytes):
                 use = use_with_comment  # the # belongs to the name
         self._uses[id(material), key] = use
         if use is not None:
@@ -480,6 +477,7 @@ class MtlReader:
             return surface
         color = surface.color
         texture = surface.texture
+        # A surface without a color would have no opacity either: it becomes grey.
         color_or_grey = np.full(3, NEUTRAL_GREY, np.float32) if color is None else color
         if use is not None and image is not None:
             opacity = _select_channel(image, use)
@@ -491,7 +489,6 @@ class MtlReader:
             )
             texture = np.concatenate([texture, resized[:, :, None]], axis=2)
         elif texture is None:
-            # A surface without any color would have no opacity either.
             color = color_or_grey
         factor_array = np.array([factor], np.float32)
         return replace(
@@ -503,30 +500,28 @@ class MtlReader:
     def _read_opacity(self, material: MtlMaterial) -> float:
         """Return the opacity in [0, 1] that ``d`` or ``Tr`` states, 1 by default.
 
-        If both are stated, ``d`` is returned. Programs mean either transparency or
-        opacity by ``Tr``. A ``Tr`` that agrees with ``d`` in neither sense is noted.
-        Without ``d``, ``Tr`` is read as a transparency, which is noted, too.
+        If both are stated, ``d`` is returned. Some programs mean transparency by
+        ``Tr``, and some mean opacity. If ``Tr`` contradicts ``d`` in both senses, that
+        is noted. Without ``d``, ``Tr`` is read as transparency, which is noted, too.
         """
         if "-halo" in material.read_argument("d").lower().split():
             self.notes.record("option", "-halo of d")
         opacity = parse_fraction(material.read_argument("d"))
-        transparency = parse_fraction(material.read_argument("tr"))
-        if transparency is None:
+        tr = parse_fraction(material.read_argument("tr"))
+        if tr is None:
             return 1.0 if opacity is None else opacity
-        material_phrase = (
-            f"the material {format_name(material.name)} has Tr {transparency:g}"
-        )
+        material_phrase = f"the material {format_name(material.name)} has Tr {tr:g}"
         if opacity is None:
-            if transparency > 0.0:
+            if tr > 0.0:
                 self.notes.warn(
                     f"{material_phrase} and no d: it is read as transparency, which "
-                    f"makes its opacity {1.0 - transparency:g}; some programs mean "
+                    f"makes its opacity {1.0 - tr:g}; some programs mean "
                     "opacity by it, so write d instead"
                 )
-            return 1.0 - transparency
-        # The tolerance is two digits, since programs round.
-        agrees_as_opacity = abs(transparency - opacity) <= 0.01
-        agrees_as_transparency = abs(1.0 - transparency - opacity) <= 0.01
+            return 1.0 - tr
+        # Programs may round to two digits.
+        agrees_as_opacity = abs(tr - opacity) <= 0.01
+        agrees_as_transparency = abs(1.0 - tr - opacity) <= 0.01
         if not agrees_as_opacity and not agrees_as_transparency:
             self.notes.warn(
                 f"{material_phrase}, which contradicts its d {opacity:g}; d is used as "
@@ -554,7 +549,7 @@ class MtlReader:
             name: name by which the mesh file uses the material.
             square: the UDIM square.
         """
-        # The keyword is only used if there is a map, which has one.
+        # Only notes about a map use the keyword; without a map it is None.
         keyword = material.spelling.get(f"map_{key}")
         note_template = f"{keyword} {{name}} {{why}}; it is left out"
         image = self._load_image(use, "numbers", note_template)
@@ -565,9 +560,9 @@ class MtlReader:
             )
             uvs, areas = self.find_mapped_faces(name, square)
             channel = _select_channel(image, use)[:, :, None]
-            return float(
-                average_over_faces(channel, uvs * use.scale + use.offset, areas)[0]
-            )
+            image_uvs = uvs * use.scale + use.offset
+            mean = average_over_faces(channel, image_uvs, areas)
+            return float(mean[0])
         return number
 
     def _make_normal_map(
@@ -833,8 +828,8 @@ class MtlMaterial:
     @cached_property
     def tracked_statements(self) -> TrackedKeys[str]:
         """The statements, tracking which of them are read."""
-        # `find_unread` returns keywords as the file writes them, so that these are the
-        # keys here; they are looked up in lower case.
+        # The keys are the keywords as the file writes them, since `find_unread` returns
+        # them for notes. With `fold` they are looked up in lower case.
         return TrackedKeys(
             {
                 self.spelling[key]: statement
@@ -963,10 +958,12 @@ def parse_numbers(argument: str) -> list[float] | None:
 def parse_fraction(argument: str) -> float | None:
     """Return the last word of a statement as a number clipped to [0, 1].
 
-    The result is None if that is no number. Options may precede it.
+    Options may precede that word. The result is None if it is missing or no number.
     """
-    last_word = " ".join(argument.split()[-1:])
-    values = parse_numbers(last_word)
+    words = argument.split()
+    if not words:
+        return None
+    values = parse_numbers(words[-1])
     return None if values is None else min(max(values[0], 0.0), 1.0)
 
 

@@ -276,7 +276,7 @@ def _select_visible_parts(
 ) -> list[ImportedPart]:
     """Return the parts that are not fully transparent, and note the others."""
     visible_parts = select_visible_parts(parts)
-    # Parts are compared by identity.
+    # Parts have no `==`, so that `in` compares them by identity.
     transparent = [part for part in parts if part not in visible_parts]
     names = dict.fromkeys(
         format_name(part.surface.name or "a part") for part in transparent
@@ -294,8 +294,8 @@ def _find_up(
 ) -> FileAxis:
     """Return the axis that points up: the user's, the format's, or a guess.
 
-    A front along y or z rules out that axis. Otherwise the axis is guessed from the
-    shape.
+    Up is y or z. If the front faces along one of these, up is the other one. Otherwise
+    the axis is guessed from the shape.
 
     Args:
         parts: the parts of the file.
@@ -307,13 +307,12 @@ def _find_up(
         return FileAxis(up)
     if file.suffix.lower() in GLTF_SUFFIXES:
         return FileAxis("y")
-    # the letter behind the sign: "y" of "-y"
-    if front.axis[1] in UP_OF_FRONT:
-        return FileAxis(UP_OF_FRONT[front.axis[1]])
+    front_letter = front.axis[1]  # "y" of "-y"
+    if front_letter in UP_OF_FRONT:
+        return FileAxis(UP_OF_FRONT[front_letter])
     as_stored = join_parts(parts, str(file), np.eye(3))
-    return guess_up(
-        as_stored.points[find_used(as_stored.faces, len(as_stored.points))], file.name
-    )
+    used_points = find_used(as_stored.faces, len(as_stored.points))
+    return guess_up(as_stored.points[used_points], file.name)
 
 
 def _find_opacity(color: Float32Array, notes: Notes) -> Float32Array | None:
@@ -398,7 +397,7 @@ def _make_mesh(
         turn: rotation (3, 3) from the file's axes to ours.
     """
     material_names, material_of_face = index_materials(soup, surfaces)
-    # Materials behind the last one with faces have no group.
+    # There is a group for each material up to the last one with faces.
     faces_by_material = zip(
         material_names, group_indices(material_of_face), strict=False
     )
@@ -410,10 +409,11 @@ def _make_mesh(
         normalised_mesh = replace(normalise_mesh(mesh), materials=materials)
     except InputError as error:  # it does not name the file
         raise InputError(f"{file}: {error}") from None
-    if stored_vertices is None:  # nothing in the file moves
+    # None if nothing in the file moves.
+    if stored_vertices is None:
         return normalised_mesh
-    # A vertex of the file was rotated, divided by the extent of all parts when they
-    # were joined, and then by the mesh's own extent.
+    # Vertices were scaled twice: by the extent of the parts when they were joined, and
+    # by that of the repaired mesh when it was normalised.
     soup_extent = compute_extent(parts)
     mesh_extent = float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max())
     # Imported here, since torch takes seconds, and most objects have no joints.
@@ -464,8 +464,9 @@ def _compute_emitted(
     if emission is None or opacity is None:
         return emission
     rows, columns = emission.shape[:2]
-    # Pairs are compared by width first, then by height.
-    width, height = max((columns, rows), (opacity.shape[1], opacity.shape[0]))
+    emission_size = (columns, rows)
+    opacity_size = (opacity.shape[1], opacity.shape[0])
+    width, height = max(emission_size, opacity_size)  # compares widths first
     resized_opacity = np.asarray(
         Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR)
     )

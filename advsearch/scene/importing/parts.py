@@ -65,14 +65,14 @@ def has_normals(picture: Float32Array) -> bool:
     visible_texels = picture[picture.any(axis=2)]  # not black
     if not len(visible_texels):
         return False
-    length_error = np.abs(np.linalg.norm(visible_texels * 2.0 - 1.0, axis=1) - 1.0)
+    normals = visible_texels * 2.0 - 1.0  # decoded from [0, 1] to [-1, 1]
+    length_error = np.abs(np.linalg.norm(normals, axis=1) - 1.0)
+    normal_fraction = (length_error < MAX_LENGTH_ERROR).mean()
     # blue minus red: 0 where the image is grey
     blueness = float(
         (visible_texels[:, 2] - visible_texels[:, 0]).mean(dtype=np.float64)
     )
-    return blueness > MIN_BLUENESS and bool(
-        (length_error < MAX_LENGTH_ERROR).mean() > MIN_NORMAL_FRACTION
-    )
+    return blueness > MIN_BLUENESS and bool(normal_fraction > MIN_NORMAL_FRACTION)
 
 
 def encode_normals(normals: npt.NDArray[np.floating]) -> Float32Array:
@@ -127,12 +127,9 @@ class ImportedSurface:
         remaining = iter(pictures)
         texture = None if self.texture is None else next(remaining)
         normals = None if self.normal_map is None else next(remaining)
-        return replace(
-            self,
-            texture=texture,
-            normal_map=normals,
-            emission=next(remaining, self.emission),
-        )
+        # An emission that is the same everywhere is not in `images`, and stays.
+        emission = next(remaining, self.emission)
+        return replace(self, texture=texture, normal_map=normals, emission=emission)
 
     @property
     def is_transparent(self) -> bool:
@@ -301,13 +298,15 @@ def replace_geometry(
 ) -> ImportedPart:
     """Return a part with other vertices and normals.
 
-    Mirroring reverses the winding of faces, and normals that were transformed by the
-    cofactors. Both are reversed again here.
+    Mirrored positions reverse the winding of faces, so that their fronts are inside. A
+    matrix that mirrors also has cofactors that reverse normals. Both are reversed again
+    here.
 
     Args:
         part: the part.
         vertices: (V, 3) new positions.
-        normals: (V, 3) new normals, or None.
+        normals: (V, 3) new normals, transformed by the cofactors of the matrix that
+            transformed the positions; or None.
         is_mirrored: whether the new positions are mirrored.
     """
     part = replace(part, vertices=vertices, normals=normals)
@@ -359,7 +358,7 @@ def make_part_from_corners(
     )
 
     def gather_vertex_values(indexed: IndexedValues | None) -> Float64Array | None:
-        """Return values (V, C), NaN for vertices without one; None if all are without."""
+        """Return values (V, C), NaN for vertices without one; None if all lack one."""
         if indexed is None:
             return None
         rows = indexed.row_of_corner[triangles].reshape(-1)[first_corner]
@@ -367,7 +366,8 @@ def make_part_from_corners(
             return None
         return np.where(rows[:, None] >= 0, indexed.values[rows], np.nan)
 
-    vertices = points.values[points.row_of_corner[triangles].reshape(-1)[first_corner]]
+    point_rows = points.row_of_corner[triangles].reshape(-1)[first_corner]
+    vertices = points.values[point_rows]
     return ImportedPart(
         vertices=vertices,
         faces=faces.reshape(-1, 3),
@@ -382,29 +382,31 @@ def make_part_from_corners(
 def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntArray:
     """Return one number for each corner, which is equal for corners with equal values.
 
-    The rows of a corner's values become the digits of the number. The base of a digit
-    is the column's number of values plus 1; the digit 0 stands for a missing value (row
-    -1).
+    A corner refers to each list of values by a row. The number is built from these
+    rows as from digits: for points and normals it is point row * base + normal row,
+    where the base is the number of rows that normals may have. Rows count from 1 here;
+    0 stands for a missing value.
 
     Args:
         triangles: (T,) indices of the triangles.
-        columns: values of the corners, such as points and normals; None is skipped.
+        *columns: values of the corners, such as points and normals; None is skipped.
 
     Returns:
         (3 T,) numbers, corner by corner.
     """
     corner_number = np.zeros(3 * len(triangles), dtype=np.int64)
     bound = 1  # all numbers are smaller than this
-    for indexed in filter(None, columns):
+    for indexed in columns:
+        if indexed is None:
+            continue
         base = len(indexed.values) + 1
-        # Replace the numbers by consecutive ones, so that the next digit does not
-        # overflow 64 bits.
-        if bound * base >= 2**63:
+        would_overflow = bound * base >= 2**63
+        if would_overflow:
+            # Equal numbers are replaced by equal smaller ones, which count from 0.
             _, corner_number = np.unique(corner_number, return_inverse=True)
             corner_number = corner_number.reshape(-1)
             bound = len(corner_number)
-        corner_number = (
-            corner_number * base + indexed.row_of_corner[triangles].reshape(-1) + 1
-        )
+        digit = indexed.row_of_corner[triangles].reshape(-1) + 1
+        corner_number = corner_number * base + digit
         bound *= base
     return corner_number

@@ -126,7 +126,8 @@ def _average_colors(
 ) -> Float32Array:
     """Return an image of colors averaged down in linear light, display-referred.
 
-    Colors are weighted by opacity, so that transparent pixels have no weight.
+    If the image has opacity, colors are weighted by it, so that transparent pixels have
+    no weight. Where all pixels are transparent, weights are equal.
 
     Args:
         image: the image.
@@ -138,7 +139,11 @@ def _average_colors(
     is_weighted = keep_alpha or image.has_transparency_data
 
     def load_band(top: int, end: int) -> Float32Array:
-        """Return rows of linear colors; if weighted, also opacity and their product."""
+        """Return rows of linear colors, from `top` to before `end`.
+
+        If colors are weighted, the channels are those of the color (3), the opacity
+        (1), and the color times the opacity (3).
+        """
         band_image = image.crop((0, top, width, end))
         levels = to_8bit_levels(band_image, alpha=is_weighted)
         colors = linear_of_level[levels[:, :, :3]]
@@ -148,12 +153,12 @@ def _average_colors(
         return np.concatenate([colors, opacity, colors * opacity], axis=2)
 
     averaged = average_in_bands(load_band, (height, width), target_shape)
-    # in the order of the channels in `load_band`
+    # the channels of `load_band`
     colors = averaged[:, :, :3]
     opacity = averaged[:, :, 3:4]
     if is_weighted:
-        weighted_colors = averaged[:, :, 4:] / np.maximum(opacity, 1e-9)
-        # Fully transparent pixels get the mean color without weights.
+        color_times_opacity = averaged[:, :, 4:]
+        weighted_colors = color_times_opacity / np.maximum(opacity, 1e-9)
         colors = np.where(opacity > 0.0, weighted_colors, colors)
     display_colors = linear_to_srgb(colors)
     if not keep_alpha:
@@ -187,10 +192,12 @@ def average_in_bands(
     bands = []
     for start in range(0, target[0], rows_per_band):
         weights = row_weights[start : start + rows_per_band]
-        # the source rows that these rows of the result need
+        # The indices of a sparse array are its columns with a weight: the source rows
+        # that these rows of the result need.
         top = int(weights.indices.min())
         end = int(weights.indices.max()) + 1
-        bands.append(_average(load_band(top, end), weights[:, top:end], column_weights))
+        band = load_band(top, end)
+        bands.append(_average(band, weights[:, top:end], column_weights))
     return np.concatenate(bands)
 
 
@@ -240,26 +247,27 @@ def _average(
 def _compute_overlaps(source: int, target: int) -> sparse.csr_array:
     """Return the weights (target, source) of source cells in target cells.
 
-    Both grids divide the same length, one into `source` and the other into `target`
-    equal cells. A weight is the length of the overlap of two cells, normalized so that
-    each row sums to 1. To find overlaps, the length is cut at the edges of both grids.
+    The same length is divided into `source` equal cells, and into `target` equal cells.
+    A weight is the length of the overlap of two cells, normalized so that each row sums
+    to 1. To find overlaps, the length is cut into pieces at the edges of all cells.
     Each piece is in one source cell and in one target cell, and its length is their
     overlap.
     """
+    # Lengths are in source cells.
+    source_edges = np.arange(source + 1, dtype=np.float64)
     target_edges = np.arange(target + 1) * (source / target)
-    all_edges = np.unique(
-        np.concatenate([target_edges, np.arange(source + 1, dtype=np.float64)])
-    )
-    centers = (all_edges[1:] + all_edges[:-1]) / 2
-    lengths = np.diff(all_edges)
-    target_cell = np.minimum((centers * (target / source)).astype(np.int64), target - 1)
+    piece_edges = np.unique(np.concatenate([target_edges, source_edges]))
+    piece_lengths = np.diff(piece_edges)
+    # The center of a piece is in the same cells as the piece. Rounding must not move it
+    # beyond the last cell.
+    centers = (piece_edges[1:] + piece_edges[:-1]) / 2
     source_cell = np.minimum(centers.astype(np.int64), source - 1)
+    target_cell = np.minimum((centers * (target / source)).astype(np.int64), target - 1)
     overlaps = sparse.coo_array(
-        (lengths, (target_cell, source_cell)), shape=(target, source)
-    )
-    weights = overlaps.tocsr()
-    normalization = sparse.diags_array(1.0 / np.asarray(weights.sum(axis=1)).ravel())
-    return sparse.csr_array(normalization @ weights)
+        (piece_lengths, (target_cell, source_cell)), shape=(target, source)
+    ).tocsr()
+    row_sums = np.asarray(overlaps.sum(axis=1)).ravel()
+    return sparse.csr_array(sparse.diags_array(1.0 / row_sums) @ overlaps)
 
 
 ImageKind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds

@@ -100,8 +100,8 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
             than its header states.
     """
     has_magic = data.startswith(b"ply")
-    # Some files end their lines in carriage returns alone. Replacing them leaves all
-    # positions as they are.
+    # Some files end their lines in carriage returns alone. These are replaced only to
+    # search for the end of the header, whose position stays the same.
     ends_in_returns = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")
     header_end = _END.search(data.replace(b"\r", b"\n") if ends_in_returns else data)
     if not has_magic or header_end is None:
@@ -123,9 +123,10 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
         cells = parse_number_array(body, np.float64).view(np.uint8)
         text = body
     position = 0
-    # Each element begins where the one before it ends.
     for element in elements.values():
-        position = _RowReader(notes, element, cells, text).read(position)
+        reader = _RowReader(notes, element, cells, text)
+        # This fills in the element, and returns its end, where the next one begins.
+        position = reader.read(position)
     return elements, comments
 
 
@@ -228,7 +229,7 @@ class _RowReader:
             name: self._view_from_any_byte(kind)
             for name, kind in element.count_types.items()
         }
-        # A list begins with its count, and a scalar is its value.
+        # A list begins with its count. A property without counts is a scalar.
         self.widths = {
             name: self.counts.get(name, values).itemsize
             for name, values in self.values.items()
@@ -250,28 +251,34 @@ class _RowReader:
         # check that the file is long enough at least for their scalars and counts.
         self._check_end(position + self.element.count * sum(self.widths.values()))
         # Rows are first assumed to be as long as the first one, which is fast. If the
-        # lists at these positions differ in length, rows are walked one by one.
+        # rows would end beyond the file, or the lists at these positions differ in
+        # length, that is wrong, and rows are walked one by one.
         starts, end = self._find_even_rows(position)
-        lists_differ = end > len(self.cells) or any(
+        rows_differ = end > len(self.cells) or any(
             np.ptp(count_at_byte[starts[name]]) != 0
             for name, count_at_byte in self.counts.items()
         )
-        if lists_differ:
+        if rows_differ:
             starts, end = self._walk_rows(position, self.element.count)
         self._store_values(starts)
         return end
 
     def _view_from_any_byte(self, kind: np.dtype[np.generic]) -> Numbers:
-        """Return the numbers of a type that begin at each byte.
+        """View the bytes as numbers of a type, one for each byte.
 
-        No byte is copied: number i of the view is made of the bytes from i on.
+        Number i is read from byte i and those after it. So successive numbers overlap,
+        and any of them can be read, wherever it begins. No byte is copied.
+
+        Args:
+            kind: type of the numbers in a binary file. The numbers of an ASCII file are
+                stored as float64, whatever their type is.
         """
-        if self.text:  # the numbers of an ASCII file
+        is_ascii = bool(self.text)
+        if is_ascii:
             kind = np.dtype(np.float64)
-        n_starts = max(0, len(self.cells) - kind.itemsize + 1)
-        # The stride is one byte.
+        n_numbers = max(0, len(self.cells) - kind.itemsize + 1)
         numbers: Numbers = np.ndarray(
-            (n_starts,), kind, buffer=self.cells, offset=0, strides=(1,)
+            (n_numbers,), kind, buffer=self.cells, offset=0, strides=(1,)
         )
         return numbers
 
@@ -298,7 +305,8 @@ class _RowReader:
             for name, width in self.widths.items():
                 starts[name].append(byte)
                 self._check_end(byte + width)
-                if name in self.counts:
+                is_list = name in self.counts
+                if is_list:  # `width` is that of its count, which is before its values
                     length = self._read_length(name, byte)
                     byte += self.values[name].itemsize * length
                 byte += width
@@ -365,7 +373,13 @@ def _gather_lists(
 def _make_length_error(notes: Notes, element: Element, text: bytes) -> FileFormatError:
     """Return the error for a file that ends within an element.
 
-    An ASCII file seems to end where a word is not a number; then the error names it.
+    The numbers of an ASCII file are parsed up to the first word that is no number. If
+    there is one, the error names it.
+
+    Args:
+        notes: notes about the file.
+        element: the element.
+        text: the body of an ASCII file; empty for a binary file.
     """
     words = map(decode_text, text.split())
     odd_word = next((word for word in words if not is_number(word)), None)
@@ -446,7 +460,8 @@ def _combine_colors(
     """
     if colors is None:
         return surface, None
-    if surface.texture is None:  # white, which does not change these colors
+    if surface.texture is None:
+        # The file has no other material. White does not change the colors.
         return ImportedSurface(color=np.ones(3, np.float32)), colors
     if colors[group].min() < 1.0:
         notes.warn("colours of vertices or faces are left out where there is a texture")
@@ -479,7 +494,7 @@ def _make_parts(
     texture = polygon_textures[polygon]
     colors = reader.read_colors(position.row_of_corner, polygon)
     surfaces = reader.make_surfaces(texture_names, has_no_colors=colors is None)
-    # The last one is for faces without texture, whose index is -1.
+    # Faces without a texture have the index -1, that of the last surface.
     surfaces.append(ImportedSurface())
     parts = list[ImportedPart]()
     has_uvs = np.zeros(len(triangles), np.bool_)
@@ -751,7 +766,8 @@ class _Properties:
         values = self.read_columns(element, COLOR_NAMES)
         if values is None:
             return None
-        # The three channels are assumed to have the same type.
+        # The file may name red "red" or "diffuse_red". All three channels are assumed
+        # to have its type.
         scalars = self.elements[element].scalars
         red_name, _, _ = self._find_group(element, scalars, COLOR_NAMES)
         color_type = self.elements[element].type_by_property[red_name]
@@ -775,10 +791,11 @@ class _Properties:
         scalars = self.elements[element].scalars
         for name in set(ALPHA_NAMES) & set(scalars):
             alphas = scalars[name].astype(np.float64)
-            is_opaque = not len(alphas) or alphas.min() >= _find_scale(
-                alphas[:, None], color_type
-            )
-            if is_opaque:
+            if not len(alphas):
+                self.notes.mark_read(f"{element} property", name)
+                continue
+            opaque_alpha = _find_scale(alphas[:, None], color_type)  # such as 255
+            if alphas.min() >= opaque_alpha:
                 self.notes.mark_read(f"{element} property", name)
 
     def read_texture_indices(
@@ -810,9 +827,10 @@ class _Properties:
         if element == "face":
             texture[: len(numbers)] = numbers  # triangles of strips keep -1
         else:
-            # A polygon without corners at the end would begin past the last corner.
             first_corner = np.cumsum(counts) - counts
-            texture = numbers[corners[np.minimum(first_corner, len(corners) - 1)]]
+            # Polygons without corners at the end would begin past the last corner.
+            first_corner = np.minimum(first_corner, len(corners) - 1)
+            texture = numbers[corners[first_corner]]
         is_wrong = (texture < -1) | (texture >= len(names))
         n_wrong = int(is_wrong.sum())
         if n_wrong:
@@ -865,7 +883,7 @@ class _Properties:
 
 
 def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
-    """Return values as integers; -1 for floats that are too large to be exact.
+    """Return values as integers; -1 for NaN, and for floats too large to be exact.
 
     A float64 of 2^53 or more may be a rounded integer.
     """
@@ -908,12 +926,16 @@ def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
         counts: (S,) how many vertices each strip has.
     """
     is_end_mark = vertices < 0
-    # One entry more than there are vertices, for an end mark that is the last vertex.
+    # Strips start at the beginning of each list, and after each end mark. An end mark
+    # may be the last vertex, and an empty list may be the last one: then the start is
+    # beyond the last vertex, and there is one entry more for it.
     is_strip_start = np.zeros(len(vertices) + 1, dtype=np.bool_)
-    is_strip_start[np.cumsum(counts) - counts] = True  # the first vertex of each strip
-    is_strip_start[1:][is_end_mark] = True
+    list_starts = np.cumsum(counts) - counts
+    is_strip_start[list_starts] = True
+    is_strip_start[np.flatnonzero(is_end_mark) + 1] = True
+    # (N,) for each vertex its index, the index of its strip's first vertex, and its
+    # position in the strip
     index = np.arange(len(vertices))
-    # for each vertex the index at which its strip began, and its position in the strip
     strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
     position = index - strip_start
     # Every vertex of a strip, except the first two, is the last one of a triangle.

@@ -442,8 +442,8 @@ class FileFrame:
 def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFrame:
     """Return the frame in which parts have extent 1, stand on z = 0 and are centered.
 
-    The largest extent becomes 1, and parts are centered in x and y. Only visible faces
-    with an area are used, since the repair of the geometry removes all others.
+    The largest extent becomes 1, and parts are centered in x and y. Faces that are not
+    visible, or have no area, do not count: the repair of the geometry removes them.
 
     Args:
         parts: the parts.
@@ -472,12 +472,15 @@ def _find_light_unit(
 ) -> tuple[float, str]:
     """Return how many candela are one unit of radiant intensity, and a note on it.
 
-    glTF states lamps in candela and surfaces in nit (candela per square meter); a nit
-    of a surface is one unit of radiance here. Exporters write watts times `LUMENS` for
-    lamps. So if there are only lamps, `LUMENS` candela are one unit. If surfaces emit
-    light, too, lamps must have the right brightness in comparison with them. By glTF's
-    definition one candela is one unit. But Blender does not multiply surfaces by
-    `LUMENS`, so that in its files `LUMENS` candela are one unit.
+    glTF states lamps in candela, and surfaces in nit (candela per square meter). A nit
+    is one unit of radiance here. The unit of lamps depends on the file:
+
+    - Only lamps emit light: `LUMENS` candela are one unit, since exporters multiply the
+      watts of lamps by `LUMENS`.
+    - Surfaces emit light, too: one candela is one unit, as glTF defines it, so that
+      lamps have the right brightness in comparison with surfaces.
+    - The same, but Blender wrote the file: `LUMENS` candela are one unit, since it
+      multiplies lamps by `LUMENS`, but not surfaces.
 
     Args:
         header: header of the file.
@@ -533,7 +536,7 @@ def _make_lamp(
         InputError: it is too far away or too bright.
     """
     position, intensity = _position_light(light, candela_per_unit, pose, frame)
-    # one limit for distances and intensities; NaN is out of range
+    # `MAX_DISTANCE` is also the limit of intensities. NaN is out of range.
     is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE
     if not is_in_range.all():
         raise InputError(
@@ -549,7 +552,7 @@ def _make_lamp(
     if light.type != "spot":
         return lamp
     return SpotLamp(
-        **vars(lamp),
+        **vars(lamp),  # a spot light has all fields of a point light
         direction=_normalize_axis(frame.rotation @ -pose[:3, 2]),
         cutoff=math.degrees(light.spot.outerConeAngle),
         beam=math.degrees(light.spot.innerConeAngle),
@@ -566,8 +569,9 @@ def _position_light(
 
     A directional light is stated in lux. It becomes a lamp so far away that its rays
     are almost parallel. Its intensity is lux times squared distance, so that it causes
-    the same lux at the object. For other lights, lengths are divided by the object's
-    size, and therefore intensities by its square.
+    the same lux at the object. Other lights are scaled with the object, whose size
+    becomes 1. Their intensity is divided by the squared size, so that they light it as
+    before.
 
     Args:
         light: its entry in the header.
@@ -577,7 +581,8 @@ def _position_light(
     """
     intensity = np.array(light.color) * light.intensity / candela_per_unit
     if light.type == "directional":
-        direction = frame.rotation @ pose[:3, 2]  # it shines along its -z
+        # It shines along its -z, so that it is in the direction of its z.
+        direction = frame.rotation @ pose[:3, 2]
         length = max(float(np.linalg.norm(direction)), 1e-12)  # not 0
         position = gltf_parts.DIRECTIONAL_LIGHT_DISTANCE * direction / length
         intensity = intensity * gltf_parts.DIRECTIONAL_LIGHT_DISTANCE**2
@@ -625,12 +630,13 @@ def _make_camera(
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
     matrix[:3, :3] = axes
-    # `to_frame` takes points that are rotated to our axes.
+    # `to_frame` moves and scales points that are rotated to our axes already.
     matrix[:3, 3] = frame.to_frame(frame.rotation @ pose[:3, 3])
     # `yfov` is the field of view along the height. Ours is along the larger side: in a
     # wide image that is the width, whose tangent is larger by the aspect ratio. If the
-    # file has no aspect ratio, that of the rendered image is used (section 5.13). It is
-    # not known here, so that `upright` states that `fov` is along the height.
+    # file has no aspect ratio, that of the rendered image is used (glTF 2.0, section
+    # 5.13). It is not known here, so that `upright` states that `fov` is along the
+    # height.
     aspect_ratio = camera.perspective.aspectRatio
     larger_side_ratio = 1.0 if aspect_ratio is None else max(aspect_ratio, 1.0)
     half_tangent = math.tan(camera.perspective.yfov / 2.0)
@@ -644,7 +650,8 @@ def _make_camera(
 def _find_camera_problem(matrix: Float64Array, fov: float) -> str | None:
     """Return why a camera cannot be imported; None if it can be.
 
-    The text continues a message that begins with "expected the camera NAME".
+    The text continues a message that begins with "expected the camera NAME", such as
+    "within 5 object sizes, got more; correct its position".
 
     Args:
         matrix: (4, 4) its pose, with unit vectors as axes.

@@ -107,10 +107,10 @@ def apply_textures(
     used_surfaces = _list_used_surfaces(soup, surfaces)
     first_surface = used_surfaces[0]
     is_uniform = all(surface.has_same_maps(first_surface) for surface in used_surfaces)
-    # `soup.colors` are factors of the base color
+    # `soup.colors` are vertex colors, factors of the base color.
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
     _, material_of_face = index_materials(soup, surfaces)
-    # Cases that need no baking return here.
+    # Objects that need no baking are returned in this block.
     shares_emission = False
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
@@ -208,10 +208,11 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     )
     # Smallest and largest material on each texel: if they differ, it is shared. Texels
     # without a face have a largest one of -1.
+    texel = row * size + column
     first_material = np.full(size * size, len(uvs))  # more than any index
     last_material = np.full(size * size, -1)
-    np.minimum.at(first_material, row * size + column, material[face])
-    np.maximum.at(last_material, row * size + column, material[face])
+    np.minimum.at(first_material, texel, material[face])
+    np.maximum.at(last_material, texel, material[face])
     n_shared = (last_material > first_material).sum()
     return bool(n_shared > _MAX_SHARED * (last_material >= 0).sum())
 
@@ -242,6 +243,8 @@ def _shares_emission(
         return False
     is_lit = pictures[-1].any(axis=2)
     height, width = is_lit.shape
+    # The negative tolerance leaves out texels on the border of a face, which neighbours
+    # share.
     _, rows, columns, _ = rasterize_triangles(
         _to_texels(uvs, (height, width)), (height, width), tolerance=-1e-6
     )
@@ -366,8 +369,9 @@ def _move_into_unit_square(soup: TriangleSoup) -> Float64Array:
     # (charts, 2) the smallest u and v of each chart
     chart_corner = np.full((int(chart.max()) + 1, 2), np.inf)
     np.minimum.at(chart_corner, chart[vertex.reshape(-1)], flat_uvs)
-    # With the tolerance, a chart that begins just below an integer begins at it: it is
-    # clipped later, and not moved to the end of the unit square.
+    # A chart that begins just below an integer, by rounding, must not be moved to the
+    # end of the unit square. With the tolerance it begins just below 0, and is clipped
+    # later.
     chart_offset = np.floor(chart_corner + _UV_TOLERANCE)
     uvs: Float64Array = soup.uvs - chart_offset[chart[vertex]]
     return uvs
@@ -415,7 +419,7 @@ def _crop_to_window(
     Returns:
         UVs relative to the window, and the images of it; or both as they were.
     """
-    # (2,) width and height of a texel of the coarsest image, as fractions of the image
+    # (2,) width and height of a texel of the coarsest image, in texture coordinates
     largest_texel = np.max([1.0 / _get_size(picture) for picture in pictures], axis=0)
     window_lower = uvs.min(axis=(0, 1)) - largest_texel
     window_upper = uvs.max(axis=(0, 1)) + largest_texel
@@ -616,14 +620,16 @@ def _fill_gaps(maps: SurfaceMaps, is_inside: npt.NDArray[np.bool_]) -> SurfaceMa
     Such texels emit light only close to a chart, where filtering needs it: further away
     the renderer would sample light from texels that no face shows.
     """
+    # A texel inside is its own nearest one, at the distance 0.
     distance, nearest = distance_transform_edt(~is_inside, return_indices=True)
-    nearest_texel = tuple(nearest)
+    nearest_texel = tuple(nearest)  # rows and columns, each (H, W)
     normals = maps.normals
     if normals is not None:
         normals = normals[nearest_texel]
     emission = maps.emission
     if emission is not None:
-        emission = emission[nearest_texel] * (distance < _EMISSION_BORDER)[:, :, None]
+        is_near_chart = distance < _EMISSION_BORDER
+        emission = emission[nearest_texel] * is_near_chart[:, :, None]
     return SurfaceMaps(maps.color[nearest_texel], normals, emission)
 
 
@@ -646,8 +652,10 @@ def _sample_base_color(
     """
     if surface.texture is not None and np.isfinite(uvs).all():
         return sample_colors(surface.texture, uvs)
-    color = _get_plain_color(surface)
-    if surface.texture is not None:
+    if surface.texture is None:
+        color = _get_plain_color(surface)
+    else:
+        # several parts may have the same texture
         shows_texture = [other.texture is surface.texture for other in surfaces]
         is_selected = np.array(shows_texture)[soup.part_of_face]
         areas = np.linalg.norm(soup.compute_area_vectors(), axis=1)[is_selected]
@@ -659,7 +667,7 @@ def _sample_base_color(
 
 
 def _count_texels(soup: TriangleSoup, surfaces: Sequence[ImportedSurface]) -> float:
-    """Return how many texels of the file's images are on an object.
+    """Return how many texels of the file's images an object shows.
 
     For a part this is the area of its UVs times the number of texels of its largest
     image. Texels of an image that repeats are counted at each repeat.
@@ -710,8 +718,9 @@ def average_over_faces(
     n_steps = int(np.clip(np.sqrt(_MAX_SAMPLES / len(areas)), 1, _MAX_STEPS))
     weights = _compute_sample_weights(n_steps)
     weighted_sum = np.zeros(texture.shape[2])
-    # In batches, so that memory is bounded. Negated twice, the quotient is rounded up.
-    n_batches = -(-len(areas) * len(weights) // _MAX_SAMPLES)
+    # In batches, so that memory is bounded. The number of batches is rounded up.
+    n_samples = len(areas) * len(weights)
+    n_batches = -(-n_samples // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
         sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
         texels = _sample_nearest(texture, sample_uvs)
@@ -726,9 +735,10 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     """Return barycentric weights (P, 3) of points evenly spread over a triangle.
 
     Each side is cut into `steps` parts, which divides the triangle into steps**2 equal
-    small triangles. The points are the centers of these. A small triangle that points
-    up begins at a grid point (i, j), and its center is a third of a step beyond it
-    along both sides. The center of one that points down is two thirds beyond it.
+    small triangles. The points are the centers of these. Small triangles point up, like
+    the large one, or down. Both kinds begin at grid points (i, j), counted in steps
+    along two sides. The center of one that points up is at (i + 1/3, j + 1/3), and the
+    center of one that points down at (i + 2/3, j + 2/3).
     """
     grid_i, grid_j = np.meshgrid(np.arange(steps), np.arange(steps))
     i = grid_i.reshape(-1)
@@ -736,10 +746,9 @@ def _compute_sample_weights(steps: int) -> Float64Array:
     # grid points at which a small triangle of either kind begins within the large one
     is_up = i + j < steps
     is_down = i + j < steps - 1
-    # steps from the first corner to each center along the two sides
     center_i = np.concatenate([i[is_up] + 1.0 / 3.0, i[is_down] + 2.0 / 3.0])
     center_j = np.concatenate([j[is_up] + 1.0 / 3.0, j[is_down] + 2.0 / 3.0])
-    # as fractions of a side they are the weights of the second and the third corner
+    # As fractions of a side these are the weights of the second and the third corner.
     weight_b = center_i / steps
     weight_c = center_j / steps
     return np.stack([1.0 - weight_b - weight_c, weight_b, weight_c], axis=1)
@@ -831,13 +840,14 @@ def _unmirror(
     if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:  # (almost) all are mirrored
         return soup, replace(maps, normals=_reverse_component(normals, component=1))
     new_uvs = uvs.copy()
-    # Both halves have half of the width: u in [0, 2] first, then halved.
+    # In units of the old width, the right half is from 1 to 2, and its u runs
+    # backwards. Then both halves are scaled to [0, 1].
     new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
     new_uvs[:, :, 0] /= 2.0
-    # in the mirrored half, bumps along u are reversed
+    # u runs the other way in the right half, so that the normals' x is reversed.
     mirrored_normals = _reverse_component(normals[:, ::-1], component=0)
     emission = maps.emission
-    # a single texel is one value everywhere
+    # An emission of a single texel is the same everywhere, and is not doubled.
     if emission is not None and emission.shape != (1, 1, 3):
         emission = np.concatenate([emission, emission[:, ::-1]], axis=1)
     color = np.concatenate([maps.color, maps.color[:, ::-1]], axis=1)
@@ -884,11 +894,11 @@ def convert_normals(
     normal = normalize_vectors(np.einsum("tk,tkc->tc", weights, old_soup.normals[face]))
     old_tangent = _compute_tangents(old_soup, normal, face)
     new_tangent = _compute_tangents(replace(old_soup, uvs=new_uvs), normal, face)
-    # The file's bitangent points up the image. That is normal x tangent, or its
-    # opposite where UVs are mirrored.
+    # The bitangents have different definitions. In the file it points up the image,
+    # which is normal x tangent, or its opposite where UVs are mirrored. The result is
+    # for the renderer, in which it is always normal x tangent.
     mirror_sign = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
     old_bitangent = np.cross(normal, old_tangent) * mirror_sign
-    # The renderer's bitangent is always normal x tangent.
     new_bitangent = np.cross(normal, new_tangent)
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)  # decoded
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent

@@ -1,7 +1,7 @@
 """Reader of Wavefront OBJ files.
 
-Statements with numbers (``v``, ``vt``, ``vn``, ``f``) are parsed as arrays, since a file
-may have millions of lines. All other statements are parsed line by line.
+Statements with numbers (``v``, ``vt``, ``vn``, ``f``) are parsed as arrays, since a
+file may have millions of lines. All other statements are parsed line by line.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class _Triangles:
         """
         material = self.material_names.index(material_name)
         is_selected = (self.material_index == material) & (self.udim_square == square)
-        is_selected = is_selected & (self.uv.row_of_corner >= 0).all(axis=1)
+        is_selected = is_selected & self.has_uvs
         uvs = self.uv.values[self.uv.row_of_corner[is_selected]]
         points = self.position.values[self.position.row_of_corner[is_selected]]
         return uvs, np.linalg.norm(compute_area_vectors(points), axis=1)
@@ -322,7 +322,7 @@ def _find_flat_faces(
     """
     values, group = _find_values_in_effect(smoothing_changes, rows)
     is_off_by_group = [value in NOT_SMOOTH for value in values]
-    # Triangles before the first statement have the group -1, which is the last entry.
+    # The last entry is for triangles before the first statement, whose group is -1.
     is_off = np.array([*is_off_by_group, False])[group]
     lacks_normals = (normal.row_of_corner < 0).any(axis=1)
     if ((group >= 0) & ~is_off & lacks_normals).any():
@@ -336,7 +336,7 @@ def _find_flat_faces(
 def _find_squares(
     reader: MtlReader, names: Sequence[str], material: IntArray, uv: IndexedValues
 ) -> IntArray:
-    """Return the UDIM square of each triangle, (T,); 0 if one image is for all.
+    """Return the UDIM square of each triangle, (T,); 0 for no UDIM texture.
 
     A UDIM texture has an image for each unit square of texture coordinates, numbered
     from 1001. Triangles in squares without an image get 0, too.
@@ -413,17 +413,17 @@ def _combine_colors(
 
     Args:
         surface: the material.
-        colors: (T, 3, 3) linear vertex colors of the corners of all triangles, or None.
-        group: the triangles that have the material.
+        colors: (T, 3, 3) linear vertex colors of the corners of all triangles of the
+            file, or None.
+        group: indices of the triangles that have the material.
         notes: notes about the file.
 
     Returns:
-        The surface; and the colors of all triangles if they multiply its color, or
-        None.
+        The surface; and `colors` if they multiply its color, otherwise None.
     """
     if colors is None:
         return surface, None
-    has_vertex_colors = colors[group].min() < 1.0  # not only white ones
+    has_vertex_colors = colors[group].min() < 1.0  # white changes nothing
     if surface.texture is not None:
         if has_vertex_colors:
             notes.warn("colours of vertices are left out where there is a texture")
@@ -475,7 +475,6 @@ def _parse_statements(lines: ObjLines, notes: Notes) -> _Statements:
             smoothing_changes.append((row, clean_argument))
         elif key in NON_FACE_STATEMENTS:
             notes.record(f"{NON_FACE_STATEMENTS[key]}, statement", key)
-        # Statements that group faces, or switch something off, change nothing.
         elif key not in GROUPING and clean_argument not in ("off", "0"):
             notes.record("statement", keyword)
     return _Statements(library_lines, material_changes, smoothing_changes)
@@ -497,11 +496,10 @@ def _find_values_in_effect(
     values = list(dict.fromkeys(value for _, value in changes))
     index_of_value = {value: index for index, value in enumerate(values)}
     change_rows = np.array([row for row, _ in changes], dtype=np.int64)
-    # the last change on a row before; -1 if there is none
-    last_change = np.searchsorted(change_rows, rows) - 1
-    # Rows before the first change have the index -1, of the last entry, which is -1.
-    index_of_change = np.array([*(index_of_value[value] for _, value in changes), -1])
-    return values, index_of_change[last_change]
+    value_of_change = np.array([-1, *(index_of_value[value] for _, value in changes)])
+    # The first entry, -1, is for rows without a change before them.
+    n_changes_before = np.searchsorted(change_rows, rows)
+    return values, value_of_change[n_changes_before]
 
 
 def _read_colors(
@@ -553,8 +551,8 @@ _CONTINUATION = re.compile(rb"\\[ \t]*\n")
 _CONTINUED_COMMENT = re.compile(rb"^([ \t]*#[^\n]*?)\\[ \t]*\n", re.MULTILINE)
 _CORNER = re.compile(r"[-+]?\d+(?:/(?:[-+]?\d+)?){0,2}")
 _NEWLINE, _HASH, _SLASH = b"\n#/"
-# (256,) bool tables over all bytes: whether a byte is blank, and whether it may occur in
-# the corners of faces.
+# (256,) bool tables over all bytes: whether a byte is blank, and whether it may occur
+# in the corners of faces.
 _IS_BLANK, _IS_IN_CORNERS = (
     np.isin(np.arange(256), np.frombuffer(characters, np.uint8))
     for characters in (b" \t\n\v\f", b"+-/0123456789 \t\n\v\f")
@@ -591,18 +589,18 @@ class ObjLines:
         text = _normalize_lines(data)
         self.notes = notes
         self.text = text
-        # A file without a last line break may be cut short; `_check_sizes` uses this.
+        # The last line of a file without a last line break may be cut short.
         self.is_unended = not data.endswith((b"\n", b"\r"))
         self.text_bytes = np.frombuffer(text, dtype=np.uint8)
         # The normalized text ends in a line break, so that every line has an end.
         self.line_ends = np.flatnonzero(self.text_bytes == _NEWLINE)
         self.line_starts = np.concatenate([[0], self.line_ends[:-1] + 1])
-        # a last line may be shorter than three bytes
+        # so that the third byte exists in a last line that is shorter
         padded = np.concatenate([self.text_bytes, np.full(3, _NEWLINE, np.uint8)])
         first_byte, second_byte, third_byte = (
             padded[self.line_starts + offset] for offset in range(3)
         )
-        # A keyword has one or two letters, and a blank after it.
+        # A keyword has one or two letters, and then a blank or a line break.
         self.kind_of_line = np.full(len(self.line_starts), OTHER_KIND, dtype=np.int8)
         for index, kind in enumerate(KINDS):
             if len(kind) == 2:
@@ -700,10 +698,10 @@ class ObjLines:
         corners, sizes = parsed
         self._check_sizes(rows, sizes)
         for column, kind in enumerate(TABLES):
-            # A view: relative indices are replaced in `corners`.
             kind_indices = corners[:, column]
             if not len(kind_indices):
                 continue
+            # This changes `corners`, of which `kind_indices` is a view.
             self._resolve_relative(kind_indices, kind, rows, sizes)
             largest = kind_indices.max()
             if largest > counts[kind]:
@@ -734,10 +732,12 @@ class ObjLines:
             raise self.notes.damaged(f"3 or more corners on line {line_number}", got)
         # Rows count from 0, lines from 1.
         where = f"in the face on line {rows[sizes.argmax()] + 1}"
+        # `check_most` writes the limit into the braces.
         self.notes.check_most(
-            int(sizes.max()), MAX_CORNERS, f"at most {{}} corners {where}"
+            int(sizes.max()), MAX_CORNERS, "at most {} corners " + where
         )
-        self.notes.check_faces(int((sizes - 2).clip(0).sum()))
+        n_triangles = (sizes - 2).clip(0)  # lines of fewer than 3 corners have none
+        self.notes.check_faces(int(n_triangles.sum()))
 
     def _resolve_relative(
         self, index: IntArray, kind: str, rows: IntArray, sizes: IntArray
@@ -745,22 +745,23 @@ class ObjLines:
         """Replace negative indices (C,) in place by indices that count from 1.
 
         A negative index counts back from the line of its face: -1 is the last row of
-        the table `kind_of_line` above it.
+        the table above it.
 
         Args:
             index: (C,) indices of all corners.
-            kind_of_line: one of `TABLES`.
+            kind: keyword of the table, one of `TABLES`.
             rows: (P,) the row of each face's line in the file.
             sizes: (P,) the number of corners of each face.
         """
         is_relative = index < 0
         if not is_relative.any():
             return
-        # For each corner, the number of rows of the table above its line. (The sum has
-        # the line itself, which is a face and no row of a table.)
+        # For each corner, the number of rows of the table above its line. (The line
+        # itself is a face, so that it does not count.)
         count_before_line = np.cumsum(self.kind_of_line == KINDS.index(kind))
         count_before = np.repeat(count_before_line[rows], sizes)
-        if (index < -count_before).any():
+        is_before_first_row = index < -count_before
+        if is_before_first_row.any():
             self._raise_for_faces(rows)
         # With n rows above the line, -1 is row n (from 1): the index grows by n + 1.
         index[is_relative] += (count_before + 1)[is_relative]
@@ -777,24 +778,25 @@ class ObjLines:
         )
         if len(digits) != 8 * count:  # not a color for each vertex
             return None
-        # two hexadecimal digits for each channel
+        # a byte for each two digits
         channels = np.frombuffer(bytes.fromhex(digits.decode()), np.uint8)
-        # The first of four is a mask.
-        return channels.reshape(-1, 4)[:, 1:].astype(np.float64)
+        mask_and_color = channels.reshape(-1, 4)
+        return mask_and_color[:, 1:].astype(np.float64)
 
     def _select_lines(self, kind: str) -> tuple[IntArray, Bytes]:
-        """Return the rows of the lines of a kind, and their bytes, one after the other.
+        """Return the indices of the lines of a kind (N,), and their text as bytes.
 
-        Keywords become blanks, and comments are removed. The arguments and one line
-        break for each line remain.
+        The bytes are those of all these lines, one line after the other. Keywords
+        become blanks, and comments are removed. The arguments and the line breaks
+        remain.
 
         Args:
-            kind_of_line: keyword, one of `KINDS`.
+            kind: keyword, one of `KINDS`.
         """
         is_selected = self.kind_of_line == KINDS.index(kind)
-        # Lengths include line breaks, so that they add up to the length of the text.
-        lengths = self.line_ends - self.line_starts + 1
         rows = np.flatnonzero(is_selected)
+        # Every line, also the last, ends in a line break of one byte.
+        lengths = self.line_ends - self.line_starts + 1
         is_selected_byte = np.repeat(is_selected, lengths)
         line_bytes = self.text_bytes[is_selected_byte]
         # index of the first byte of each selected line in `line_bytes`
@@ -834,7 +836,8 @@ class ObjLines:
                         f"whole numbers in the face on line {line_number}",
                         format_name(word),
                     )
-                # A missing index, as in 1//3, is valid, and so is the 1 in its place.
+                # A missing index, as in 1//3, is valid. It is replaced by 1, which is
+                # always valid, too.
                 indices = [int(text or "1") for text in word.split("/")]
                 # A corner may have fewer indices than there are tables.
                 is_wrong = any(
@@ -859,8 +862,8 @@ def _normalize_lines(data: bytes) -> bytes:
         data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         + b"\n"
     )
-    # A backslash at the end of a line continues the line, but not a comment. So it is
-    # removed from comments first, whose line breaks stay.
+    # A backslash at the end of a line joins it with the next one, but not if the line
+    # is a comment. So backslashes at the end of comments are removed first.
     if _CONTINUATION.search(text):
         without_continued_comments = _CONTINUED_COMMENT.sub(rb"\1\n", text)
         text = _CONTINUATION.sub(b" ", without_continued_comments)
@@ -888,10 +891,10 @@ def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntAr
     """Return the column of each number in its corner, by the slashes before it.
 
     The column is the number of slashes in the corner before the number: in ``7//5`` the
-    7 is in column 0 and the 5 in column 2. A corner has at most three numbers. So the
-    column is a sum of at most three terms: the slashes right before the number, before
-    its predecessor, and before the predecessor of that, as far as they are in the same
-    corner.
+    7 is in column 0 and the 5 in column 2. A corner has at most three numbers, so at
+    most two of them are before a number. The slashes right before the number, right
+    before the previous number, and right before the one before that are added up, as
+    far as these are in the same corner. (The sum is 3 or more for a fourth number.)
 
     Args:
         is_first: (N,) whether a number is the first of its corner.
@@ -902,11 +905,12 @@ def _find_columns(is_first: BoolArray, is_after_two_slashes: BoolArray) -> IntAr
     n_slashes_if_not_first = np.where(is_after_two_slashes, 2, 1)
     n_slashes = np.where(is_first, 0, n_slashes_if_not_first)
     column = n_slashes.copy()
-    # Numbers that are not the first have a predecessor in the corner.
+    # slashes before the previous number, if it is in the same corner
     column[1:] += np.where(is_first[1:], 0, n_slashes[:-1])
-    # They have two predecessors unless they or their predecessor are the first.
-    is_first_or_second = is_first[2:] | is_first[1:-1]
-    column[2:] += np.where(is_first_or_second, 0, n_slashes[:-2])
+    # slashes before the number before that, if it is in the same corner: a number is
+    # the second of its corner if the previous one is the first
+    is_second = is_first[1:-1]
+    column[2:] += np.where(is_first[2:] | is_second, 0, n_slashes[:-2])
     return np.asarray(column)
 
 
@@ -925,21 +929,24 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     """
     is_slash = data == _SLASH
     number_starts, is_first = _find_numbers(data)
-    # The byte two before a number is a slash if two slashes are before it. For the
-    # first number of a corner, `_find_columns` ignores that.
-    column = _find_columns(is_first, is_slash[number_starts - 2])
+    # A number that is not the first of its corner has a slash before it. It has two if
+    # the byte before that is one, too. `_find_columns` ignores this for first numbers,
+    # where that byte is of another corner, or at the end of the text for the first one.
+    is_after_two_slashes = is_slash[number_starts - 2]
+    column = _find_columns(is_first, is_after_two_slashes)
     without_slashes = np.where(is_slash, np.uint8(ord(" ")), data)
     values = parse_number_array(without_slashes.tobytes(), np.int64)
     if (
         len(values) != len(number_starts)
         or (values == 0).any()  # the file counts from 1
-        or _has_malformed_corner(data, is_first, column)
+        or _has_malformed_corner(data, column)
     ):
         return None
-    # (P,) corners before each line break, minus those before the previous one
     corner_starts = number_starts[is_first]
     line_ends = np.flatnonzero(data == _NEWLINE)
-    sizes = np.diff(np.searchsorted(corner_starts, line_ends), prepend=0)
+    # (P,) corners before the end of each line, and those of each line alone
+    n_corners_before_end = np.searchsorted(corner_starts, line_ends)
+    sizes = np.diff(n_corners_before_end, prepend=0)
     # (N,) the corner of each number: the number of corners that have begun, minus 1
     corner_of_number = np.cumsum(is_first) - 1
     corners = np.zeros((len(corner_starts), 3), dtype=np.int64)
@@ -960,21 +967,15 @@ def _find_numbers(data: Bytes) -> tuple[IntArray, BoolArray]:
     return number_starts, is_first_of_corner
 
 
-def _has_malformed_corner(data: Bytes, is_first: BoolArray, column: IntArray) -> bool:
+def _has_malformed_corner(data: Bytes, column: IntArray) -> bool:
     """Return whether face lines have other characters, or corners of a wrong form.
 
     Args:
         data: the lines without keywords.
-        is_first: (N,) whether a number is the first of its corner.
-        column: (N,) column of each number in its corner.
+        column: (N,) column of each number in its corner; more than 2 if the corner has
+            too many slashes or numbers.
     """
     begins_with_slash = (data[1:] == _SLASH) & _IS_BLANK[data[:-1]]
-    # A number is the fourth of its corner, or a later one, if neither it nor its two
-    # predecessors are the first.
-    is_fourth = ~(is_first[3:] | is_first[2:-1] | is_first[1:-2])
     return bool(
-        begins_with_slash.any()
-        or not _IS_IN_CORNERS[data].all()
-        or is_fourth.any()
-        or (column > 2).any()
+        begins_with_slash.any() or not _IS_IN_CORNERS[data].all() or (column > 2).any()
     )

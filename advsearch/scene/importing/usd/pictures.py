@@ -232,28 +232,26 @@ def _unfilter(filters: Array, filtered: Array) -> Array:
     height, width, pixel_size = filtered.shape
     if filters.max(initial=0) > 4:
         raise ValueError("a PNG with an unknown filter")
-    # With zeros above and to the left; 16 bits hold the sum of two bytes.
-    pixels = np.zeros((height + 1, width + 1, pixel_size), np.int16)
+    # The image with a row of zeros above and a column of zeros to the left, which are
+    # what its first pixels are predicted from. 16 bits hold the sum of two bytes.
+    padded = np.zeros((height + 1, width + 1, pixel_size), np.int16)
     for diagonal in range(height + width - 1):
-        # the pixels of the image with row + column == diagonal
+        # (N,) padded row and column of the pixels on the diagonal of the image
         first_row = max(0, diagonal - width + 1)
-        row = np.arange(first_row, min(height, diagonal + 1))
-        column = diagonal - row
-        # `pixels` has one more row and column in front.
-        left = pixels[row + 1, column]
-        above = pixels[row, column + 1]
-        kind = filters[row][:, None]
+        padded_row = np.arange(first_row, min(height, diagonal + 1)) + 1
+        padded_column = diagonal + 2 - padded_row
+        left = padded[padded_row, padded_column - 1]
+        above = padded[padded_row - 1, padded_column]
+        above_left = padded[padded_row - 1, padded_column - 1]
+        row_filter = filters[padded_row - 1][:, None]
+        # A filter of 0 predicts 0.
         predicted = np.select(
-            [kind == 1, kind == 2, kind == 3, kind == 4],
-            [
-                left,
-                above,
-                (left + above) // 2,
-                _paeth(left, above, pixels[row, column]),
-            ],
+            [row_filter == 1, row_filter == 2, row_filter == 3, row_filter == 4],
+            [left, above, (left + above) // 2, _paeth(left, above, above_left)],
         )
-        pixels[row + 1, column + 1] = (filtered[row, column] + predicted) & 255
-    return pixels[1:, 1:].astype(np.uint8)
+        stored = filtered[padded_row - 1, padded_column - 1]
+        padded[padded_row, padded_column] = (stored + predicted) & 255  # modulo 256
+    return padded[1:, 1:].astype(np.uint8)
 
 
 def _paeth(left: Array, above: Array, corner: Array) -> Array:

@@ -1,8 +1,8 @@
 """Converter of OpenUSD stages to binary glTF, with `usd-core`.
 
 This module runs in a separate process. Layers are checked before they are composed:
-they may only refer to layers in or below the folder of the first one. Notes on prims and
-inputs that are not converted are in `asset.extras` of the file.
+they may only refer to layers in or below the folder of the first one. Notes on prims
+and inputs that are not converted are in `asset.extras` of the file.
 """
 
 from __future__ import annotations
@@ -381,7 +381,7 @@ class Conversion:
         """
         light = UsdLux.LightAPI(prim)
         kind = prim.GetTypeName()
-        stops = _get_first(light, "Exposure")
+        stops = _get_first(light, "Exposure")  # each doubles the radiance
         radiance = _get_first(light, "Intensity") * 2.0**stops
         color = _read_light_color(light)
         if kind == "DistantLight":
@@ -389,7 +389,7 @@ class Conversion:
             intensity = _compute_illuminance(prim, radiance)
         elif kind == "SphereLight":
             entry = _make_point_light(prim)
-            # the radius is in the stage's unit
+            # The area of the disk is in squared units of the stage, and becomes m^2.
             intensity = _integrate_over_sphere(prim, radiance) * self.unit**2
             self._note("has a SphereLight, which is a point light at its center here")
         else:
@@ -614,9 +614,9 @@ class Conversion:
     ) -> Array:
         """Return the indices of the values of selected triangles' corners.
 
-        The result is (3 T, columns). The first column is the index of the point. Then
-        each attribute has a column with the index of its value. The index is 0 if the
-        attribute is constant, or missing.
+        The result is (3 T, columns), where T is the number of selected triangles. The
+        first column is the index of the point. Then each attribute has a column with
+        the index of its value. The index is 0 if the attribute is constant, or missing.
 
         Args:
             path: path of the prim, for messages.
@@ -765,6 +765,7 @@ class Conversion:
             return np.full((len(faces), 1), NO_TINT)
         face_values = _compute_face_values(opacities, faces, mesh_faces)
         opacity = np.round(face_values.clip(0.0, 1.0) * 255.0) / 255.0
+        # "uniform" values are those of faces.
         is_of_vertices = opacities.interpolation not in ("constant", "uniform")
         if is_of_vertices and len(np.unique(opacities.values)) > 1:
             self._note("has an opacity of vertices; faces have its mean")
@@ -796,6 +797,7 @@ class Conversion:
         is_unbound = np.ones(faces, bool)
         for subset in subsets:
             selected = np.unique(_to_array(_get_first(subset, "Indices"), np.int64))
+            # without indices that do not exist, and faces of earlier subsets
             selected = selected[(selected >= 0) & (selected < faces)]
             selected = selected[is_unbound[selected]]
             is_unbound[selected] = False
@@ -884,17 +886,18 @@ def _find_face_colors(
 def _select_tint_color(
     tint: Array, colors: MeshValues | None, vertex_colors: MeshValues | None
 ) -> list[float] | None:
-    """Return the color (3,) of a material with a tint (4,); None for its own color.
+    """Return the color (3,) that replaces that of a material; None if none does.
 
     Args:
-        tint: color and opacity.
-        colors: colors of the primvar, or None.
-        vertex_colors: the same colors, if they become vertex colors.
+        tint: (4,) color and opacity of the material's copy for some faces.
+        colors: colors of the mesh's primvar, or None. Then the material keeps its own.
+        vertex_colors: the same colors, if they become vertex colors; otherwise None.
     """
     if colors is None:
         return None
     if vertex_colors is not None:
-        return [1.0, 1.0, 1.0]  # it is multiplied by the vertex colors
+        # The renderer multiplies vertex colors by that of the material: it is white.
+        return [1.0, 1.0, 1.0]
     return list(map(float, tint[:3]))
 
 
@@ -915,13 +918,14 @@ def _read_light_color(light: Any) -> Array:
 def _make_point_light(prim: Any) -> dict[str, Any]:
     """Return the entry of a point light, or of a spot light if the prim has a cone.
 
-    The softness is the fraction of the cone over which light fades.
+    Light fades from the inner to the outer angle. The softness is the distance of these
+    as a fraction of the outer angle.
     """
     if not prim.HasAPI(UsdLux.ShapingAPI):
         return {"type": "point"}
     shaping = UsdLux.ShapingAPI(prim)
     cone = _get_first(shaping, "ShapingConeAngle")
-    if cone is None or cone >= 90.0:
+    if cone is None or cone >= 90.0:  # glTF has no wider cones
         return {"type": "point"}
     softness = _get_first(shaping, "ShapingConeSoftness") or 0.0
     outer = math.radians(max(cone, 0.1))
@@ -932,7 +936,7 @@ def _make_point_light(prim: Any) -> dict[str, Any]:
 def _compute_face_values(
     primvar: MeshValues, faces: Array, mesh_faces: MeshFaces
 ) -> Array:
-    """Return the value (C,) of each of F faces, as (F, C).
+    """Return the values (F, C) of faces.
 
     Values of points or corners are averaged over the face. If a corrupt mesh has too
     few values, the last one is repeated.
@@ -952,8 +956,8 @@ def _compute_face_values(
     if primvar.interpolation in ("vertex", "varying"):
         corner_index = mesh_faces.point_of_corner
     corner_values = values[np.minimum(corner_index, last_index)]
-    # `reduceat` sums the rows from the start of a face to that of the next one. A row of
-    # zeros is appended, since faces without corners at the end begin after the last
+    # `reduceat` sums the rows from the start of a face to that of the next one. A row
+    # of zeros is appended, since faces without corners at the end begin after the last
     # row. Other faces without corners get a wrong value, but have no triangles.
     padded_values = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
     counts = mesh_faces.corner_counts
@@ -967,11 +971,13 @@ def _compute_illuminance(prim: Any, radiance: float) -> float:
     """Return the lux of a distant light on a surface that faces it.
 
     Its radiance is integrated over the cone of directions that it covers: L pi sin^2 of
-    the half angle. A "normalized" light of USD states its illuminance directly.
+    the half angle. The value that a "normalized" light of USD states is not a radiance,
+    but its illuminance already. So is that of a light without an angle.
     """
     angle = _get_first(UsdLux.DistantLight(prim), "Angle")
     half_angle = math.radians(angle) / 2.0
-    if _get_first(UsdLux.LightAPI(prim), "Normalize") or not half_angle > 0.0:
+    is_normalized = _get_first(UsdLux.LightAPI(prim), "Normalize")
+    if is_normalized or not half_angle > 0.0:  # also for NaN
         return radiance
     return radiance * (math.pi * math.sin(half_angle) ** 2)
 
@@ -982,8 +988,9 @@ def _integrate_over_sphere(prim: Any, radiance: float) -> float:
     The area is pi r^2. A "normalized" light of USD has a power that does not depend on
     its size: its radiance is divided by the area of the sphere, 4 pi r^2.
     """
-    if _get_first(UsdLux.LightAPI(prim), "Normalize"):
-        return radiance * 0.25
+    is_normalized = _get_first(UsdLux.LightAPI(prim), "Normalize")
+    if is_normalized:
+        return radiance * 0.25  # pi r^2 / (4 pi r^2)
     radius: float = _get_first(UsdLux.SphereLight(prim), "Radius")
     return radiance * (math.pi * radius**2)
 

@@ -511,7 +511,8 @@ class PreviewSurface:
     def _note_unread(self, *, is_specular: bool) -> None:
         """Note the inputs that are not read, of the surface and of its shaders.
 
-        Inputs of the surface need no note if they have no value or a neutral one.
+        Inputs of the surface need no note if they have no value, or one that changes
+        nothing.
         """
 
         def is_without_effect(name: str, shader_input: Any) -> bool:
@@ -555,7 +556,7 @@ class PreviewSurface:
             name: the input.
             kinds: ids of shaders that read primvars of the right type, such as
                 "UsdPrimvarReader_float3"; for other shaders the result is None.
-            default: the default of the input, which has its number of channels.
+            default: the default of the input. Only its number of channels is used.
         """
         source = self.shader.find_source(name)
         if source is None:
@@ -586,7 +587,8 @@ class PreviewSurface:
 
         Returns:
             The texture; or the numbers, one for each channel, that replace a missing
-            image; or None. If the input is connected, None has a note.
+            image; or None if the input is not connected, or if its texture is left out,
+            which is noted.
         """
         source = self.shader.find_source(name)
         if source is None:
@@ -596,8 +598,8 @@ class PreviewSurface:
         if node.kind != UV_TEXTURE:
             self.surfaces.note(f"has a {name} of {node.kind[:100]}, which is left out")
             return None
-        # All inputs are read, also if the texture is left out below: then they need no
-        # note as unread inputs.
+        # Inputs are read even if the texture is left out below, which has a note of its
+        # own. Otherwise they would be noted as unread inputs, too.
         inputs = _TextureInputs(
             asset=node.get_value("file"),
             color_space=str(node.get_value("sourceColorSpace") or "auto"),
@@ -662,8 +664,9 @@ class PreviewSurface:
 
         Returns:
             The texture or None; and `value`, or the numbers that replace a missing
-            image. A texture replaces the value.
+            image. The value is of use only without a texture.
         """
+        # a texture, the numbers that replace a missing image, or None
         texture_or_numbers = self._find_texture(name)
         if isinstance(texture_or_numbers, tuple):
             return None, texture_or_numbers
@@ -700,8 +703,8 @@ class PreviewSurface:
 
         The shaders are followed from the texture back to the primvar. Texture
         coordinates go the other way, so the transform that is found last is applied
-        first. A shader of another kind is replaced by a reader of the primvar "st", with
-        a note; transforms stay.
+        first: it is the last factor of the matrix product. A shader of another kind is
+        replaced by a reader of the primvar "st", with a note; transforms stay.
 
         Raises:
             FileFormatError: more than `MAX_SHADERS` shaders are connected one after the
@@ -739,7 +742,7 @@ class PreviewSurface:
     ) -> TextureLayout:
         """Return the layout of a texture with constant coordinates, with a note.
 
-        Its matrix ignores the texture coordinates, and yields the transformed value.
+        Its matrix multiplies texture coordinates by 0, and adds the transformed value.
 
         Args:
             node: the shader with the value.
@@ -930,7 +933,7 @@ class PreviewSurface:
         texture = self.surfaces.add_image(
             _pack_planes(plane_by_name, factor_by_name), texture_use.sampler
         )
-        # The image has the numbers already.
+        # Factors multiply the image, which has the numbers already.
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
         surface["metallicRoughnessTexture"] = self._make_slot(
@@ -993,7 +996,7 @@ class PreviewSurface:
             )
             return primvar.fallback[0], None
         use = self._find_texture(name)
-        if isinstance(use, tuple):
+        if isinstance(use, tuple):  # the number that replaces a missing image
             return use[0], None
         values = None if use is None else self.surfaces.compute_values(use)
         if use is None or values is None:
@@ -1051,7 +1054,7 @@ class PreviewSurface:
         self._note_srgb("normal", use)
         normals = self.surfaces.compute_values(use)
         if normals is not None:
-            # stored as (n + 1) / 2
+            # glTF stores a component n in [-1, 1] as (n + 1) / 2.
             texture = self.surfaces.add_image(normals * 0.5 + 0.5, use.sampler)
             entry["normalTexture"] = self._make_slot(texture, use.layout)
 
@@ -1084,10 +1087,11 @@ class PreviewSurface:
             entry: the glTF material.
         """
         black = (0.0, 0.0, 0.0)
-        stated_value = self.shader.get_numbers("emissiveColor", black)
-        use, value = self._find_texture_or_value("emissiveColor", stated_value)
-        # The factor without a texture. A fallback of one channel is a grey.
-        factor: Sequence[float] = list(map(float, np.broadcast_to(value, 3)))
+        stated_color = self.shader.get_numbers("emissiveColor", black)
+        use, plain_color = self._find_texture_or_value("emissiveColor", stated_color)
+        # Without a texture the factor is the color. If a missing image is replaced by
+        # the fallback of one of its channels, the color is a grey.
+        factor: Sequence[float] = list(map(float, np.broadcast_to(plain_color, 3)))
         if use is not None and _is_scaled_texel(use, max_scale=math.inf):
             texture = self.surfaces.add_texture(use.data, use.sampler)
             entry["emissiveTexture"] = self._make_slot(texture, use.layout)
@@ -1179,13 +1183,15 @@ def _is_scaled_texel(use: UsdTextureUse, max_scale: float = 1.0) -> bool:
 
 
 def _is_alpha_of(opacity_use: UsdTextureUse, color_use: UsdTextureUse) -> bool:
-    """Return whether an opacity is the alpha of the image of the color."""
+    """Return whether an opacity is the alpha of the color's image, not scaled."""
+    alpha = 3  # index of the channel
     is_unchanged_alpha = (
         opacity_use.channels == CHANNELS["a"]
-        and opacity_use.scale[3] == 1.0
-        and opacity_use.bias[3] == 0.0
+        and opacity_use.scale[alpha] == 1.0
+        and opacity_use.bias[alpha] == 0.0
     )
-    return is_unchanged_alpha and opacity_use.data == color_use.data
+    has_same_image = opacity_use.data == color_use.data  # the bytes of the files
+    return is_unchanged_alpha and has_same_image
 
 
 def _resize(values: Array, size: tuple[int, int]) -> Array:
