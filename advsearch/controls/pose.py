@@ -111,8 +111,8 @@ def _get_base_pose(
     Args:
         mesh: mesh that is posed.
         surrounding_mesh: the same mesh in the scene as it was described, with its pose;
-            None for the object, whose pose is a control's input only. The object's mesh
-            is in the coordinates of the scene, and stands on the height 0.
+            None for the object, whose mesh is in the coordinates of the scene and stands
+            on the height 0.
 
     Returns:
         The pose (4, 4) from the mesh's coordinates to the scene, its vertices (V, 3) in

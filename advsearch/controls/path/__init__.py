@@ -873,7 +873,7 @@ class PathControl(Control):
     def _shift_object(
         self, movements: MovementByMover, scene_start: StartPoses, time: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the object's shift, and its turn or heading, on its movement.
+        """Return how far the object is shifted and turned from its pose in the scene.
 
         On "approach" it moves on a level line towards the camera, up to its position in
         the scene. On "pass" it moves past that position from right to left. On "orbit"
