@@ -60,7 +60,7 @@ def make_control(
               range.
 
             A kind may also be a class, "package.module:Class". If the settings have a
-            "kind", `control_name` is only the name of the instance.
+            "kind", that is the kind, and `control_name` only names the instance.
         settings: values of its parameters and choices. A missing value, or None, means
             the default.
 
@@ -72,7 +72,8 @@ def make_control(
         name: value for name, value in (settings or {}).items() if value is not None
     }
     kind, name, parameter = _parse_name(control_name, options)
-    if kind not in CONTROLS:  # false for a class "package.module:Class" as well
+    # A class "package.module:Class" counts as in `CONTROLS`.
+    if kind not in CONTROLS:
         raise make_unknown_control_error(kind)
     control = CONTROLS[kind]
     if parameter is not None:
@@ -128,24 +129,28 @@ def _parse_name(
 
     Args:
         control_name: "pose", "pose:chair", "pose.yaw", or "pose.yaw:chair", where the
-            parameter stands before the colon; or a class of controls,
-            "package.module:Class". If the settings have a "kind", it is only the name
-            of the instance.
+            parameter stands before the colon ("pose:chair.yaw" is rejected); or a class
+            of controls, "package.module:Class". If the settings have a "kind",
+            `control_name` is only the name of the instance.
         settings: settings of the control; a "kind" is removed from them.
 
     Returns:
-        Kind, instance name, and parameter; None if the full name has no parameter.
+        Kind, instance name, and parameter. The parameter is None if the full name has
+        none.
     """
     kind_setting = settings.pop("kind", None)
     if kind_setting is not None:
         return str(kind_setting), control_name, None
     if CONTROLS.is_class_path(control_name):
+        # A control of a class is named after the kind that the class declares.
         return control_name, CONTROLS[control_name].kind, None
     head, colon, name = control_name.partition(":")
     kind, dot, parameter = head.partition(".")
     if colon:
         check_instance_name(f"`controls` {control_name}", name)
-    return kind, make_instance_name(kind, name), parameter if dot else None
+    has_parameter = dot != ""
+    instance_name = make_instance_name(kind, name)
+    return kind, instance_name, parameter if has_parameter else None
 
 
 def make_instance_name(kind: str, name: str) -> str:
@@ -195,9 +200,9 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
 
     Raises:
         UnknownNameError: the control has no such parameter.
-        InputError: the control has no default ranges.
+        InputError: the control declares no parameters, so it has no default ranges.
     """
-    # The control `mitsuba` declares no parameters: users name those of Mitsuba.
+    # Only the control `mitsuba` declares no parameters: users name those of Mitsuba.
     if not control.parameters:
         raise InputError(
             f"`controls` {control.kind}.{parameter}: expected a range, as in "
@@ -205,9 +210,10 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
         )
     # Besides the parameters of the class, a control may have one by the name that a
     # user states, such as a joint of a mesh.
+    stated_names = (parameter,)
     parameter_by_name = {
         declared_parameter.name: declared_parameter
-        for declared_parameter in control.declare_parameters((parameter,))
+        for declared_parameter in control.declare_parameters(stated_names)
     }
     if parameter not in parameter_by_name:
         raise UnknownNameError(
@@ -260,15 +266,17 @@ def merge_control_settings(
     """
     by_control: dict[str, dict[str, object]] = {}
     for name, control_settings in check_control_settings(settings).items():
-        head, dot, rest = name.partition(".")
-        kind = head.partition(":")[0]
-        if not dot or kind not in CONTROLS:  # no parameter, or a class with its module
+        before_dot, dot, after_dot = name.partition(".")
+        kind = before_dot.partition(":")[0]
+        # In "package.module:Class" the dot is that of a module, whose package is no
+        # kind of control.
+        has_parameter = dot != "" and kind in CONTROLS
+        if not has_parameter:
             by_control.setdefault(name, {}).update(control_settings)
             continue
-        # "pose.yaw:chair" is split into "pose", "yaw" and ":chair"; in "pose:chair.yaw"
-        # the instance is in the head already.
-        parameter, colon, instance = rest.partition(":")
-        control_name = head + colon + instance
+        # Both "pose.yaw:chair" and "pose:chair.yaw" become "pose:chair" and "yaw".
+        parameter, colon, instance = after_dot.partition(":")
+        control_name = before_dot + colon + instance
         default_range = _get_default_range(CONTROLS[kind], parameter)
         # A range in the settings replaces the default range.
         new_settings = {parameter: default_range, **control_settings}
@@ -364,18 +372,22 @@ def compose_space(controls: Sequence[Control], scene: SceneDescription) -> Space
     bound = tuple(control.bind(scene) for control in controls)
     for control in bound:
         adjusted += control.adjusted_defaults
-    # Two lists were joined: adjustments by `prepare`, and those by `bind`.
+    # The adjustments by `prepare` come first, then those by `bind`: sort them by control.
     names = [control.name for control in controls]
     adjusted.sort(key=lambda default: names.index(default.control_name))
-    # A new environment is an adjusted default, or a control has recorded it in the
-    # scene.
-    environment = None
+    # A control that replaces the environment has either recorded its name in the scene,
+    # or listed it as an adjusted default. If several have listed one, the first counts.
+    environment_name = None
     if scene.environment_spec != described_scene.environment_spec:
-        environment = scene.environment_spec
-    for default in reversed(adjusted):  # the first one takes precedence
-        if default.parameter_name == ENVIRONMENT:
-            environment = str(default.used_value)
-    return Space(bound, scene, tuple(adjusted), environment)
+        environment_name = scene.environment_spec
+    listed_environments = [
+        str(default.used_value)
+        for default in adjusted
+        if default.parameter_name == ENVIRONMENT
+    ]
+    if listed_environments:
+        environment_name = listed_environments[0]
+    return Space(bound, scene, tuple(adjusted), environment_name)
 
 
 def _check_controls(controls: Sequence[Control], scene: SceneDescription) -> None:

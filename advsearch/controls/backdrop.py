@@ -96,7 +96,8 @@ class BackdropControl(Control):
         views = {name: folder.scenes[name] for name in allowed}
         self._check_views(views)
         first = views[allowed[0]]
-        # The scene shows the first photograph of the folder, which may not be allowed.
+        # The scene shows the first photograph of the folder. If that is not allowed, it
+        # is replaced by the first allowed one.
         if first.backdrop_photograph is not scene.backdrop_photograph:
             scene = replace(
                 scene,
@@ -104,7 +105,8 @@ class BackdropControl(Control):
                 camera=first.camera,
                 values=first.values,
             )
-        # Then the other photographs get a model too, see `_compute_view_inputs`.
+        # If one photograph needs a camera model, all of them are rendered with one:
+        # `_compute_view_inputs` sets the lens of the photograph that is shown.
         has_model = any(view.camera_model is not None for view in views.values())
         return replace(
             scene,
@@ -141,14 +143,15 @@ class BackdropControl(Control):
 
         Without a setting of the user all of them are searched.
         """
+        # `prepare` has checked that at least one photograph is allowed.
         options = tuple(map(str, self._list_names(self.scene)))
-        high = max(len(options) - 1.0, 0.0)
+        last_index = float(len(options) - 1)
         return replace(
             parameter,
             options=options,
             default=options[0],
-            high=high,
-            search=(0.0, high),
+            high=last_index,
+            search=(0.0, last_index),
         )
 
     def scene_inputs(
@@ -178,11 +181,12 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     view = list(scene.photographs.scenes.values())[index]
     view_to_scene = _compute_view_to_first(view, scene)
     pose = view_to_scene @ camera_to_world(view)
+    # A gain is the factor of an exposure; the input is in stops, relative to the scene.
+    exposure_stops = math.log2(view.gain / scene.gain)
     inputs = {
         PHOTOGRAPH_INPUT: torch.tensor(float(index)),
         "camera.to_world": torch.from_numpy(pose).float(),
-        # in stops, relative to the first photograph
-        "camera.exposure": torch.tensor(math.log2(view.gain / scene.gain)),
+        "camera.exposure": torch.tensor(exposure_stops),
     }
     if scene.camera_model is not None:
         inputs["camera.lens"] = torch.tensor(_get_lens(view).intrinsics)
@@ -191,9 +195,10 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
     if has_plane(scene):
         inputs["ground.to_world"] = _compute_plane_pose(view, view_to_scene)
     if scene.environment is not None:
+        # All photographs have the same environment, whose directions refer to the camera.
         radiance = torch.from_numpy(scene.environment.radiance.copy())
-        # The map to the scene may only turn about the vertical (`_check_compatible`);
-        # this is the angle, counter-clockwise seen from above.
+        # `view_to_scene` can only turn about the vertical (see `_check_compatible`): by
+        # this angle, counter-clockwise seen from above.
         angle = math.atan2(view_to_scene[1, 0], view_to_scene[0, 0])
         degrees = torch.tensor(math.degrees(angle))
         inputs["environment.data"] = rotate_map(radiance, degrees)
@@ -262,10 +267,9 @@ def _check_compatible(
             "state one `environment` for all photographs, or sweep over them"
         )
     view_to_first = _compute_view_to_first(view, first)
-    # Row 2 of the map gives the height in the world of the first photograph. Up to a
-    # shift, it has to be the height in the world of this photograph.
-    height_row = view_to_first[2, :3]
-    up_error = np.abs(height_row - [0.0, 0.0, 1.0]).max()
+    # The z axis of the first photograph's world, in the world of this photograph.
+    up_of_first = view_to_first[2, :3]
+    up_error = np.abs(up_of_first - [0.0, 0.0, 1.0]).max()
     is_upright = up_error <= PLANE_TOLERANCE
     same_surface = all(
         view.get_number(setting) == first.get_number(setting)

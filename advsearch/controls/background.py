@@ -93,9 +93,9 @@ class BackgroundControl(Control):
             InputError: `what` is fixed at the environment, which shows no color.
         """
         super().__init__(name, **settings)
-        # Only a range of the color counts as a requested search. If the user sets a
-        # list of values of `what` only, the color is searched over its default range
-        # as well.
+        # `Control` searches the default ranges unless the user has requested a range.
+        # Here only a range of the color counts: with a list of values of `what` alone,
+        # the color is still searched over its default range.
         color_specs = [
             self.specs[parameter_name]
             for parameter_name in COLOR_PARAMETERS
@@ -161,7 +161,9 @@ def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
     differentiable almost everywhere. The derivative of a gray by its hue is 0.
     """
     # The color circle has six sectors of 60 degrees. The same function of the position
-    # on the circle gives each channel, with an offset for red, green and blue.
+    # on the circle gives each channel. The offsets put pure red, green and blue (0, 120
+    # and 240 degrees) at the position 5 of their own channel, where it has its full
+    # value.
     offsets = torch.tensor([5.0, 3.0, 1.0]).to(hue)
     sector = torch.remainder(offsets + hue / 60.0, 6.0)
     # 0 where the channel has its full value (two sectors), and 1 where the saturation

@@ -194,7 +194,8 @@ def _find_replaced_environment(
             "contradict each other: the control "
             f"puts {after.environment.name} in its place; leave one of the two out"
         )
-    # The control has recorded the new name in the scene itself; `compose` reads it.
+    # If the control has recorded the new name in the scene, `compose_space` reads it
+    # there, and no adjusted default is needed.
     if after.environment_spec != before.environment_spec:
         return None
     return AdjustedDefault(
@@ -255,7 +256,7 @@ class Choice:
         """
         if value is None and self.default is None:
             return
-        expected = self._describe_expected()
+        expected = self._describe_expected()  # None if any value is allowed
         if expected is not None and not self._is_valid(value):
             raise InputError(
                 f"{control}.{self.name}: expected {expected}, got {value!r}"
@@ -388,6 +389,10 @@ class Control:
     flashes: float = 0.0
 
     def __init_subclass__(cls, **more: Any) -> None:
+        """Make the methods of a user's subclass get copies of tensors; set `summary`.
+
+        Without a `summary`, the first paragraph of the docstring of the class is used.
+        """
         super().__init_subclass__(**more)
         names = [method.__name__ for method in METHODS_WITH_COPIES]
         all_arguments = slice(None)
@@ -402,7 +407,8 @@ class Control:
         Args:
             name: name of this instance; by default its kind, e.g. "pose".
             **settings: value, range or list of values of each parameter, and values of
-                choices. None counts as left out.
+                choices. A setting of None counts as left out, but must have a valid
+                name.
 
         Raises:
             InputError: a setting is out of range or of a wrong form.
@@ -415,7 +421,6 @@ class Control:
         }
         self.instance_parameters = self.declare_parameters(settings)
         self._check_setting_names(settings)
-        # A setting of None counts as left out.
         self._settings: dict[str, Any] = {
             setting: to_plain_value(value)
             for setting, value in settings.items()
@@ -468,10 +473,10 @@ class Control:
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check the values of the choices, `self.choice_values`.
+        """Check the values of the choices together; they are in `self.choice_values`.
 
-        Does nothing by default. Subclasses override it for what `Choice` can't check,
-        such as two choices that exclude each other.
+        Does nothing by default. `Choice.check` has checked each value by itself.
+        Subclasses override this for the rest, such as choices that exclude each other.
 
         Raises:
             InputError: the value of a choice is not allowed.
@@ -487,12 +492,13 @@ class Control:
     def mesh_name(self) -> str:
         """Name of the mesh that the control acts on.
 
-        It is "chair" for the control "pose:chair", and the object for "pose".
+        It is "chair" for the control "pose:chair", and "object" for "pose" and for every
+        control whose kind does not act on a mesh, such as "light:key".
         """
-        mesh_name = ""
-        if self.targets_mesh:
-            mesh_name = self.name.partition(":")[2]
-        return mesh_name or OBJECT
+        name_after_colon = self.name.partition(":")[2]
+        if not self.targets_mesh or not name_after_colon:
+            return OBJECT
+        return name_after_colon
 
     @property
     def name_in_files(self) -> str:
@@ -539,11 +545,12 @@ class Control:
 
         Each form has one parameter. The user requests a form by the setting `form`, or
         by setting the form's parameter to its full range, e.g. ``texels: [0, 1]``. Any
-        other range is an error, because `epsilon` limits how far the parameter may go.
+        other range is an error: the setting `epsilon`, not a range, limits how far the
+        parameter may go.
 
         Args:
-            forms: names of the forms, in the order of their parameters; the first is
-                the default.
+            forms: name of the form of each parameter of the class, in the order of
+                `parameters`; the first is the default.
 
         Raises:
             InputError: two forms are requested, or a parameter is set to something
@@ -551,7 +558,6 @@ class Control:
             UnknownNameError: there is no such form.
         """
         requested = []
-        # The parameters of the class are in the order of the forms.
         for parameter, form in zip(self.parameters, forms, strict=True):
             value = self._settings.get(parameter.name)
             if value is None:
@@ -627,7 +633,7 @@ class Control:
         return bound
 
     def bind_parameters(self) -> None:
-        """Set `parameter_slots`, `start`, `groups` and `adjusted_defaults` for `self.scene`.
+        """Set the slots, start, groups and adjusted defaults for `self.scene`.
 
         A slot is a parameter with the position of its coordinates in the control's
         slice of u; a fixed parameter has no coordinates. A group has the coordinates of
@@ -655,9 +661,10 @@ class Control:
         self.groups = tuple(
             self._make_group(slot) for slot in slots if slot.n_coordinates
         )
-        # For `compute_values`: the lower bound and the width of the range of each coordinate,
-        # (d,) each. All coordinates of a slot have the same range. A slot that is fixed
-        # or has a list of values has no range; its placeholder is never read.
+        # `compute_values` needs the lower bound and the width of the range of each
+        # coordinate, (d,) each. All coordinates of a slot have the same range. A slot
+        # that is fixed, or has a list of values, has no range. `compute_values` never
+        # reads the numbers of its placeholder.
         placeholder = Range(0.0, 1.0)
         ranges = [
             slot.parameter_spec
@@ -669,9 +676,10 @@ class Control:
             [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
         ).reshape(-1, 2)
         counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
-        low_and_span = low_and_span_of_slot.T.repeat_interleave(counts, dim=1)
-        self._low = low_and_span[0]
-        self._span = low_and_span[1]
+        # (d, 2): the row of a slot for each of its coordinates
+        low_and_span = low_and_span_of_slot.repeat_interleave(counts, dim=0)
+        self._low = low_and_span[:, 0].contiguous()
+        self._span = low_and_span[:, 1].contiguous()
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its value in the unchanged scene as the default.
@@ -769,7 +777,8 @@ class Control:
         its value in the clean scene, the other parameters have no effect.
 
         Raises:
-            InputError: the user set the scene's value, and the control excludes it.
+            InputError: the user set the value in the scene, and the control does not
+                allow that value.
         """
         for slot in self.parameter_slots:
             parameter = slot.parameter
@@ -777,8 +786,14 @@ class Control:
                 continue
             scene_value = self.get_value_without_control(parameter)
             used = slot.get_start_value()
-            is_hidden = self.strength_parameter not in (None, parameter.name)
-            if is_hidden or is_same_value(used, scene_value, is_angle=slot.is_angle):
+            # Without its strength, the control has no effect, whatever this parameter is.
+            depends_on_strength = (
+                self.strength_parameter is not None
+                and parameter.name != self.strength_parameter
+            )
+            if depends_on_strength:
+                continue
+            if is_same_value(used, scene_value, is_angle=slot.is_angle):
                 continue
             # the scene's setting for the same value, such as "pose.yaw"
             setting = self.get_setting_name(parameter)
@@ -793,16 +808,18 @@ class Control:
                     "leave one out"
                 )
             is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
-            if not is_fixed_by_user:
-                yield AdjustedDefault(
-                    self.name,
-                    # The environment is one value, which several controls may replace:
-                    # it has the same label in all of them.
-                    setting if setting == ENVIRONMENT else label,
-                    "name" if parameter.options else parameter.unit,
-                    scene_value,
-                    used,
-                )
+            if is_fixed_by_user:
+                continue
+            # The environment is one value, which several controls may replace: it has
+            # the same label in all of them.
+            parameter_name = setting if setting == ENVIRONMENT else label
+            yield AdjustedDefault(
+                control_name=self.name,
+                parameter_name=parameter_name,
+                unit="name" if parameter.options else parameter.unit,
+                scene_value=scene_value,
+                used_value=used,
+            )
 
     def _quote_setting(self, setting: str) -> str:
         """Return how the user writes a setting of the scene, with its value."""
@@ -827,12 +844,19 @@ class Control:
         spec = slot.parameter_spec
         setting = self.get_setting_name(parameter)
         if isinstance(spec, OneOf):
+            no_estimators = ()
             return Group(
-                name, slot.n_coordinates, (), options=len(spec.values), setting=setting
+                name,
+                slot.n_coordinates,
+                no_estimators,
+                options=len(spec.values),
+                setting=setting,
             )
         budget = self.get_budget(parameter)
-        is_distribution = type(spec) is not Range  # a subclass of it
-        if is_distribution and budget != FULL_RANGE:
+        # A distribution is a subclass of `Range`.
+        is_distribution = type(spec) is not Range
+        is_limited_by_norm = budget != FULL_RANGE
+        if is_distribution and is_limited_by_norm:
             raise InputError(
                 f"{self.name}.{name}: expected a range, got a distribution; its values "
                 "are limited by a norm (epsilon)"
@@ -902,7 +926,8 @@ class Control:
                 coordinates = slice(
                     slot.coordinate_offset, slot.coordinate_offset + slot.n_values
                 )
-                is_distribution = type(spec) is not Range  # a subclass of it
+                # A distribution is a subclass of `Range`.
+                is_distribution = type(spec) is not Range
                 if parameter.log or is_distribution:
                     value = spec.interpolate(u[coordinates], log=parameter.log)
                 else:
@@ -911,7 +936,7 @@ class Control:
                 continue
             if isinstance(spec, Fixed):
                 constant = spec.value
-            else:
+            else:  # a list of values, `OneOf`, which has one coordinate
                 constant = spec.select_value(u[slot.coordinate_offset])
             values[parameter.name] = _to_tensor(constant, slot, u.device)
         return values
@@ -922,11 +947,11 @@ class Control:
         """Return the scene inputs that the values set, by name.
 
         Returns no inputs by default. Subclasses that act on the scene override it,
-        by differentiable torch operations. Those that act on the finished image override
-        `on_picture` instead.
+        by differentiable torch operations. Those that act on the finished image instead
+        override `on_picture`, which `apply_to_image` calls.
 
         Args:
-            compute_values: value of each parameter, by name.
+            values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one. Only names in
                 `refines` may be returned again.
         """
@@ -953,7 +978,7 @@ class Control:
         it, by differentiable torch operations.
 
         Args:
-            compute_values: value of each parameter, by name.
+            values: value of each parameter, by name.
             image: (H, W, 3) display-referred sRGB in [0, 1].
         """
         return image
@@ -978,12 +1003,12 @@ class Control:
         """Return further values to store with a configuration; none by default.
 
         Args:
-            compute_values: value of each parameter, by name.
+            values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one.
 
         Returns:
-            Values with their units (see `make_value_with_unit`), by name without that of the
-            control.
+            Values with their units (see `make_value_with_unit`), by name without that of
+            the control.
         """
         return {}
 
@@ -1004,12 +1029,13 @@ class Control:
         described: dict[str, Value] = {}
         for slot in self.parameter_slots:
             parameter = slot.parameter
-            is_image = len(parameter.shape) > 1
+            is_image = len(parameter.shape) > 1  # numbers have (), vectors (k,)
             if isinstance(slot.parameter_spec, Fixed) or is_image:
                 continue
             value = values[parameter.name]
             name = f"{self.name}.{parameter.name}"
             if parameter.options:
+                # The value is the index of an option.
                 option = parameter.options[int(value)]
                 described[name] = {"value": option, "unit": "name"}
             elif value.ndim == 0:
@@ -1055,7 +1081,7 @@ class Control:
         """Return images to store with a result; none by default.
 
         Args:
-            compute_values: value of each parameter, by name.
+            values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one.
 
         Returns:
@@ -1089,7 +1115,7 @@ class Control:
         """Return other files to store with a result; none by default.
 
         Args:
-            compute_values: value of each parameter, by name.
+            values: value of each parameter, by name.
             earlier_inputs: inputs of the controls before this one.
 
         Returns:

@@ -108,11 +108,13 @@ class BodyControl(Control):
                 raise errors.UnknownNameError(
                     f"parameter of {self.mesh_name}", name, known, hint
                 )
-        # With settings, `make_space` reports if nothing is searched.
+        # Without settings, default ranges are searched: there has to be one. With
+        # settings, `make_space` reports if nothing is searched.
         has_default_search = any(
             self.resolve_parameter(parameter).search for parameter in self.parameters
         )
         if not self._settings and not has_default_search:
+            # for the message: a rotation of a joint about x, if the rig has one
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(
                 f"`controls` {self.name}: {self.mesh_name} has no animation to play; set "

@@ -191,8 +191,8 @@ class CameraControl(Control):
         """Check that a lens has all the numbers that the settings change.
 
         Args:
-            model: lens from a camera file; or a model without a name, which is a
-                pinhole with distortion or raindrops.
+            model: lens from a camera file; or a model with an empty name, which is a
+                pinhole that has a model because of distortion or raindrops on it.
             distortion_names: distortion coefficients that were set, such as "k1".
 
         Raises:
@@ -207,12 +207,15 @@ class CameraControl(Control):
                     f"coefficients {coefficients}, not {name}"
                 )
         unsupported_names = ["aperture", "focus"]
-        if model.name:  # a calibrated lens has its focal length already
+        is_from_file = model.name != ""
+        if is_from_file:  # it has its own focal length
             unsupported_names += ["fov", "focal_length"]
-        if not supported_names:  # an equirectangular image, which shows all directions
+        # Only an equirectangular image has no coefficients. It shows all directions.
+        is_equirectangular = not supported_names
+        if is_equirectangular:
             unsupported_names += ["shift_x", "shift_y"]
         lens = "a lens with distortion, or raindrops"
-        if model.name:
+        if is_from_file:
             lens = f"the lens of `camera={model.name}`"
         for name in unsupported_names:
             if name in self.specs:
@@ -222,10 +225,10 @@ class CameraControl(Control):
                 )
 
     def _drives_against_traffic(self, scene: SceneDescription) -> bool:
-        """Return whether the camera seems to drive against the traffic everywhere.
+        """Return whether the camera seems to drive against the traffic in all images.
 
-        Only three configurations are checked: all parameters at the lower bound, the
-        center and the upper bound of their ranges.
+        Only three configurations are checked: all parameters at the lower bound, all at
+        the center and all at the upper bound of their ranges.
         """
         control = self.bind(scene)  # a copy for this check
         configurations = (
@@ -263,7 +266,9 @@ class CameraControl(Control):
         name = parameter.name
         if name in COEFFICIENTS and scene.camera_model is not None:
             return scene.camera_model.intrinsic_by_name[name]
-        # All three are the distance of the object: the camera is focused on it.
+        # The camera is focused on the object. So all three are the distance of the object:
+        # "sizes" in object sizes, the others in metres if the object's size is known.
+        # (`size_in_metres` of the scene is 1 if it is not.)
         if name in ("distance", "focus", "sizes"):
             # The default distance depends on the field of view.
             fixed_lens_scene = self._with_fixed_lens()
@@ -288,8 +293,9 @@ class CameraControl(Control):
 
         If the scene has a preset, only ranges of the preset are searched. Otherwise,
         around a road vehicle, the camera's height is searched over the eye heights of
-        road users, and the elevation is not searched. The distance is searched over
-        multiples of its default, since its declared `search` is a pair of factors.
+        road users, and the elevation is not searched. The declared `search` of the
+        distance is a pair of factors, by which its default is multiplied; that of other
+        parameters is the range itself.
 
         Args:
             parameter: the parameter.
@@ -313,7 +319,8 @@ class CameraControl(Control):
         if is_road_vehicle(scene.object) and name == "elevation":
             return None
         if is_road_vehicle(scene.object) and name == "height":
-            # The range includes the default height of a camera that is higher.
+            # A road vehicle has a size in metres, so the height is in metres. The range
+            # is extended if the camera's default height is above it.
             return ROAD_USER_HEIGHTS[0], max(ROAD_USER_HEIGHTS[1], float(default))
         if name == "distance" and search is not None:
             return search[0] * float(default), search[1] * float(default)
@@ -352,8 +359,8 @@ class CameraControl(Control):
         if scene.thin_lens and sets_thin_lens:
             # A thin lens needs a positive aperture.
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
-            focus = distance
-            if "focus" in self.specs:
+            focus = distance  # in object sizes, as scene inputs are
+            if "focus" in self.specs:  # in metres
                 focus = values["focus"] / scene.size_in_metres
             inputs["camera.focus"] = focus.reshape(1)
         if scene.camera_model is None and self._sets_shift:
@@ -373,7 +380,7 @@ class CameraControl(Control):
         Distortion coefficients that were set replace those of the model.
 
         Args:
-            model: lens from a camera file; or a model without a name, which is a
+            model: lens from a camera file; or a model with an empty name, which is a
                 pinhole whose focal lengths follow from the field of view.
             values: values of the control by parameter.
             fov: () field of view along the longer side of the image, degrees.
@@ -381,9 +388,11 @@ class CameraControl(Control):
         model_values = {
             name: torch.tensor(value) for name, value in model.intrinsic_by_name.items()
         }
-        if not model.name:
+        is_pinhole = model.name == ""
+        if is_pinhole:
             aspect = self.scene.aspect  # width over height
-            # as a fraction of the longer side, along which the field of view is
+            # Focal length in lengths of the longer side, which the field of view is
+            # along. The model has "fx" in widths and "fy" in heights of the image.
             focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
             longer_side_in_widths = max(1.0, 1.0 / aspect)
             longer_side_in_heights = max(1.0, aspect)
@@ -391,9 +400,8 @@ class CameraControl(Control):
                 "fx": focal * longer_side_in_widths,
                 "fy": focal * longer_side_in_heights,
             }
-        model_values |= {
-            name: values[name] for name in COEFFICIENTS if name in self.specs
-        }
+        coefficients_set_by_user = [name for name in COEFFICIENTS if name in self.specs]
+        model_values |= {name: values[name] for name in coefficients_set_by_user}
         model_values |= {
             "cx": model_values["cx"] + values["shift_x"],
             "cy": model_values["cy"] + values["shift_y"],
@@ -419,9 +427,9 @@ class CameraControl(Control):
     def _compute_distance(self, values: Values, fov: Tensor) -> Tensor:
         """Return the camera's distance () from the object's center, in object sizes.
 
-        It is the value of `sizes` or `distance` if the user or the scene sets one of
-        them, or if `distance` is searched by default. Otherwise it is the distance at
-        which the object fills the image.
+        It is the value of `sizes` if the user sets that. Else it is the value of
+        `distance` if the user or the scene sets that, or if it is searched by default.
+        Otherwise it is the distance at which the object fills the image.
 
         Args:
             values: values of the control by parameter.
@@ -431,6 +439,7 @@ class CameraControl(Control):
         if "sizes" in self.specs:
             return values["sizes"]
         scene_has_distance = scene.values.get("camera.distance") is not None
+        # Default ranges are searched only if the user requests no range.
         searches_default_ranges = not self.has_requested_range
         if "distance" in self.specs or searches_default_ranges or scene_has_distance:
             # from metres to object sizes
@@ -491,11 +500,12 @@ class CameraControl(Control):
             ]
         )
         # Axes without roll: left is level, and up is at right angles to left and to
-        # the direction of view.
+        # the direction of view. E.g. at azimuth 0 the camera is at +x and looks along
+        # -x, so that -y is on its left.
         level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         level_up = torch.linalg.cross(-outwards, level_left)
-        # A positive roll turns left towards up: the camera turns clockwise as seen from
-        # behind it.
+        # A positive roll turns the camera clockwise, as seen from behind it: its left
+        # axis turns towards up, and its up axis towards the right.
         left = roll.cos() * level_left + roll.sin() * level_up
         up = roll.cos() * level_up - roll.sin() * level_left
         forward = -outwards

@@ -107,9 +107,10 @@ def find_vessel(asset: assets.ObjectAsset) -> Vessel | None:
     distances = []
     faces = []
     for height in heights:
-        row_distances, row_faces = _find_wall(
-            mesh, axis, max(float(height), min_height)
-        )
+        # The lowest rays are cast a little above the floor, and stand for the wall at
+        # the floor.
+        ray_height = max(float(height), min_height)
+        row_distances, row_faces = _find_wall(mesh, axis, ray_height)
         distances.append(row_distances)
         faces.append(row_faces)
     radii = _fill_missed_radii(np.stack(distances))
@@ -198,7 +199,8 @@ def _compute_height_map(
     lower = vertices[:, :2].min(axis=0)
     upper = vertices[:, :2].max(axis=0)
     cell = float((upper - lower).max()) / GRID_CELLS
-    # at least one empty cell on each side, over which water runs off
+    # At least one empty cell on each side, over which water runs off. `lower` becomes the
+    # center of cell (0, 0), whose upper bound is then one cell below the mesh.
     lower = lower - 1.5 * cell
     width, height = (np.ceil((upper - lower) / cell).astype(np.int64) + 2).tolist()
     below_mesh = vertices[:, 2].min() - 1.0
@@ -206,7 +208,7 @@ def _compute_height_map(
     corners = vertices[mesh.faces.astype(np.int64)]
     in_cells = (corners[..., :2] - lower) / cell
     face, row, column, weights = images.rasterize_triangles(in_cells, (height, width))
-    # several faces may lie over one cell: the highest counts
+    # several faces may lie over a cell: the highest one counts
     np.maximum.at(heights, (row, column), (weights * corners[face, :, 2]).sum(axis=1))
     _draw_edges(heights, in_cells, corners[..., 2])
     return lower, cell, heights
@@ -286,7 +288,7 @@ def _find_wall(
 
     Args:
         mesh: mesh of the object.
-        axis: (2,) x and y of the axis.
+        axis: (2,) x and y of the vertical axis, where the rays begin.
         height: z of the rays.
 
     Returns:
@@ -300,7 +302,8 @@ def _find_wall(
     second_end = second_end - axis
     angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
     ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    # (K, S) cross products; their signs tell on which side of a ray an end lies
+    # (K, S) cross products with the ends: positive on the left of a ray, negative on the
+    # right, and proportional to the distance from the ray's line.
     first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
     second_side = ray[:, :1] * second_end[:, 1] - ray[:, 1:] * second_end[:, 0]
     is_crossed = (first_side > 0.0) != (second_side > 0.0)
@@ -328,7 +331,8 @@ def _cut_faces(
     corners = corners[face]
     is_above = is_above[face]
     index = np.arange(len(face))
-    # (S,) index, 0 to 2, of the corner that is alone on its side of the plane
+    # (S,) index, 0 to 2, of the corner that is alone on its side of the plane. Both edges
+    # that the plane cuts begin at this corner, the apex.
     apex_corner = np.where(
         is_above.sum(axis=1) == 1, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
     )
@@ -336,8 +340,8 @@ def _cut_faces(
     ends = []
     for step in (1, 2):
         other = corners[index, (apex_corner + step) % 3]
-        # The two other corners are on the other side: both cut edges begin at the apex.
-        rise = np.where(other[:, 2] == apex[:, 2], 1.0, other[:, 2] - apex[:, 2])
+        # never 0, because the other corner is on the other side of the plane
+        rise = other[:, 2] - apex[:, 2]
         fraction = (height - apex[:, 2]) / rise
         ends.append(apex[:, :2] + fraction[:, None] * (other[:, :2] - apex[:, :2]))
     return face, ends[0], ends[1]
@@ -404,9 +408,9 @@ class ContentsControl(Control):
     def _add_default_bounds(self, rest: float) -> None:
         """Add the bounds of the proportions that are not set.
 
-        If proportions are searched, their bounds are 0 and the rest. Otherwise the
-        first of coffee, water and milk that is not set gets all of the rest, and the
-        others get 0.
+        If proportions are searched, their bounds are 0 and the rest. Otherwise they are
+        fixed: the first of coffee, water and milk that is not set gets all of the rest,
+        and the others get 0.
 
         Args:
             rest: 1 minus the lower bounds of the proportions that are set.
@@ -415,7 +419,7 @@ class ContentsControl(Control):
         are_searched = not self.has_requested_range or any(
             isinstance(self.specs.get(name), Range) for name in INGREDIENTS
         )
-        # by default a cup of coffee, as in `parameters`
+        # Coffee comes first: by default, `parameters` describe a cup of coffee.
         for name in ("coffee", "water", "milk"):
             if name in self.proportion_bounds:
                 continue
@@ -423,7 +427,7 @@ class ContentsControl(Control):
                 self.proportion_bounds[name] = (0.0, rest)
             else:
                 self.proportion_bounds[name] = (rest, rest)
-                rest = 0.0
+                rest = 0.0  # for the next ones
 
     def _read_bounds(self) -> dict[str, tuple[float, float]]:
         """Return the smallest and largest proportion of each ingredient that is set.
@@ -462,7 +466,8 @@ class ContentsControl(Control):
         """
         max_total = sum(upper for _, upper in self.proportion_bounds.values())
         all_set = len(self.proportion_bounds) == len(INGREDIENTS)
-        # A proportion that is not set makes up for what is missing.
+        # A maximum below 1 is only an error if all are set: otherwise the proportions that
+        # are not set get the rest.
         is_too_little = all_set and max_total < 1.0 - SUM_TOLERANCE
         is_too_much = min_total > 1.0 + SUM_TOLERANCE
         if not is_too_little and not is_too_much:
@@ -470,11 +475,13 @@ class ContentsControl(Control):
         stated = []
         for name in INGREDIENTS:
             if name in self.proportion_bounds:
-                # "water 0.2 to 0.5"; a dict, so that equal bounds are named once
-                bounds = dict.fromkeys(
-                    f"{bound:g}" for bound in self.proportion_bounds[name]
+                # "water 0.2 to 0.5", or "water 0.2" for equal bounds
+                lower, upper = self.proportion_bounds[name]
+                stated.append(
+                    f"{name} {lower:g}"
+                    if f"{lower:g}" == f"{upper:g}"
+                    else f"{name} {lower:g} to {upper:g}"
                 )
-                stated.append(f"{name} {' to '.join(bounds)}")
         raise InputError(
             f"`controls` {self.name}: expected proportions of water, milk and "
             f"coffee that add up to 1, got {', '.join(stated)}; "
@@ -543,18 +550,19 @@ class ContentsControl(Control):
     ) -> dict[str, Tensor]:
         """Return the offsets, the pose and the color of the liquid's surface."""
         vessel = find_vessel(self.scene.object)
-        assert vessel is not None  # see `prepare`
-        # `prepare` has made the mesh at half the height.
-        base = _make_liquid_surface(vessel, torch.full_like(values["level"], 0.5))
+        assert vessel is not None  # `prepare` has checked it
+        # Offsets are relative to the mesh, which `prepare` has made at this level.
+        mesh_level = torch.full_like(values["level"], 0.5)
+        base = _make_liquid_surface(vessel, mesh_level)
         surface = _make_liquid_surface(vessel, values["level"])
         inputs = {f"{self.name}.offsets": surface - base}
         if "object.to_world" in earlier_inputs:
             inputs[f"{self.name}.to_world"] = earlier_inputs["object.to_world"]
         proportions = torch.stack([values[name] for name in INGREDIENTS])
         vessel_color = torch.from_numpy(vessel.color).to(proportions)
-        inputs[f"{self.name}.base_color"] = mix_liquid_color(
-            proportions, vessel_color
-        ).expand(4, 4, 3)
+        liquid_color = mix_liquid_color(proportions, vessel_color)
+        # the size of the black texture of `prepare`
+        inputs[f"{self.name}.base_color"] = liquid_color.expand(4, 4, 3)
         return inputs
 
     # ---- proportions
@@ -564,7 +572,8 @@ class ContentsControl(Control):
 
         A cut is a coordinate from 0 to 1 that decides the proportion of an ingredient
         (`cut_proportions`). The last ingredient whose proportion has a range has no
-        cut: it gets what the others leave.
+        cut: it gets what the others leave. An ingredient without a cut, which may have
+        a fixed proportion, has a placeholder of 0.
         """
         if parameter.name not in INGREDIENTS:
             return super().get_parameter_spec(parameter)
@@ -573,7 +582,8 @@ class ContentsControl(Control):
             lower, upper = self.proportion_bounds[name]
             if upper > lower:
                 ranged.append(name)
-        return Range(0.0, 1.0) if parameter.name in ranged[:-1] else Fixed(0.0)
+        has_cut = parameter.name in ranged[:-1]
+        return Range(0.0, 1.0) if has_cut else Fixed(0.0)
 
     def cut_proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the proportion of each ingredient for its cut; they add up to 1.
@@ -689,17 +699,18 @@ def _make_liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     radius = (
         torch.lerp(radii[row], radii[row + 1], position - row) * DISK_RADIUS_FRACTION
     )
-    # Relative size of the disk: 1 above the level at which it begins to shrink. It is
+    # Factor on the disk's radius: 1 from `SINKING_LEVEL` upwards, and smaller below. It is
     # never 0, so that its faces keep an area.
-    opening = (level / SINKING_LEVEL).clamp(1e-3, 1.0)
+    shrinkage = (level / SINKING_LEVEL).clamp(1e-3, 1.0)
     depth = heights[-1] - heights[0]
-    # At level 0 the disk is below the floor by almost `SINKING_LEVEL` of the depth.
-    height = heights[0] + level * depth - (1.0 - opening) * SINKING_LEVEL * depth
+    # The disk sinks as it shrinks. At level 0 it is `SINKING_LEVEL` of the depth below the
+    # floor (a little less, as the factor is not 0).
+    height = heights[0] + level * depth - (1.0 - shrinkage) * SINKING_LEVEL * depth
     angle = torch.arange(WALL_DIRECTIONS, device=level.device) * (
         2.0 * torch.pi / WALL_DIRECTIONS
     )
     circle = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
-    rim = circle * (radius * opening)[:, None]
+    rim = circle * (radius * shrinkage)[:, None]
     axis = torch.from_numpy(vessel.axis).to(level)
     positions = torch.cat([rim.new_zeros(1, 2), rim]) + axis  # (1 + K, 2)
     return torch.cat([positions, height.expand(len(positions), 1)], dim=1)

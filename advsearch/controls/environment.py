@@ -100,7 +100,9 @@ class EnvironmentControl(Control):
     def declare_parameters(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         """Return the parameters, with files of the setting `which` among its options.
 
-        See `list_allowed_names` for the forms of the setting.
+        Args:
+            settings: settings by name, whose values are read by `list_allowed_names`; or
+                only names, which add no options.
         """
         which, *others = cls.parameters
         files = [
@@ -125,9 +127,10 @@ class EnvironmentControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with the first allowed environment, or with its own.
 
-        The scene gets the first allowed environment if its own one is not allowed, and
-        the allowed one is fixed or any of several is a file. Otherwise it keeps its own
-        environment, which it must have. Notes on environment files become remarks.
+        The scene keeps its own environment if that is allowed, or if several bundled
+        ones are listed; then it must have one. If a single other environment is allowed,
+        or any file, it gets the first that is allowed. Notes on environment files become
+        remarks.
 
         Raises:
             InputError: the scene has no environment and needs one.
@@ -150,6 +153,7 @@ class EnvironmentControl(Control):
                 scene, environment=_load_environment(name), environment_spec=name
             )
         else:
+            # raises if the scene has none
             environment = scene.require_environment(f"`controls` {self.name}")
             shows_photograph = scene.photograph is not None or environment.photographed
             # A photograph shows its own floor instead of the table.
@@ -160,16 +164,18 @@ class EnvironmentControl(Control):
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; the default of `which` is the scene's own environment.
 
-        Its value is `SCENE_ENVIRONMENT`, the option that keeps the scene's environment.
-        If the user lists environments without that option, it is the name of the
-        scene's environment, if that is among them.
+        It is the option `SCENE_ENVIRONMENT`, which keeps the scene's environment. If the
+        user lists environments without that option, the default is the name of the
+        scene's environment, if that is listed.
         """
         if parameter.name != "which":
             return super().resolve_parameter(parameter)
-        default: str | None = SCENE_ENVIRONMENT
+        default = SCENE_ENVIRONMENT
         if not self._allows_scene_environment:
-            default = self._find_scene_environment_name(self.scene)
-        return replace(parameter, default=default or SCENE_ENVIRONMENT)
+            # If that is not listed either, the slot starts at a value that is.
+            scene_name = self._find_scene_environment_name(self.scene)
+            default = scene_name or SCENE_ENVIRONMENT
+        return replace(parameter, default=default)
 
     @property
     def _allows_scene_environment(self) -> bool:
@@ -185,8 +191,10 @@ class EnvironmentControl(Control):
         """Return the value of a parameter in the scene as it was described.
 
         For `which` it is `SCENE_ENVIRONMENT` if that is allowed. Otherwise it is the
-        allowed name of the scene's environment, or else how the user stated it.
+        allowed name of the scene's environment; if none is allowed, its name in the
+        scene.
         """
+        # If `SCENE_ENVIRONMENT` is allowed, it is the default, see `resolve_parameter`.
         if parameter.name != "which" or self._allows_scene_environment:
             return parameter.default
         name = self._find_scene_environment_name(self.scene)
@@ -216,7 +224,7 @@ class EnvironmentControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the map (H, W, 3) of linear radiance, "environment.data".
+        """Return the map "environment.data", (H, W, 3) linear radiance.
 
         The scene's own rotation and exposure are applied when it is rendered, so that
         only the differences from these are applied here.
@@ -227,9 +235,8 @@ class EnvironmentControl(Control):
         is_scene_map = name == SCENE_ENVIRONMENT or _is_scene_environment(
             name, self.scene
         )
-        base = _load_map(
-            self.scene, None if is_scene_map else _load_environment(name)
-        ).to(device)
+        other_asset = None if is_scene_map else _load_environment(name)
+        base = _load_map(self.scene, other_asset).to(device)
         rotated = rotate_map(
             base, values["rotation"] - self.scene.get_number("environment.rotation")
         )
@@ -238,9 +245,9 @@ class EnvironmentControl(Control):
         stops = values["exposure"] - self.scene.get_number("environment.exposure")
         lit = rotated * tint * torch.exp2(stops)
         if "harmonics" in self.specs:
-            lit = (lit + compute_harmonic_light(values["harmonics"], base)).clamp_min(
-                0.0
-            )
+            # relative to the mean radiance of the map as it is in the file
+            added_light = compute_harmonic_light(values["harmonics"], base)
+            lit = (lit + added_light).clamp_min(0.0)
         return {"environment.data": lit}
 
 
@@ -269,7 +276,13 @@ def _is_file(name: ParameterValue) -> bool:
 
 
 def _is_scene_environment(name: ParameterValue, scene: SceneDescription) -> bool:
-    """Return whether an environment, a bundled name or a file, is the scene's own."""
+    """Return whether an environment is the scene's own.
+
+    Args:
+        name: name of a bundled environment, or path of a file.
+        scene: scene, whose environment has a `source`: the path of its file,
+            `BUNDLED_ENVIRONMENT`, or empty if it was made otherwise.
+    """
     environment = scene.environment
     if environment is None:
         return False
@@ -308,9 +321,10 @@ def _read_environment(real_path: str, name: str, *version: int) -> EnvironmentAs
 def _load_map(scene: SceneDescription, asset: EnvironmentAsset | None) -> Tensor:
     """Return the map (H, W, 3) of an environment, linear radiance.
 
-    A scene can be metered: its exposure is set by the brightness of its environment. As
-    that exposure does not change later, another map is scaled by the ratio of both
-    exposures: the image is as bright as if the other map had been metered.
+    A scene can be metered: its exposure is set by the brightness of its environment. That
+    exposure stays as it is. So another map is multiplied by the exposure that it would
+    have been metered to, over that of the scene: the image is then as bright as if the
+    other map had been metered.
 
     Args:
         scene: the scene.
@@ -319,7 +333,8 @@ def _load_map(scene: SceneDescription, asset: EnvironmentAsset | None) -> Tensor
     scene_environment = scene.require_environment("the environment")
     if asset is None:
         return torch.from_numpy(scene_environment.radiance.copy())
-    # `photographed` decides the kind of ground, and the scene keeps its own ground.
+    # `photographed`, which decides the kind of ground, stays as in the scene: another map
+    # changes no ground.
     other_scene = replace(
         scene, environment=replace(asset, photographed=scene_environment.photographed)
     )

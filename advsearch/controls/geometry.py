@@ -89,17 +89,20 @@ class WeldedMesh:
     def __init__(self, mesh: Mesh) -> None:
         """Weld the seams of a mesh, and find its walls.
 
-        Vertices at the same position become one position. Faces without area are left
-        out. The normal of a position is the mean of its faces' normals, weighted by
-        their areas.
+        Seams are edges at which the mesh has several vertices at the same position, e.g.
+        with other texture coordinates: these become one position. Walls are pairs of
+        positions on opposite sides of thin parts. Faces without area are left out. The
+        normal of a position is the mean of its faces' normals, weighted by their areas.
         """
         self.position_of_vertex, count = weld_vertices(mesh)
         self.positions = np.zeros((count, 3))
+        # All vertices of a position have the same coordinates.
         self.positions[self.position_of_vertex] = mesh.vertices
         self.extent = float(np.ptp(self.positions, axis=0).max())
         faces = self.position_of_vertex[mesh.faces]
         area_vectors = compute_area_vectors(self.positions[faces])
         self.faces = faces[np.linalg.norm(area_vectors, axis=1) > 0.0]
+        # A face without area adds the zero vector.
         summed = np.zeros((count, 3))
         np.add.at(summed, faces.reshape(-1), np.repeat(area_vectors, 3, axis=0))
         lengths = np.linalg.norm(summed, axis=1, keepdims=True)
@@ -110,13 +113,15 @@ class WeldedMesh:
         """Return pairs (W, 2) of positions on opposite sides of a wall or of a gap.
 
         For a position x with the normal n, the partner is the position y, with the
-        normal m, that minimises |x - y|^2 + b^2 |n + m|^2. Here b is a tenth of the
+        normal m, that minimizes |x - y|^2 + b^2 |n + m|^2. Here b is a tenth of the
         mesh's extent; a k-d tree in six dimensions finds it. A pair is a wall if both
         normals are nearly opposite and the distance is not too large, and not 0.
         """
         scaled_normals = 0.1 * self.extent * self.normals  # b n
+        # The distance between the points (x, -b n) and (y, b m), squared, is the sum that
+        # is minimized. A position may be its own partner; its distance is then 0.
         tree = cKDTree(np.hstack([self.positions, scaled_normals]))
-        partner = tree.query(np.hstack([self.positions, -scaled_normals]))[1]
+        _, partner = tree.query(np.hstack([self.positions, -scaled_normals]))
         distance = np.linalg.norm(self.positions - self.positions[partner], axis=1)
         cosine = (self.normals * self.normals[partner]).sum(axis=1)
         is_wall = (
@@ -155,9 +160,10 @@ def _compute_landmark_weights(
 def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     """Return the smoothest displacement fields of a mesh that are no rigid motion.
 
-    Some points of the surface, the landmarks, get a diffusion map: functions that vary
-    slowly over the surface. The fields are combinations of these, extended from the
-    landmarks to all positions of the mesh (Nystrom). The result is cached.
+    Functions that vary slowly over the surface are computed at some of its points, the
+    landmarks, by a diffusion map (Coifman and Lafon 2006, alpha = 1). The fields are
+    combinations of these functions, extended from the landmarks to all positions of the
+    mesh (Nystrom). The result is cached.
 
     Args:
         mesh: mesh in object sizes.
@@ -168,52 +174,69 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
         the largest length is 1 in each.
     """
     welded_mesh = get_welded_mesh(mesh)
-    landmarks, cell = _sample_landmarks(welded_mesh)
-    # A function gives three fields, one along each axis. Two more functions are used,
-    # because the three rotations are removed from the fields.
+    landmarks, cell_size = _sample_landmarks(welded_mesh)
+    kernel_width = BANDWIDTH * cell_size
+    kernel, density = _compute_kernel(landmarks, kernel_width)
+    mass = kernel.sum(axis=1)
+    # Each function gives three fields, one along each axis, and three fields are removed
+    # as rotations. So at least one more function is needed than the fields require.
     n_functions = min(math.ceil(count / 3) + 2, len(landmarks) - 1)
-    width = BANDWIDTH * cell
-    density, functions, mass, eigenvalues = _compute_diffusion_map(
-        landmarks, width, n_functions
-    )
+    functions, eigenvalues = _compute_smooth_functions(kernel, mass, n_functions)
     # Approximate eigenvalues of the Laplacian: 0 for a constant function, and larger
     # for functions that vary faster.
-    energy = (1.0 - eigenvalues) / width**2
+    energy = (1.0 - eigenvalues) / kernel_width**2
     # (functions, 3, count)
     combination = _combine_without_rotation(landmarks, functions, mass, energy, count)
 
     # Nystrom extension from the landmarks to all positions: a weighted mean, divided
     # by the eigenvalue. Small eigenvalues would amplify noise.
     weights = _compute_landmark_weights(
-        welded_mesh.positions, landmarks, width, density
+        welded_mesh.positions, landmarks, kernel_width, density
     )
     extended = weights @ (functions / np.maximum(eigenvalues, MIN_EIGENVALUE))
     # p positions, s scalar functions, c axes, k fields
     fields = np.einsum("ps,sck->pck", extended, combination)
-    return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
+    largest_length = np.linalg.norm(fields, axis=1).max(axis=0)  # of each field
+    return np.asarray(fields / largest_length)
 
 
-def _compute_diffusion_map(
-    points: Float64Array, width: float, n_functions: int
-) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
-    """Compute the diffusion map of points (Coifman and Lafon 2006, alpha = 1).
+def _compute_kernel(
+    points: Float64Array, width: float
+) -> tuple[Float64Array, Float64Array]:
+    """Compute a Gaussian kernel between points, independent of their density.
 
     Args:
         points: (N, 3) landmarks.
-        width: standard deviation of the Gaussian kernel.
-        n_functions: number of functions, without the constant one.
+        width: standard deviation of the Gaussian.
 
     Returns:
-        The kernel density (N,) at the points; the most slowly varying functions (N,
-        n_functions), orthonormal under the mass; the mass (N,) of the points, which is
-        the sum of their normalized kernel; and the eigenvalues (n_functions,) of the
-        functions, descending.
+        The kernel (N, N), divided by the densities of both points (alpha = 1); and the
+        density (N,) at each point.
     """
-    kernel = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
-    density = kernel.sum(axis=1)
-    # alpha = 1 makes the result independent of the density of landmarks
-    kernel /= density[:, None] * density[None, :]
-    mass = kernel.sum(axis=1)
+    gaussian = np.exp(-cdist(points, points, "sqeuclidean") / (2.0 * width**2))
+    density = gaussian.sum(axis=1)
+    return gaussian / (density[:, None] * density[None, :]), density
+
+
+def _compute_smooth_functions(
+    kernel: Float64Array, mass: Float64Array, n_functions: int
+) -> tuple[Float64Array, Float64Array]:
+    """Compute the functions on points that a diffusion by a kernel changes least.
+
+    They are the eigenvectors of `kernel / mass[:, None]` with the largest eigenvalues,
+    without the largest one, whose function is constant.
+
+    Args:
+        kernel: (N, N) symmetric kernel between the points.
+        mass: (N,) sum of each row of the kernel.
+        n_functions: number of functions.
+
+    Returns:
+        The functions (N, n_functions), orthonormal under the mass, the most slowly
+        varying first; and their eigenvalues (n_functions,), descending.
+    """
+    # A symmetric matrix with the same eigenvalues. Its eigenvectors are those functions
+    # times the square root of the mass.
     symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
     # A sparse matrix without negligible entries, for the Lanczos method. Dense solvers
     # run in many threads, and take ten times as long on a busy machine.
@@ -221,16 +244,15 @@ def _compute_diffusion_map(
         np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
     )
     # a fixed start, so that the result is deterministic
-    first_vector = np.cos(np.arange(len(points)))
-    n_lanczos_vectors = min(len(points), 4 * (n_functions + 1))
+    first_vector = np.cos(np.arange(len(mass)))
+    n_lanczos_vectors = min(len(mass), 4 * (n_functions + 1))
     eigenvalues, vectors = sparse_linalg.eigsh(
         matrix, n_functions + 1, which="LA", v0=first_vector, ncv=n_lanczos_vectors
     )
-    # without the largest eigenvalue, whose function is constant
-    descending = np.argsort(-eigenvalues)[1:]
-    # from eigenvectors of the symmetric matrix to functions
-    functions = _fix_signs(vectors[:, descending]) / np.sqrt(mass)[:, None]
-    return density, functions, mass, eigenvalues[descending]
+    # in descending order, without the first one, whose function is constant
+    selected = np.argsort(-eigenvalues)[1:]
+    functions = _fix_signs(vectors[:, selected]) / np.sqrt(mass)[:, None]
+    return functions, eigenvalues[selected]
 
 
 def _fix_signs(vectors: Float64Array) -> Float64Array:
@@ -245,9 +267,9 @@ def _fix_signs(vectors: Float64Array) -> Float64Array:
 def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
     """Return points (N, 3) spread evenly over a surface, and the size of their cells.
 
-    The surface is sampled evenly by area, and its vertices are added. All points in one
-    cubic cell are averaged to one landmark. Cells are enlarged until there are at most
-    `MAX_LANDMARKS`.
+    The surface is sampled evenly by area, and its vertices are added. Space is divided
+    into cubic cells, and all points in one cell are averaged to one landmark. Cells are
+    enlarged until there are at most `MAX_LANDMARKS`; their final size is returned.
     """
     corners = welded_mesh.positions[welded_mesh.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
@@ -255,21 +277,22 @@ def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
     # The face of each sample: samples are evenly spaced in the cumulative area.
     quantiles = (np.arange(N_SURFACE_SAMPLES) + 0.5) / N_SURFACE_SAMPLES
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
-    face = face.clip(max=len(areas) - 1)
+    face = face.clip(max=len(areas) - 1)  # if the sum is rounded to less than 1
     barycentric = generator.dirichlet((1.0, 1.0, 1.0), N_SURFACE_SAMPLES)
     samples = np.einsum("nk,nkc->nc", barycentric, corners[face])
     pool = np.concatenate([samples, welded_mesh.positions])
-    cell = CELL_SIZE * welded_mesh.extent
+    cell_size = CELL_SIZE * welded_mesh.extent
     while True:
-        cubes = np.floor((pool - pool.min(axis=0)) / cell).astype(np.int64)
-        # index of the occupied cell that each point lies in
+        cubes = np.floor((pool - pool.min(axis=0)) / cell_size).astype(np.int64)
+        # index, among the cells with points, of the cell that each point lies in
         cell_index = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
-        if int(cell_index.max()) + 1 <= MAX_LANDMARKS:
+        n_cells = int(cell_index.max()) + 1
+        if n_cells <= MAX_LANDMARKS:
             break
-        cell *= 1.15
+        cell_size *= 1.15
     n_members = np.bincount(cell_index)
     means = [np.bincount(cell_index, pool[:, axis]) / n_members for axis in range(3)]
-    return np.stack(means, axis=1), cell
+    return np.stack(means, axis=1), cell_size
 
 
 def _combine_without_rotation(
@@ -286,8 +309,8 @@ def _combine_without_rotation(
     vary (their energy). Shifts need not be removed, because the constant function is
     not among the functions.
 
-    In this function a field is a vector of 3 S coefficients: for each function, the
-    weights in the x, y and z component.
+    In this function a field is a vector of 3 S coefficients: the weights of function 0
+    in the x, y and z component, then those of function 1, and so on.
 
     Args:
         points: (N, 3) landmarks.
@@ -303,20 +326,21 @@ def _combine_without_rotation(
     center = (points * mass[:, None]).sum(axis=0) / mass.sum()
     # (N, 3) displacements by a small rotation about each axis
     turns = [np.cross(axis, points - center) for axis in np.eye(3)]
-    # (3, 3 S) coefficients of the three rotations
+    # (3, 3 S) coefficients of the three rotations: projections on the functions
     rotations = np.stack(
         [(functions.T @ (mass[:, None] * turn)).reshape(-1) for turn in turns]
     )
     # (3 S, M) orthonormal basis of the fields without rotation
     basis = linalg.null_space(rotations)
-    # Energy as a quadratic form, first of coefficients, then in the basis. Its
-    # eigenvectors are the fields, with the smallest energy first.
-    coefficient_energy = np.repeat(energy, 3)[:, None]
-    basis_energy = basis.T @ (coefficient_energy * basis)
+    # The energy of a field is the sum of energy times weight squared over all weights: a
+    # diagonal quadratic form of the coefficients. Here it is written in the basis.
+    energy_of_coefficient = np.repeat(energy, 3)[:, None]
+    basis_energy = basis.T @ (energy_of_coefficient * basis)
+    # Eigenvectors by ascending energy. The first ones are the smoothest fields.
     _, vectors = linalg.eigh(basis_energy)
     n_fields = min(count, basis.shape[1])
-    combined = _fix_signs(basis @ vectors[:, :n_fields])
-    return np.asarray(combined.reshape(n_functions, 3, -1))
+    fields = _fix_signs(basis @ vectors[:, :n_fields])
+    return np.asarray(fields.reshape(n_functions, 3, n_fields))
 
 
 # ---- one push per vertex
@@ -340,7 +364,7 @@ class Preconditioner:
         """
         positions = welded_mesh.positions
         laplacian, mean_edge_length = _compute_wall_laplacian(welded_mesh)
-        # The Laplacian counts lengths in mean edges, so lambda does as well.
+        # The Laplacian is in units of the mean edge length, and so is lambda.
         smoothing_length = SMOOTHING_LENGTH * welded_mesh.extent / mean_edge_length
         system = sparse.identity(len(positions)) + smoothing_length**2 * laplacian
         self._factor = sparse_linalg.splu(system.tocsc())
@@ -348,12 +372,17 @@ class Preconditioner:
         shifts = [np.broadcast_to(axis, positions.shape) for axis in np.eye(3)]
         centered = positions - positions.mean(axis=0)
         turns = [np.cross(axis, centered) for axis in np.eye(3)]
-        # (3 P, 6), with the three components of a position next to each other
+        # (3 P, 6): a column for each motion, in which x, y and z of a position follow
+        # each other
         motions = np.stack([field.reshape(-1) for field in (*shifts, *turns)], axis=1)
         self._rigid = torch.from_numpy(np.asarray(linalg.orth(motions)))
 
     def __call__(self, pushes: Tensor) -> Tensor:
-        """Return displacements (P, 3) for pushes (P, 3), float64; differentiable."""
+        """Return displacements (P, 3) for pushes (P, 3), float64; differentiable.
+
+        They are smooth, and have no part that is a rigid motion.
+        """
+        # I + lambda L is inverted twice, as in the formula of the class.
         solved: Tensor = _Solve.apply(pushes, self._factor)  # type: ignore[no-untyped-call]
         smooth: Tensor = _Solve.apply(solved, self._factor)  # type: ignore[no-untyped-call]
         vector = smooth.reshape(-1)
@@ -455,18 +484,19 @@ class DisplacementLimits:
         edges = np.stack([edge_1, edge_2, edge_1 - edge_2])
         longest = np.linalg.norm(edges, axis=-1).max(axis=0)
         double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
-        # Double the area is the longest edge times the height over it.
-        is_no_sliver = double_area > MIN_FACE_HEIGHT * longest**2
-        edge_1 = edge_1[is_no_sliver]
-        edge_2 = edge_2[is_no_sliver]
-        double_area = double_area[is_no_sliver]
-        # Edge 2 is split into a multiple of edge 1 and the height over edge 1.
+        # The height over the longest edge is `double_area / longest`.
+        is_limited = double_area > MIN_FACE_HEIGHT * longest**2  # others are slivers
+        edge_1 = edge_1[is_limited]
+        edge_2 = edge_2[is_limited]
+        double_area = double_area[is_limited]
         length_1 = np.linalg.norm(edge_1, axis=1)
+        # Edge 2 is a multiple of edge 1, plus the height over edge 1.
         projection = (edge_1 * edge_2).sum(axis=1) / length_1
+        multiple = projection / length_1
         inverse_height = length_1 / double_area
-        self._faces = torch.from_numpy(welded_mesh.faces[is_no_sliver])
+        self._faces = torch.from_numpy(welded_mesh.faces[is_limited])
         self._gradient_factors = torch.from_numpy(
-            np.stack([1.0 / length_1, projection / length_1, inverse_height], axis=1)
+            np.stack([1.0 / length_1, multiple, inverse_height], axis=1)
         )
         self._walls = torch.from_numpy(welded_mesh.walls)
         wall_vectors = (
@@ -487,7 +517,7 @@ class DisplacementLimits:
             field: (P, 3) the field d, without units.
 
         Returns:
-            (N,): positions first, then faces, then walls.
+            (N,): of positions first, then of faces, then of walls.
         """
         walls = self._walls.to(field.device)
         wall_widths = self._wall_widths.to(field.device)
@@ -501,15 +531,18 @@ class DisplacementLimits:
             difference.square().sum(dim=1)
             * (self.epsilon / MAX_WALL_STRAIN / wall_widths).square()
         )
-        return torch.cat([field.square().sum(dim=1), face_usage, wall_usage])
+        # |epsilon d| / epsilon = |d|
+        position_usage = field.square().sum(dim=1)
+        return torch.cat([position_usage, face_usage, wall_usage])
 
     def _compute_squared_gradients(self, field: Tensor) -> Tensor:
         """Return the squared norm (F,) of the gradient of a field (P, 3) on each face.
 
         The field changes by d1 along edge 1 of the face, and by d2 along edge 2. Edge 2
-        is the sum of a multiple m of edge 1 and a vector at right angles to it, whose
-        length is the height of the face. So the gradient is d1 / length along edge 1,
-        and (d2 - m d1) / height at right angles to it.
+        is m times edge 1, plus a vector at right angles to it, whose length is the
+        height of the face. So the gradient is d1 / length along edge 1, and
+        (d2 - m d1) / height at right angles to it. `_gradient_factors` has 1 / length, m
+        and 1 / height of each face.
 
         Args:
             field: (P, 3) vectors at the positions of the mesh.
@@ -518,6 +551,7 @@ class DisplacementLimits:
         # (F, 1) each
         inverse_length, multiple, inverse_height = factors.split(1, dim=1)
         face_corners = self._faces.to(field.device)
+        # values of the field at the first, second and third corner of each face
         corners = [field.index_select(0, corner) for corner in face_corners.T]
         d1 = corners[1] - corners[0]
         d2 = corners[2] - corners[0]
@@ -533,14 +567,15 @@ class DisplacementLimits:
         bounds that epsilon d uses and p is `NORM_EXPONENT`. Small fields are hardly
         changed, large ones reach the tightest bound, and the result is differentiable.
         """
-        squared_usage = self.compute_squared_usage(field)
-        half_exponent = NORM_EXPONENT // 2  # as usages are squared already
-        # To avoid an overflow, all r are divided by the largest one, R (at least 1):
+        squared_usage = self.compute_squared_usage(field)  # r^2
+        # To avoid an overflow, all r are divided by R, the largest of them and 1:
         #     1 + sum r^p = R^p total,    total = R^-p + sum (r / R)^p
-        # R cancels in the result, so that it may be a constant for the derivative.
-        squared_max = squared_usage.detach().max().clamp_min(1.0)
+        # The result does not depend on R, which is therefore a constant for derivatives.
+        squared_max = squared_usage.detach().max().clamp_min(1.0)  # R^2
+        half_exponent = NORM_EXPONENT // 2  # r^p is the power p / 2 of r^2
         sum_of_powers = (squared_usage / squared_max).pow(half_exponent).sum()
         total = sum_of_powers + squared_max**-half_exponent
+        # (1 + sum r^p)^(-1/p)
         scale = total ** (-1.0 / NORM_EXPONENT) / squared_max.sqrt()
         return self.epsilon * field * scale
 
@@ -636,7 +671,7 @@ class GeometryControl(Control):
         self.form = self.select_form(FORMS)
 
     def bind_parameters(self) -> None:
-        """Compute what turns coordinates into a displacement field of the mesh.
+        """Prepare `self._field`, which maps coordinates to a displacement field.
 
         In the form "modes" a coordinate is the amplitude of a smooth field. Otherwise
         it is a push on one position along one axis, which a preconditioner spreads.
@@ -653,7 +688,7 @@ class GeometryControl(Control):
             modes = torch.from_numpy(
                 compute_shape_modes(self._mesh, int(self.choice_values["modes"]))
             )
-            n_modes = modes.shape[2]
+            n_modes = modes.shape[2]  # fewer than requested for a small mesh
             group = Group("amplitudes", n_modes, ESTIMATORS)
             self._field: Callable[[Tensor], Tensor] = lambda amplitudes: (
                 modes.to(amplitudes.device) @ amplitudes
@@ -665,7 +700,7 @@ class GeometryControl(Control):
                 PUSH_FACTOR * precondition(pushes.reshape(-1, 3))
             )
         self.groups = (group,)
-        # no displacement, see `compute_offsets`
+        # `compute_offsets` maps 0.5 to no displacement
         self.start = torch.full((group.size,), 0.5)
 
     def inputs(
@@ -704,10 +739,11 @@ class GeometryControl(Control):
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, bytes]:
         """Return the displaced mesh as an OBJ file; earlier inputs are not used."""
-        moving = MovingMesh(self._mesh, np.eye(4))
+        in_mesh_coordinates = MovingMesh(self._mesh, np.eye(4))
         offsets = self.inputs(u.detach())[self._offsets_input]
-        # without another pose
-        vertices, normals = moving.transform_mesh(None, offsets)
+        vertices, normals = in_mesh_coordinates.transform_mesh(
+            to_world=None, offsets=offsets
+        )
         lines = ["# advsearch: z is up; texture coordinates as of the original object"]
         lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
         lines += [

@@ -65,10 +65,11 @@ class HazeControl(Control):
             return self._resolve_density(parameter, scene_haze)
         if scene_haze is None:
             return parameter
-        # the others are the channels of the color
+        # The other parameters are the channels of the color: "red", "green" and "blue".
         linear_albedo = np.asarray(scene_haze.albedo, np.float32)
         albedo = color.linear_to_srgb(linear_albedo).tolist()
-        return replace(parameter, default=albedo[color.CHANNELS.index(parameter.name)])
+        channel = color.CHANNELS.index(parameter.name)
+        return replace(parameter, default=albedo[channel])
 
     def _resolve_density(
         self, parameter: Parameter, scene_haze: parts.HazePart | None
@@ -87,14 +88,12 @@ class HazeControl(Control):
             default = scene_haze.density
         elif self.has_requested_range and not self.is_searched("density"):
             default = DEFAULT_DENSITY
-        # The adjoint needs a positive density.
+        # The adjoint needs a positive density. Without a range of the user, the range
+        # includes 0.
         spec = self.specs.get("density")
         has_adjoint = isinstance(spec, Range) and spec.low > 0.0
-        return replace(
-            parameter,
-            default=default,
-            estimators=Parameter.LIT if has_adjoint else ("differences",),
-        )
+        estimators = Parameter.LIT if has_adjoint else ("differences",)
+        return replace(parameter, default=default, estimators=estimators)
 
     def get_value_without_control(self, parameter: Parameter) -> float | str:
         # Only the value of the density is used (`strength_parameter`).

@@ -154,16 +154,14 @@ class LensControl(Control):
         return {self.name: draw_dots(checkerboard, self._spread_dots(values))}
 
     def _spread_dots(self, values: Values) -> dict[str, Tensor]:
-        """Return the values with dots spread along the axes that the user did not set.
+        """Return the values with dots spread along the axes that are fixed by default.
 
-        If the user sets a range of another parameter, x and y are fixed at their
-        defaults, which are the same for all dots: the dots would cover each other. If
-        the user sets no range at all, x and y are searched, and `fit` has spread their
-        start.
+        The user may set a range of another parameter than x or y. Then x and y are
+        fixed, and all dots would be at the same default position.
         """
-        are_positions_searched = not self.has_requested_range
-        if are_positions_searched:
-            return dict(values)
+        are_default_ranges_searched = not self.has_requested_range
+        if are_default_ranges_searched:
+            return dict(values)  # `bind_parameters` has spread the start of x and y
         positions = spread_positions(self.n_dots)
         spread_values = dict(values)
         for axis, name in enumerate(POSITION_PARAMETERS):
@@ -227,10 +225,12 @@ def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Te
     x_offset = (column - values["x"][:, None] * width) / shorter_side
     y_offset = (row - values["y"][:, None] * height) / shorter_side
     squared_distance = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
-    in_radii = squared_distance / values["radius"][:, None, None] ** 2
+    squared_radii = squared_distance / values["radius"][:, None, None] ** 2  # r^2
     falloff = values["falloff"]
-    # Beyond this the exponential is 0 and its derivative would not be finite.
-    max_in_radii = float(_MAX_EXPONENT ** (1.0 / falloff.detach()))
+    # Here r^2 to the falloff is `_MAX_EXPONENT`. Beyond, the exponential is practically 0,
+    # and its derivative would not be finite.
+    max_squared_radii = float(_MAX_EXPONENT ** (1.0 / falloff.detach()))
     # at least 1e-12, as a power has no derivative at 0
-    fading = torch.exp(-(in_radii.clamp(1e-12, max_in_radii) ** falloff))
+    limited = squared_radii.clamp(1e-12, max_squared_radii)
+    fading = torch.exp(-(limited**falloff))
     return values["opacity"][:, None, None] * fading

@@ -52,7 +52,8 @@ def _make_coordinate(
 ) -> Parameter:
     """Return a parameter for a coordinate of the lamp, searched from `low` to `high`.
 
-    It can move an outline, as the ball is visible and a lamp casts shadows.
+    Its gradient is estimated by finite differences. It moves outlines in the image, those
+    of shadows and of the visible ball, for which an adjoint would be wrong.
     """
     limit = 1000.0
     return Parameter.moving(

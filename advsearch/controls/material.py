@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -328,30 +328,47 @@ def marble(grid: Grid) -> Float64Array:
     """
     warped = _warp_grid(grid, cells=2, amount=0.22, seed=21)
     finely_warped = _warp_grid(warped, cells=6, amount=0.03, seed=22)
-    x, y = finely_warped
     clouds = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=4, seed=25)
-    veins = np.zeros((TILE_SIDE, TILE_SIDE))
-    # Each family of parallel veins has its own frequencies, width, depth and seed. A line
-    # along x crosses n_right veins of the tile, a line along y crosses n_down.
-    for n_right, n_down, width, depth, seed in (
-        (1, 1, 0.05, 0.75, 23),
-        (2, 1, 0.02, 0.45, 24),
-        (1, 3, 0.012, 0.3, 26),
-    ):
-        turbulence = 0.5 * _clouds(finely_warped, cells=(2, 2), octaves=4, seed=seed)
-        strength = 0.25 + 0.75 * _step(
-            _clouds(warped, cells=(3, 3), octaves=2, seed=seed + 50), edge=0.0, soft=0.8
-        )
-        # Frequencies are integers, so that veins continue across the tile's borders.
-        phase = n_right * x + n_down * y + turbulence
-        veins += depth * strength * _compute_vein_profile(phase, width)
-    return _mix(
-        _mix(
-            _color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, edge=0.58, soft=0.8)
-        ),
-        _color("4c5159"),
-        np.clip(veins, 0.0, 0.9),
+    grayness = 0.8 * _step(clouds, edge=0.58, soft=0.8)
+    clouded = _mix(_color("f4f2ee"), _color("c6c8ca"), grayness)
+    # three families of parallel veins, from wide and dark to fine and pale
+    paint_veins = partial(_paint_veins, warped, finely_warped)
+    veins = (
+        paint_veins(n_right=1, n_down=1, width=0.05, depth=0.75, seed=23)
+        + paint_veins(n_right=2, n_down=1, width=0.02, depth=0.45, seed=24)
+        + paint_veins(n_right=1, n_down=3, width=0.012, depth=0.3, seed=26)
     )
+    return _mix(clouded, _color("4c5159"), np.clip(veins, 0.0, 0.9))
+
+
+def _paint_veins(
+    warped: Grid,
+    finely_warped: Grid,
+    *,
+    n_right: int,
+    n_down: int,
+    width: float,
+    depth: float,
+    seed: int,
+) -> Float64Array:
+    """Return how dark a family of parallel veins makes each texel, (SIDE, SIDE).
+
+    Args:
+        warped: warped coordinates of the texels, for the strength along the veins.
+        finely_warped: coordinates with finer warps, for the shape of the veins.
+        n_right: number of veins that a line along x crosses in a tile.
+        n_down: number of veins that a line along y crosses in a tile.
+        width: width of a vein, see `_compute_vein_profile`.
+        depth: darkness of a vein where it is strongest.
+        seed: seed of the noise.
+    """
+    turbulence = 0.5 * _clouds(finely_warped, cells=(2, 2), octaves=4, seed=seed)
+    patches = _clouds(warped, cells=(3, 3), octaves=2, seed=seed + 50)
+    strength = 0.25 + 0.75 * _step(patches, edge=0.0, soft=0.8)
+    x, y = finely_warped
+    # The numbers of veins are integers, so that veins continue across the tile's borders.
+    phase = n_right * x + n_down * y + turbulence
+    return np.asarray(depth * strength * _compute_vein_profile(phase, width))
 
 
 def _compute_vein_profile(phase: Float64Array, width: float) -> Float64Array:
@@ -359,10 +376,12 @@ def _compute_vein_profile(phase: Float64Array, width: float) -> Float64Array:
 
     Args:
         phase: (SIDE, SIDE) phase, which increases by 1 from vein to vein.
-        width: width of the core, where half the distance between two veins is 1.
+        width: width of the core. The unit is that of `distance`.
     """
+    # 0 on a vein, 1 halfway between two veins
     distance = np.abs(np.sin(np.pi * phase))
     core = np.exp(-((distance / width) ** 2))
+    # weaker than the core and four times as wide, chosen by eye
     halo = 0.3 * np.exp(-(distance / (4.0 * width)))
     return np.asarray(core + halo)
 
@@ -501,9 +520,9 @@ def _draw_rosettes(
     distance: Float64Array,
     index: npt.NDArray[np.int64],
 ) -> tuple[Float64Array, Float64Array]:
-    """Draw broken rings around points, and the cores inside of the rings.
+    """Draw rings with gaps around points, and the cores inside of the rings.
 
-    Numbers are chosen by eye; lengths are in tiles.
+    All numbers are chosen by eye; lengths are in tiles.
 
     Args:
         grid: coordinates of the texels.
@@ -514,7 +533,8 @@ def _draw_rosettes(
     Returns:
         Opacity of the rings and of the cores, from 0 to 1, (SIDE, SIDE) each.
     """
-    generator = np.random.Generator(np.random.PCG64(54))
+    generator = np.random.Generator(np.random.PCG64(seed=54))
+    # Each rosette has a size and a turn; these are the ones of each texel's rosette.
     size = generator.uniform(0.85, 1.15, len(points))[index]
     turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
     radius = distance / size
@@ -522,14 +542,17 @@ def _draw_rosettes(
     x_offset = (grid[0] - points[index, 0] + 0.5) % 1.0 - 0.5
     y_offset = (grid[1] - points[index, 1] + 0.5) % 1.0 - 0.5
     angle = np.arctan2(y_offset, x_offset)
-    # A function of the angle: the ring has gaps where it is low.
-    waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
+    # A ring is between two edges. The outer one is not quite a circle.
+    beyond_inner_edge = _step(radius, edge=0.031, soft=0.008)
     outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
-    ring = _step(radius, edge=0.031, soft=0.008) * (
-        1.0 - _step(radius, edge=outer_edge, soft=0.008)
-    )
+    beyond_outer_edge = _step(radius, edge=outer_edge, soft=0.008)
+    ring = beyond_inner_edge * (1.0 - beyond_outer_edge)
+    # It has gaps at the angles where the waves are low.
+    waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
+    opacity_at_angle = _step(waves, edge=-0.75, soft=0.5)
+    # The core reaches below the ring, and is visible in its gaps.
     core = 1.0 - _step(radius, edge=0.042, soft=0.02)
-    return ring * _step(waves, edge=-0.75, soft=0.5), core
+    return ring * opacity_at_angle, core
 
 
 @register_pattern(tile_size=0.8, roughness=0.8, specular=0.2)
@@ -604,13 +627,15 @@ def _bend_blades(
         along: (1, along, 1) positions of the samples along a blade, 0 to 1.
         across: (1, 1, across) positions across a blade, -1 to 1.
     """
-    # half a width of 0.0042 tiles at the root, 0 at the tip
+    # half the width of a blade is 0.0042 tiles at the root (by eye), and 0 at the tip
     offset = across * 0.0042 * (1.0 - along**2)
+    # A blade is an arc of a circle. The chord from the root to a sample points halfway
+    # between the headings at its ends; its length is almost that of the arc.
     heading = lean + bend * along
-    # a chord of a circular arc points halfway between the headings of its ends
-    middle = lean + 0.5 * bend * along
-    x = root[..., 0] + length * along * np.cos(middle) - offset * np.sin(heading)
-    y = root[..., 1] + length * along * np.sin(middle) + offset * np.cos(heading)
+    chord_heading = lean + 0.5 * bend * along
+    chord = length * along
+    x = root[..., 0] + chord * np.cos(chord_heading) - offset * np.sin(heading)
+    y = root[..., 1] + chord * np.sin(chord_heading) + offset * np.cos(heading)
     return x, y
 
 
@@ -741,20 +766,23 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
         side: number of texels along a side of the texture.
 
     Returns:
-        (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
+        (side, side, 3) float32 display-referred sRGB in [0, 1]. Row 0 is at the texture
+        coordinate v = 1.
     """
     positions, normals = _compute_texel_surface(mesh, side)
     texels_per_object_size = TILE_SIDE / PATTERNS[name].tile_size
     weights = np.abs(normals) ** BLEND_EXPONENT
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
-    # For a projection along x, y and z: the axes that are to the right and upwards in the
-    # tile.
-    for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
+    # For each axis of projection (x, y, z): the axes to the right and upwards in the tile.
+    # One of two opposite walls gets the mirrored tile.
+    axes_in_tile = ((1, 2), (0, 2), (0, 1))
+    for axis, (right, up) in enumerate(axes_in_tile):
         column = positions[..., right] * texels_per_object_size
         row = -positions[..., up] * texels_per_object_size  # rows go down
         projected = look_up_texture(make_tile(name), column, row)
-        texels += weights[..., axis : axis + 1] * projected
+        weight = weights[..., axis, None]
+        texels += weight * projected
     return texels
 
 
@@ -830,7 +858,11 @@ class MaterialControl(Control):
 
     @property
     def refines(self) -> frozenset[str]:
-        return frozenset({self._base_color}) if self._changes_color() else frozenset()
+        return (
+            frozenset({self._base_color_input})
+            if self._changes_color()
+            else frozenset()
+        )
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -849,17 +881,16 @@ class MaterialControl(Control):
         material = self._get_material(which)
         inputs: dict[str, Tensor] = {}
         for name in SURFACE_PARAMETERS:
+            input_name = f"{self.mesh_name}.{name}"
             if self._is_set(name):
-                inputs[f"{self.mesh_name}.{name}"] = values[name].reshape(1)
+                inputs[input_name] = values[name].reshape(1)
             elif self._may_change_material:
                 number = float(getattr(material, name))
-                inputs[f"{self.mesh_name}.{name}"] = values["which"].new_tensor(
-                    [number]
-                )
+                inputs[input_name] = values["which"].new_tensor([number])
         if self._changes_color():
             tint = color.combine_channels(values)
             base = self._compute_base_color(which, earlier_inputs)
-            inputs[self._base_color] = tint * base.to(tint.device)
+            inputs[self._base_color_input] = tint * base.to(tint.device)
         return inputs
 
     def _compute_base_color(
@@ -873,8 +904,8 @@ class MaterialControl(Control):
         mesh = self.get_mesh(self.scene)
         if which != OBJECT_SURFACE:
             return _make_linear_covering(mesh.mesh, which)
-        if self._base_color in earlier_inputs:
-            return earlier_inputs[self._base_color]
+        if self._base_color_input in earlier_inputs:
+            return earlier_inputs[self._base_color_input]
         return srgb_to_linear(torch.from_numpy(mesh.base_color.copy()))
 
     def make_artifact_images(
@@ -883,14 +914,11 @@ class MaterialControl(Control):
         """Return the texture if the control changes it."""
         if not self._changes_color():
             return {}
-        return {
-            self.name: linear_to_srgb(
-                self.scene_inputs(values, earlier_inputs)[self._base_color]
-            )
-        }
+        inputs = self.scene_inputs(values, earlier_inputs)
+        return {self.name: linear_to_srgb(inputs[self._base_color_input])}
 
     @property
-    def _base_color(self) -> str:
+    def _base_color_input(self) -> str:
         """Name of the scene input for the texture."""
         return f"{self.mesh_name}.base_color"
 

@@ -50,7 +50,7 @@ class MitsubaControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with a part for the numbers that are set by Mitsuba's names.
 
-        A name is e.g. "mug.bsdf.reflectance".
+        The settings of this control are named by these, e.g. "mug.bsdf.reflectance".
 
         Raises:
             InputError: the scene has no such number; or it does not belong to the
@@ -65,14 +65,10 @@ class MitsubaControl(Control):
                 f"`backdrop={scene.backdrop_photograph.spec}` contradict each other: "
                 "everything but the object is the photograph; leave one of the two out"
             )
-        return scene.with_part(
-            parts.PluginNumbers(
-                self.name,
-                mitsuba_data.find_plugin_numbers(
-                    scene, self.name, tuple(self._settings)
-                ),
-            )
+        numbers = mitsuba_data.find_plugin_numbers(
+            scene, self.name, keys=tuple(self._settings)
         )
+        return scene.with_part(parts.PluginNumbers(self.name, numbers))
 
     def list_parameter_specs(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
         """Yield one parameter for each number that was set, with its range or value.

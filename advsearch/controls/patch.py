@@ -250,7 +250,9 @@ class PatchControl(PictureControl):
         self._picture = (
             None if picture is None else images.resize_to_square(picture, side)
         )
-        # `values` needs the picture, and the start of the pixels needs the painter.
+        # The painter needs the values at the start, which `compute_values` returns, and the
+        # start of the pixels needs the painter. So the pixels are set last, and are left
+        # out here.
         start_values = {
             name: float(value)
             for name, value in self.compute_values(self.start).items()
@@ -264,7 +266,7 @@ class PatchControl(PictureControl):
         """Let searched pixels start as the texture underneath the patch.
 
         Colors outside of the range are clipped to it. If there are any, the start is
-        recorded as an adjusted default.
+        recorded as an adjusted default, in words: "the nearest from 0.2 to 0.8".
 
         Args:
             parameter: parameter of the pixels.
@@ -278,8 +280,8 @@ class PatchControl(PictureControl):
         # Pixels are the first parameter, so that their coordinates come first.
         n_coordinates = start.numel()
         self.start[:n_coordinates] = start.reshape(-1)
-        if not torch.allclose(start, underneath, atol=1e-5):
-            # "the nearest from 0.2 to 0.8": values, in words
+        is_clipped = not torch.allclose(start, underneath, atol=1e-5)
+        if is_clipped:
             self.record_adjusted_default(
                 parameter,
                 scene_value="the texture underneath",
@@ -330,16 +332,14 @@ def find_side_towards_camera(scene: SceneDescription) -> tuple[float, float]:
         Azimuth in degrees, and height from 0 to 1, as the parameters of the control.
     """
     center, radius, half_height = _measure_mesh(scene.object.mesh)
-    camera = np.append(geometry.camera_to_world(scene)[:3, 3], 1.0)
-    # The offset from the center to the camera, in the coordinates of the object: the
-    # solution is the camera's position there.
-    x, y, z = (
-        np.linalg.solve(geometry.compute_object_to_world(scene), camera)[:3] - center
-    )
+    object_to_world = geometry.compute_object_to_world(scene)
+    camera_in_world = np.append(geometry.camera_to_world(scene)[:3, 3], 1.0)
+    camera_in_object = np.linalg.solve(object_to_world, camera_in_world)[:3]
+    x, y, z = camera_in_object - center
     # A limit above 0, so that the height of a camera straight above is 1.
     level_distance = max(math.hypot(x, y), 1e-12)
-    # latitude of the direction after the ellipsoid around the object, with a level radius
-    # and a half height, is scaled to a sphere
+    # Latitude of the direction after the ellipsoid around the object is scaled to a unit
+    # sphere: level distances are divided by the radius, z by the half height.
     latitude = math.atan2(z * radius, level_distance * half_height)
     azimuth = math.degrees(math.atan2(y, x)) % 360.0
     return azimuth, 0.5 + latitude / math.pi
@@ -462,6 +462,8 @@ class PatchPainter:
         )
         map_side = len(charts.face_index)
         self._object_color = _resize_to_square(object_color, map_side)
+        # Only texels on faces are stored: row i of each array is texel `_texels[i]` of the
+        # flattened map, on the face `_faces[i]` of the mesh.
         is_on_face = charts.is_readable
         self._texels = np.flatnonzero(is_on_face)
         self._faces = charts.face_index[is_on_face]
@@ -555,10 +557,10 @@ class PatchPainter:
         # and normals are flipped.
         is_front = float(self._surface.normals[face] @ outwards) >= 0.0
         sign = 1.0 if is_front else -1.0
-        normal = self._compute_mean_normal(face, point)
-        frame = _make_frame(sign * normal, _upward_direction(azimuth, outwards))
-        # The third row of the frame is the flipped normal; the mesh needs its own one.
-        rows = self._select_texels(face, point, sign * frame[2], PAINT_RADIUS * size)
+        mean_normal = self._compute_mean_normal(face, point)
+        # rows right, up and outwards of the patch
+        frame = _make_frame(sign * mean_normal, _upward_direction(azimuth, outwards))
+        rows = self._select_texels(face, point, mean_normal, PAINT_RADIUS * size)
 
         coordinates, cosine = unroll_surface(
             self._positions[rows] - point, sign * self._normals[rows], frame
@@ -606,18 +608,20 @@ class PatchPainter:
     ) -> assets.IntArray:
         """Return the rows (N,) of texels within a radius of a point of a face.
 
-        The texels are connected to the point over the surface, and their faces are on
-        the side to which the normal points.
+        The texels are connected to the point over the surface, and their faces face the
+        direction of the normal.
 
         Args:
             face: index of the face.
             point: (3,) point of the face.
-            normal: (3,) normal of the patch.
+            normal: (3,) normal of the patch, as the mesh has it.
             radius: largest distance from the point, object sizes.
         """
+        # a mask of all faces of the mesh
         is_face_near = self._surface.find_region(face, point, normal, radius)
         # rows of the texels on these faces
-        connected = np.flatnonzero(is_face_near[self._faces])
+        is_texel_on_these = is_face_near[self._faces]
+        connected = np.flatnonzero(is_texel_on_these)
         offsets = self._positions[connected] - point
         is_close = (offsets**2).sum(axis=1) <= radius**2
         return np.asarray(connected[is_close])
@@ -644,12 +648,13 @@ def _outward_direction(
 ) -> assets.Float64Array:
     """Return the unit vector (3,) from the center of an object to a patch on it.
 
-    The patch lies on an ellipsoid around the object.
+    Azimuth and height are coordinates of an ellipsoid around the object: a unit sphere
+    with these coordinates is stretched to the ellipsoid.
 
     Args:
         azimuth: degrees around the vertical.
-        height: latitude on the ellipsoid: 0 at the lower pole, 0.5 at the equator, 1 at
-            the upper pole.
+        height: latitude on the sphere: 0 at the lower pole, 0.5 at the equator, 1 at the
+            upper pole.
         radius: level radius of the ellipsoid, object sizes.
         half_height: half the height of the ellipsoid, object sizes.
     """
@@ -686,14 +691,16 @@ def _upward_direction(
 
 
 def _fade_in(cosine: assets.Float64Array) -> Tensor:
-    """Return the opacity (N,) of a patch on texels that face towards it or away.
+    """Return the opacity (N,) of a patch on texels, by the direction that they face.
 
-    `cosine` (N,) is that of the angle between the normals of texel and patch.
+    It is 1 for texels with the normal of the patch, and 0 for those that face away.
+
+    Args:
+        cosine: (N,) cosine of the angle between the normals of texel and patch.
     """
-    low, high = FACING_COSINES
-    return _smooth_step(
-        torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32))
-    )
+    transparent_cosine, opaque_cosine = FACING_COSINES
+    fraction = (cosine - transparent_cosine) / (opaque_cosine - transparent_cosine)
+    return _smooth_step(torch.from_numpy(fraction.astype(np.float32)))
 
 
 def _make_frame(
@@ -766,10 +773,12 @@ def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:
     means = sums / counts.clamp_min(1.0)[:, None]
     line = torch.arange(side) + 0.5
     grid = torch.meshgrid(line, line, indexing="ij")
-    centers = torch.stack(grid, dim=-1).reshape(-1, 2)  # (row, column) of each pixel
+    # (row, column) of each pixel's center, so positions need the same order
+    centers = torch.stack(grid, dim=-1).reshape(-1, 2)
     tree = spatial.cKDTree(positions.flip(1).numpy())
-    nearest = tree.query(centers.numpy() / side)[1]
-    return torch.where(counts[:, None] > 0.0, means, colors[torch.from_numpy(nearest)])
+    _, nearest = tree.query(centers.numpy() / side)
+    has_color = counts[:, None] > 0.0
+    return torch.where(has_color, means, colors[torch.from_numpy(nearest)])
 
 
 def _rotate(coordinates: Tensor, degrees: Tensor) -> Tensor:

@@ -84,19 +84,21 @@ class PoseControl(Control):
             values["yaw"], values["pitch"], values["roll"]
         )
         linear = values["scale"] * rotation
-        # height of the lowest point relative to the center, so negative
-        if self.choice_values["on_ground"] in ("yes", True):
+        # Height of the lowest point relative to the center, which is negative.
+        if self.choice_values["on_ground"] in ("yes", True):  # text, or a YAML boolean
             # of the turned and scaled mesh, so that its lowest point is on the floor
-            lowest = ((vertices - center) @ linear[2]).amin()
+            linear_to_height = linear[2]  # the row for z
+            lowest = ((vertices - center) @ linear_to_height).amin()
         else:
             # of the mesh before, so that the center keeps its height
             lowest = floor - center[2]
-        center_height = floor + values["z"] - lowest
-        # The new center: x and y are shifts, and the height is absolute.
-        shift = torch.stack([values["x"], values["y"], center_height])
+        # The new center is `shift_and_height + level_center`: x and y are shifts of the
+        # old center, and the height is absolute.
+        new_height = floor + values["z"] - lowest
+        shift_and_height = torch.stack([values["x"], values["y"], new_height])
         level_center = torch.cat([center[:2], center.new_zeros(1)])
         # The linear map turns about the origin, and moves the center to linear @ center.
-        translation = shift - linear @ center + level_center
+        translation = shift_and_height - linear @ center + level_center
         return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base_pose}
 
 
@@ -108,9 +110,9 @@ def _get_base_pose(
 
     Args:
         mesh: mesh that is posed.
-        surrounding_mesh: the mesh in the scene as it was described; None for the
-            object. The object's mesh is in the coordinates of the scene, and stands on
-            the height 0.
+        surrounding_mesh: the same mesh in the scene as it was described, with its pose;
+            None for the object, whose mesh is in the coordinates of the scene and stands
+            on the height 0.
 
     Returns:
         The pose (4, 4) from the mesh's coordinates to the scene, its vertices (V, 3) in

@@ -302,8 +302,10 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
         )
     if low > high:
         remedy = f"write [{high:g}, {low:g}]"
-        # A wider range has no shorter form through 0.
-        if parameter.periodic and low - high < FULL_TURN:
+        # [350, 10] may be meant as the 20 degrees through 0. With a full turn or more
+        # between the bounds, as in [400, 10], there is no such interval.
+        may_be_through_zero = low - high < FULL_TURN
+        if parameter.periodic and may_be_through_zero:
             remedy = _explain_reversed_angles(parameter, low, high)
         raise InputError(
             f"{where}: the range [{low:g}, {high:g}] is reversed; {remedy}"
@@ -327,14 +329,15 @@ def _explain_reversed_angles(parameter: Parameter, low: float, high: float) -> s
         low: first bound as the user wrote it, which is the larger one.
         high: second bound.
     """
-    # A full turn is subtracted from `low`; if that is below the parameter's bound, it
-    # is added to `high` instead.
-    begin = low
-    end = high + FULL_TURN
+    # The interval through 0 in ascending order: [350, 10] becomes [-10, 10]; or [350, 370]
+    # if the parameter has no values below 0.
     if low - FULL_TURN >= parameter.low:
         begin = low - FULL_TURN
         end = high
-    # the multiple of a full turn between both bounds
+    else:
+        begin = low
+        end = high + FULL_TURN
+    # the angle that lies between both, which is 0 or 360
     inner_turn = 0 if begin <= 0 else FULL_TURN
     inner_width = FULL_TURN - low + high
     return (
@@ -514,10 +517,11 @@ def clip_to_range(
         is_angle: whether values are degrees, of which 0 and 360 are the same.
     """
     if is_angle:
-        # The value is moved to [low, low + 360). If it is above `high` then, it may be
-        # nearer to `low` + 360, which is the same angle as `low`.
-        value = low + (value - low) % FULL_TURN
-        if value > high and value - high > low + FULL_TURN - value:
+        value = low + (value - low) % FULL_TURN  # in [low, low + 360)
+        # An angle above `high` is also below `low` + 360, which is the same as `low`.
+        to_high = value - high
+        to_low = low + FULL_TURN - value
+        if value > high and to_high > to_low:
             value = low
     return min(max(value, low), high)
 
@@ -576,7 +580,8 @@ class Slot:
     def get_start_value(self) -> ParameterValue:
         """Return the parameter's default, or the allowed value that is nearest to it.
 
-        Names have no nearest value: the first allowed one is returned.
+        Names have no nearest value: the first allowed one is returned. A fixed parameter
+        allows one value only, which is returned.
         """
         spec = self.parameter_spec
         default = self.parameter.default
@@ -588,7 +593,8 @@ class Slot:
             )
         if default in spec.values:
             return default
-        if any(isinstance(value, str) for value in (default, *spec.values)):
+        has_names = any(isinstance(value, str) for value in (default, *spec.values))
+        if has_names:
             return spec.values[0]
         return min(
             spec.values,
@@ -598,15 +604,18 @@ class Slot:
         )
 
     def get_start_coordinates(self) -> list[float]:
-        """Return the coordinates of `get_start_value`; none if the parameter is fixed."""
+        """Return the coordinates of the value that `get_start_value` returns.
+
+        There is one for each element of a parameter with a range, one for a list of
+        values, and none if the parameter is fixed.
+        """
         spec = self.parameter_spec
         value = self.get_start_value()
         if isinstance(spec, Range):
-            return [
-                spec.find_coordinate(float(value), log=self.parameter.log)
-            ] * self.n_values
+            coordinate = spec.find_coordinate(float(value), log=self.parameter.log)
+            return [coordinate] * self.n_values
         if isinstance(spec, OneOf):
-            # the middle of the value's interval of [0, 1]
+            # [0, 1] is divided into an interval for each value: the middle of this one
             return [(spec.values.index(value) + 0.5) / len(spec.values)]
         return []
 
@@ -646,7 +655,8 @@ def parse_distribution(
     arguments = {key: value for key, value in setting.items() if key != DISTRIBUTION}
     frozen, text = _freeze_distribution(label, name, arguments)
     with np.errstate(all="ignore"):  # far out in the tails, some formulas overflow
-        # continuous distributions only: a single value has the probability 0
+        # Probabilities below each bound. The bounds themselves have the probability 0, as
+        # the distribution is continuous.
         lower_probability = float(frozen.cdf(parameter.low))
         upper_probability = float(frozen.cdf(parameter.high))
         outside = lower_probability + float(frozen.sf(parameter.high))
@@ -697,7 +707,8 @@ def _freeze_distribution(
         UnknownNameError: scipy has no continuous distribution of that name.
         InputError: it does not take the arguments.
     """
-    # imported here, as it takes a quarter of a second and few runs need it
+    # Imported here, since the import takes a quarter of a second and most runs have no
+    # distribution.
     from scipy import stats
 
     family = getattr(stats, name, None) if isinstance(name, str) else None
@@ -714,9 +725,11 @@ def _freeze_distribution(
     if all(map(Parameter.is_number, arguments.values())):
         with suppress(TypeError):  # it has no such arguments, or lacks one
             frozen = family(**arguments)
-            # with arguments out of range, scipy's median is NaN
-            is_valid = bool(np.isfinite(frozen.ppf(0.5)))
+            # scipy returns NaN for quantiles if an argument is out of its range
+            median = frozen.ppf(0.5)
+            is_valid = bool(np.isfinite(median))
     if not is_valid:
+        # `family.shapes` are the names of its arguments besides loc and scale, e.g. "a, b"
         shapes = f"{family.shapes}, " if family.shapes else ""
         raise InputError(
             f"{where}: expected {{distribution: {name}}} with numbers for "
@@ -757,7 +770,7 @@ def _read_python_quantiles(
         return np.array(values).reshape(probabilities.shape)
 
     with np.errstate(all="ignore"):
-        # whether there is a smallest and a largest value; if not, tails are cut off
+        # Whether there is a smallest and a largest value. An infinite tail is cut off.
         has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
     lower_probability = 0.0 if has_end[0] else TAIL_PROBABILITY
     upper_probability = 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY

@@ -143,15 +143,15 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
         `compression`. The derivative of the JPEG compression is taken as the identity.
     """
     height, width = image.shape[:2]
-    light = color.srgb_to_linear(image) * compute_vignette(
-        height, width, values["vignetting"]
-    ).to(image.device)
+    vignette = compute_vignette(height, width, values["vignetting"])
+    light = color.srgb_to_linear(image) * vignette.to(image.device)
     light = apply_aberration(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
-    # The square root, shifted so that its derivative at 0 is finite; it is 0 there.
+    # The square root of the variance, shifted by `_DARK` so that its derivative at 0 is
+    # finite. It is 0 there.
     std = torch.sqrt(variance + _DARK**2) - _DARK
     light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
-    # `mosaic` is the weight of the image with the effect.
+    # `mosaic` is the weight of the image with a mosaic of color filters.
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
     # white balance: red and blue in stops, relative to green
     gains = torch.stack(
@@ -161,7 +161,7 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     compression = round(float(values["compression"].detach()))
     if compression == 0:
         return display
-    jpeg_quality = 100 - compression  # 5 to 99
+    jpeg_quality = 100 - compression  # 5 to 99, as the compression is 1 to 95 here
     return images.compress_jpeg(display, jpeg_quality).clamp(0.0, 1.0)
 
 

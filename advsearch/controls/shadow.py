@@ -175,16 +175,16 @@ class ShadowControl(Control):
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
-        """Return the card's pose and the offsets of its corners.
+        """Return the pose of the card that casts the shadow, and its corners' offsets.
 
-        A radius of 1 leaves a corner where it is, and 0 moves it to the center. The
-        card is hidden if it has no size, or if the camera would see it at all
-        distances.
+        A radius of 1 leaves a corner at the distance 1 from the center, where the mesh
+        has it, and 0 moves it to the center. The card is hidden if it has no size, or if
+        the camera would see it at all distances.
         """
         radii = values["radii"]
-        rim = torch.from_numpy(parts.make_polygon(len(radii)).vertices[1:].copy()).to(
-            radii
-        )
+        # the first vertex is the center, which stays
+        corners = parts.make_polygon(len(radii)).vertices[1:]
+        rim = torch.from_numpy(corners.copy()).to(radii)
         offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
         distance = self._find_distance(values, earlier_inputs)
         if distance is None:
@@ -214,15 +214,20 @@ class ShadowControl(Control):
         object_center = torch.from_numpy(geometry.compute_center(self.scene)).to(right)
         center = object_center + distance * outwards
         center = center + values["x"] * right + values["y"] * up
-        # The card's third axis, its normal, points to the object. So the second axis
-        # changes its sign too: otherwise the pose would be a reflection.
+        # The card's third axis, its normal, points to the object: -outwards. With two
+        # axes as they are and one reversed, the pose would be a reflection. So the second
+        # axis is reversed, too.
         card_axes = torch.stack([first_axis, -second_axis, -outwards], dim=1)
         return geometry.make_affine(size * card_axes, center)
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
-        """Return the actual distance of the card, which may be larger than requested."""
+        """Return the actual distance of the card that casts the shadow.
+
+        It may be larger than requested, and is 0 if the card is hidden, see
+        `_find_distance`.
+        """
         distance = self._find_distance(values, earlier_inputs)
         return {
             "true_distance": Value(
@@ -247,10 +252,10 @@ class ShadowControl(Control):
     ) -> float | None:
         """Find the smallest distance at which the camera does not see the card.
 
-        It is at least the requested one, unless that is beyond the largest distance
-        (`_compute_max_distance`). The camera does not see the card if a ball around it,
-        whose radius is the card's size, is outside of the cone through the corners of
-        the image.
+        Distances from the requested one upwards are tried, or only the largest distance
+        (`_compute_max_distance`) if the requested one is beyond it. The camera does not
+        see the card if a ball around it, whose radius is the card's size, is outside of
+        the cone through the corners of the image.
 
         Args:
             values: values of the control by parameter.
@@ -276,7 +281,7 @@ class ShadowControl(Control):
         cone_angle = self._compute_image_cone_angle(earlier_inputs)
         max_distance = self._compute_max_distance()
         for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
-            # Beyond the largest distance all factors give the same one.
+            # From some factor on, this is always the largest distance.
             distance = min(requested * factor, max_distance)
             card = geometry.compute_center(self.scene) + distance * outwards + offset
             # components along the camera's axes, the columns of its pose
@@ -293,15 +298,15 @@ class ShadowControl(Control):
     def _compute_image_cone_angle(self, earlier_inputs: Mapping[str, Tensor]) -> float:
         """Return the angle of the image's corners from the camera's axis, radians.
 
-        With a camera model, it is that of the visible rectangle, with a margin. With a
-        shift it is an upper bound.
+        With a camera model, or with a shift, it is an upper bound.
         """
         model = self.scene.camera_model
         aspect = self.scene.aspect
         fov_input = earlier_inputs.get("camera.fov")
         if model is not None:
-            # The angle between opposite corners, which is larger than that of the longer
-            # side.
+            # The angle between opposite corners of the visible rectangle, in place of that
+            # of its longer side. So the corner that is computed from it below is farther
+            # from the axis than the true one.
             fov = 2.0 * math.atan(math.hypot(*model.inner_half_tangents))
         elif fov_input is not None:
             fov = math.radians(float(fov_input.detach()))

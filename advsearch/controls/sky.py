@@ -91,9 +91,10 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
         turbidity: () turbidity, from 1 to 10.
     """
     last = len(table) - 1
-    # At the turbidity 10 it is the row for 9, so that there is a row above.
+    # Index of the row below the turbidity. For 10 it is that of 9, as there must be a row
+    # above it.
     below = min(last - 1, max(0, int(turbidity.detach()) - 1))
-    t = turbidity - 1.0 - below  # from 0 at the entry below to 1 at the next
+    t = turbidity - 1.0 - below  # from 0 at the row below to 1 at the next
     lower = table[below]
     upper = table[below + 1]
     slopes = []
@@ -101,10 +102,12 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
         before = max(0, index - 1)
         after = min(last, index + 1)
         slopes.append((table[after] - table[before]) / (after - before))
-    # The straight line between both entries, and a cubic that is 0 at both and gives
-    # the curve the two slopes there.
+    # The curve is the straight line between both rows, whose slope is `rise`, plus a cubic
+    # that is 0 at both. The cubic has the slope (slopes[0] - rise) at t = 0, and
+    # (slopes[1] - rise) at t = 1.
     rise = upper - lower
-    return torch.lerp(lower, upper, t) + t * (1.0 - t) * (
+    line = torch.lerp(lower, upper, t)
+    return line + t * (1.0 - t) * (
         (1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise)
     )
 
@@ -112,12 +115,14 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
 def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     """Return the sun's irradiance (3,) on a surface that faces it.
 
-    Its unit is that of the sky's radiance times steradian. The range of elevations is
-    divided into `SUN_PIECES` pieces, evenly in the cube root of the elevation. In each
-    piece the radiance is a cubic polynomial in the elevation above the lower bound of
-    the piece. There is a polynomial for each of 6 powers of cos(psi), where psi is the
-    angle between the sun's surface and the line of sight: they describe how the sun's
-    disk darkens towards its edge.
+    Its unit is that of the sky's radiance times steradian.
+
+    The sun's radiance at a point of its disk is a polynomial in two variables. One is
+    cos(psi), where psi is the angle between the normal of the sun's surface and the line
+    of sight, with the powers 0 to 5: the disk darkens towards its edge. The other is the
+    elevation, with the powers 0 to 3. Elevations are divided into `SUN_PIECES` pieces,
+    evenly in their cube root. Each piece has its own coefficients, and its elevations
+    are counted from its lower bound.
 
     Args:
         elevation: () elevation of the sun, degrees.
@@ -129,17 +134,20 @@ def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     lower_bound = (math.pi / 2.0) * (piece / SUN_PIECES) ** 3
     above = radians - lower_bound
     _, _, sun_table = load_sky_tables(radians.device)
-    # (channel, power of the elevation, power of cos(psi))
-    terms = _at_turbidity(sun_table, turbidity)[piece]
+    # of this piece: (channel, power of the elevation, power of cos(psi))
+    coefficients = _at_turbidity(sun_table, turbidity)[piece]
     elevation_powers = torch.stack([above**power for power in range(4)])
     # Means of the powers of cos(psi) over the disk: at the distance r from its center,
     # cos(psi) is sqrt(1 - r^2), and the mean of (1 - r^2)^(p / 2) is 2 / (p + 2).
     limb_means = torch.tensor(
         [2.0 / (power + 2.0) for power in range(6)], device=radians.device
     )
-    radiance = torch.einsum("ckj,k,j->c", terms, elevation_powers, limb_means)
+    # c channels, k powers of the elevation, j powers of cos(psi)
+    mean_radiance = torch.einsum(
+        "ckj,k,j->c", coefficients, elevation_powers, limb_means
+    )
     solid_angle = 2.0 * math.pi * (1.0 - math.cos(REAL_SUN_RADIUS))
-    return (radiance * solid_angle * SUN_UNIT_FACTOR).clamp_min(0.0)
+    return (mean_radiance * solid_angle * SUN_UNIT_FACTOR).clamp_min(0.0)
 
 
 class Sky:
@@ -161,7 +169,8 @@ class Sky:
             ground: (3,) linear reflectance of the ground, in [0, 1].
         """
         # Row 0 of the map is straight up, and its last row straight down. Only the upper
-        # half is above the horizon. Columns are at the centers of texels.
+        # half is above the horizon. Azimuths begin at 90 degrees and decrease from column
+        # to column; they are those of the texels' centers.
         self.ground = ground
         n_upper_rows = MAP_ROWS // 2
         row = torch.arange(n_upper_rows, device=ground.device)
@@ -179,9 +188,11 @@ class Sky:
         directions = compute_direction(dense_azimuths, elevations)  # (3, H, W)
         self.directions = directions.permute(1, 2, 0).contiguous()
         self.cosines = self.directions[..., 2:3].clamp_min(0.0)
-        # height times width of a texel at the horizon, radians
-        texel = (math.pi / (MAP_ROWS - 1)) * (2.0 * math.pi / MAP_COLUMNS)
-        self.solid_angles = torch.cos(torch.deg2rad(elevations))[..., None] * texel
+        # Texels get narrower towards the pole, where row 0 has no solid angle at all.
+        height = math.pi / (MAP_ROWS - 1)  # radians
+        width_at_horizon = 2.0 * math.pi / MAP_COLUMNS
+        relative_width = torch.cos(torch.deg2rad(elevations))[..., None]
+        self.solid_angles = relative_width * (height * width_at_horizon)
 
     def compute_dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
         """Return the radiance of the sky above the horizon, without the sun's disk.
@@ -196,13 +207,14 @@ class Sky:
             coefficients; `level` is the mean radiance.
         """
         coefficient_table, level_table, _ = load_sky_tables(sun.device)
-        # The tables have I before H.
+        # (3,) each, for the channels. The tables have I before H.
         a, b, c, d, e, f, g, i, h = self._interpolate(
             coefficient_table, elevation, turbidity
         ).unbind(-1)
         level = self._interpolate(level_table, elevation, turbidity)
-        # Angles of a direction: `cosine` and `angle` are from the sun, `self.cosines`
-        # from the zenith. 0.01 avoids a division by 0 at the horizon.
+        # `cosine` and `angle` are those between a direction and the sun, `self.cosines`
+        # those between a direction and the zenith. 0.01 avoids a division by 0 at the
+        # horizon.
         cosine = (self.directions @ sun)[..., None]
         angle = compute_angles(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
@@ -235,27 +247,28 @@ class Sky:
         Returns:
             (3, ...).
         """
-        # over 0, as the cube root has no derivative at 0
+        # position on the curve; over 0, as the cube root has no derivative at 0
         x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
         weights = torch.stack(
             [math.comb(5, k) * x**k * (1.0 - x) ** (5 - k) for k in range(6)]
         )
-        curves = torch.einsum(
-            "k,akc...->ac...", weights, _at_turbidity(table, turbidity)
-        )
-        # (3, 1, ...) to be broadcast
+        control_points = _at_turbidity(table, turbidity)
+        # a albedos (0 and 1), k control points, c channels
+        curves = torch.einsum("k,akc...->ac...", weights, control_points)
+        # the reflectance of the ground; (3, 1, ...) to be broadcast
         albedo = self.ground.reshape(3, *[1] * (curves.ndim - 2))
         return torch.lerp(curves[0], curves[1], albedo)
 
     def compute_disk(self, sun: Tensor) -> Tensor:
-        """Return the sun's shape (ROWS / 2, COLUMNS, 1), with an integral of 1 over
-        solid angle.
+        """Return the sun's shape on the texels above the horizon, (H, W, 1).
 
-        It is (1 - r^2)^2, where r is the distance from the sun's center in radii, and 0
-        outside. At the edge its value and its derivative are 0. So all texels whose
-        radiance changes when the sun moves have some radiance, and an adjoint that
-        samples texels by their radiance misses none of them.
+        Its integral over solid angle is 1. It is (1 - r^2)^2, where r is the distance
+        from the sun's center in radii, and 0 outside. It is smooth at the edge: a texel
+        whose radiance changes when the sun moves has some radiance already. An adjoint
+        that samples texels by their radiance needs that, as it never samples a texel
+        without radiance.
         """
+        # Between unit vectors, the distance is practically the angle for a small disk.
         squared_distance = (self.directions - sun).square().sum(-1, keepdim=True)
         squared_radii = squared_distance / SUN_RADIUS**2
         bump = (1.0 - squared_radii).clamp_min(0.0).square()
@@ -277,25 +290,29 @@ class Sky:
         """
         sun = compute_direction(azimuth, elevation)
         dome = self.compute_dome(sun, elevation, turbidity)
-        sun_irradiance = compute_sun_irradiance(elevation, turbidity)
-        upper = dome + self.compute_disk(sun) * sun_irradiance
-        # (H, W, 3) irradiance by each texel on a surface that faces it
+        # The disk has an integral of 1, so that this is its radiance.
+        disk = self.compute_disk(sun) * compute_sun_irradiance(elevation, turbidity)
+        upper = dome + disk
+        # (H, W, 3) irradiance by each texel on a surface that faces the texel
         texel_irradiance = upper * self.solid_angles
         ground_irradiance = (texel_irradiance * self.cosines).sum((0, 1))
         # The ground is diffuse: its radiance is the same in all directions.
         lower = (self.ground * ground_irradiance / math.pi).expand(
             MAP_ROWS - MAP_ROWS // 2, MAP_COLUMNS, 3
         )
-        # cosines for a surface that faces the sun
-        facing = (self.directions @ sun).clamp_min(0.0)[..., None]
-        return torch.cat([upper, lower]), (texel_irradiance * facing).sum() / 3.0
+        radiance = torch.cat([upper, lower])
+        # The same for a surface that faces the sun, instead of the ground.
+        cosines_to_sun = (self.directions @ sun).clamp_min(0.0)[..., None]
+        irradiance = (texel_irradiance * cosines_to_sun).sum() / 3.0  # mean of channels
+        return radiance, irradiance
 
 
 def compute_angles(directions: Tensor, reference: Tensor) -> Tensor:
     """Return the angle (...) in radians between unit vectors (..., 3) and (3,).
 
-    Differentiable at 0 and 180 degrees.
+    Differentiable at 0 and 180 degrees, as `EPSILON` keeps the square roots over 0.
     """
+    # |a - b| / 2 is the sine of half the angle between a and b, |a + b| / 2 its cosine.
     half_sine = ((directions - reference).square().sum(-1) / 4.0 + EPSILON).sqrt()
     half_cosine = ((directions + reference).square().sum(-1) / 4.0 + EPSILON).sqrt()
     return 2.0 * torch.atan2(half_sine, half_cosine)
@@ -353,6 +370,7 @@ class SkyControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with the sky at the control's start as its environment."""
+        # To know the sky at the start, a copy is bound to the scene before its sky is set.
         bound = self.bind(scene)
         radiance = (
             bound.compute_radiance(bound.compute_values(bound.start))
@@ -360,6 +378,7 @@ class SkyControl(Control):
             .astype(np.float32)
         )
         sky = assets.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
+        # The map is as it should be: it is neither rotated nor exposed by the scene.
         return replace(scene, environment=sky).with_values(
             environment__rotation=0.0, environment__exposure=0.0
         )
@@ -386,6 +405,7 @@ class SkyControl(Control):
         """
         azimuth = values["azimuth"]
         sky = make_sky(self.scene.ground_color, azimuth.device)
+        # the map, and the irradiance () on a surface that faces the sun
         radiance, irradiance = sky(azimuth, values["elevation"], values["turbidity"])
         if self.choice_values["exposure"] == "fixed":
             irradiance = self._start_irradiance.to(radiance.device)

@@ -79,8 +79,9 @@ class Space:
     def groups(self) -> tuple[Group, ...]:
         """Groups of coordinates, one for each searched parameter, in the order of u.
 
-        A group lists the gradient estimators that are valid for it; one is chosen
-        later. The estimator "material" is removed if the scene does not support it.
+        A group lists the gradient estimators that are valid for it (`valid`), of which
+        one is chosen later. The estimator "material" is removed if the scene does not
+        support it.
         """
         lacks_material_form = not self._has_material_form()
         groups = []
@@ -90,7 +91,7 @@ class Space:
                 valid = group.valid
                 if lacks_material_form:
                     valid = tuple(name for name in valid if name != "material")
-                # A control does not know its position in the space.
+                # A control does not know where its coordinates begin in u.
                 groups.append(
                     replace(group, control=control.name, begin=begin, valid=valid)
                 )
@@ -98,16 +99,16 @@ class Space:
         return tuple(groups)
 
     def _has_material_form(self) -> bool:
-        """Return whether the scene's derivatives can be computed in material form.
+        """Return whether the gradient estimator "material" supports the scene.
 
-        That adjoint follows points of a moving surface. It is not implemented for a
-        medium, a backdrop, a lens, the edges of cut-out texels, normal maps, or meshes
-        that emit light.
+        This adjoint follows the points of a moving surface (the material form of the
+        derivative). It is not implemented for a medium, a backdrop, a lens, the edges of
+        cut-out texels, normal maps, or meshes that emit light.
         """
         scene = self.scene
         if scene is None:
             return True
-        unsupported = (
+        unsupported_features = (  # false or None if the scene has none
             scene.backdrop,
             scene.thin_lens,
             scene.camera_model,
@@ -116,7 +117,7 @@ class Space:
             scene.has_emission,
         )
         has_medium = any(part.volumetric for part in scene.parts)
-        return not (any(unsupported) or has_medium)
+        return not any(unsupported_features) and not has_medium
 
     @cached_property
     def coordinate_counts(self) -> list[int]:
@@ -132,8 +133,10 @@ class Space:
         """Indices of the controls in the order in which they are evaluated.
 
         First come the controls that refine no inputs of others, then those that do;
-        and among both, those with `on_top` come last. Otherwise they keep their order.
+        and in both groups, those with `on_top` come last. Otherwise they keep their
+        order.
         """
+        # False sorts before True, and `sorted` keeps the order of equal ranks.
         ranks = [(bool(control.refines), control.on_top) for control in self.controls]
         return tuple(sorted(range(len(ranks)), key=lambda index: ranks[index]))
 
@@ -153,10 +156,12 @@ class Space:
         for index in self._evaluation_order:
             control = self.controls[index]
             new_inputs = control.inputs(slices[index], merged)
-            # Built-in controls are checked by tests; checks at every image take time.
+            # Only controls of users are checked: checks at every image take time, and
+            # tests check the built-in ones.
             if not is_package_class(type(control)):
                 _check_inputs(control.name, new_inputs)
             for name in new_inputs:
+                # Only inputs that a control refines may be set again.
                 if name in merged and name not in control.refines:
                     hint = ""
                     if name.endswith(".base_color"):
@@ -174,12 +179,16 @@ class Space:
     ) -> list[tuple[Control, Tensor, Mapping[str, Tensor]]]:
         """Return each control with its slice of u and the inputs of earlier controls.
 
-        "Earlier" refers to the order of evaluation; the result has the order of
-        `controls`. Only controls that refine inputs get those of earlier controls. So
-        no inputs are computed after the last of these controls, to save time.
+        Controls are evaluated in another order than that of `controls`, in which they
+        are returned. Only controls that refine inputs get those of earlier controls; the
+        others get none. To save time, no inputs are computed after the last control that
+        refines some.
 
         Args:
             u: (d,) the configuration.
+
+        Returns:
+            For each control: itself, its slice (k,) of u, and the inputs.
         """
         slices = u.detach().split(self.coordinate_counts)
         order = self._evaluation_order
@@ -189,7 +198,7 @@ class Space:
             for position, index in enumerate(order)
             if self.controls[index].refines
         ]
-        last_refining = max(refining_positions, default=0)
+        last_refining = max(refining_positions, default=-1)  # -1 if there is none
         earlier_inputs = NO_INPUTS
         inputs_before = dict[int, Mapping[str, Tensor]]()
         for position, index in enumerate(order):
@@ -291,8 +300,8 @@ class Space:
             InputError: no number of controls has k coordinates.
         """
         sizes = self.coordinate_counts
-        # Several counts may fit, as a control may have no coordinates. The smallest is
-        # used: a control without coordinates is fixed anyway.
+        # Several counts may fit, as the next controls may have no coordinates. These are
+        # fixed anyway, so that the smallest count is enough.
         counts = [
             count for count in range(len(sizes) + 1) if sum(sizes[:count]) == len(u)
         ]
@@ -308,6 +317,7 @@ class Space:
             _FixedControl(control, u_slice)
             for control, u_slice in zip(first_controls, slices, strict=True)
         ]
+        # only to find out which environment the first controls choose
         fixed_space = Space(first_controls, self.scene)
         chosen_environment = fixed_space.find_environment_name(fixed_space.describe(u))
         return replace(
@@ -326,9 +336,10 @@ class Space:
             Name of the environment; None if the scene keeps its own.
         """
         for group in self.groups:
-            if group.setting == ENVIRONMENT:
+            if group.setting == ENVIRONMENT:  # the environment is searched
                 name = str(values[group.name]["value"])
                 return None if name == SCENE_ENVIRONMENT else name
+        # It is the same in all configurations.
         return self.environment_name
 
     def list_notes(self, scene: SceneDescription) -> tuple[str, ...]:
@@ -366,13 +377,13 @@ class Space:
         pose. If none does, the only view is that of the scene.
         """
         for control, start in self.split_by_control(self.start):
-            # A control without slots, such as a texture, does not move the camera. A
-            # fixed control has no slots, but the control that it wraps may move it.
+            # To save time, inputs are not computed for controls without slots, such as a
+            # texture: these do not move the camera. A fixed control has no slots either,
+            # but the control that it wraps may move the camera.
             may_move_camera = bool(control.parameter_slots) or isinstance(
                 control, _FixedControl
             )
             if may_move_camera and "camera.to_world" in control.inputs(start):
-                # A single view if the control has no coordinates.
                 return [
                     _view_of_inputs(scene, control.inputs(u))
                     for u in _spread_over_box(len(start))
@@ -401,13 +412,16 @@ class Space:
 def _spread_over_box(size: int) -> Tensor:
     """Return points (n, size) spread over the unit box, and the centers of its faces.
 
-    A box without axes has a single point, (1, 0).
+    A box without axes, of size 0, is a single point: the result is then (1, 0).
     """
-    spread = SobolEngine(size).draw(N_CAMERA_VIEWS) if size else torch.zeros(1, 0)
-    # Each row is the axis of two opposite faces.
+    if not size:
+        return torch.zeros(1, 0)
+    spread = SobolEngine(size).draw(N_CAMERA_VIEWS)
+    # In row i only axis i is at a bound: the center of a face.
     is_axis = torch.eye(size) > 0.0
-    face_centers = [torch.where(is_axis, bound, 0.5) for bound in (0.0, 1.0)]
-    return torch.cat([spread, *face_centers])
+    lower_face_centers = torch.where(is_axis, 0.0, 0.5)
+    upper_face_centers = torch.where(is_axis, 1.0, 0.5)
+    return torch.cat([spread, lower_face_centers, upper_face_centers])
 
 
 def _view_of_inputs(
@@ -431,7 +445,8 @@ class _FixedControl(Control):
         """
         self._control = control
         self._u = u
-        # the attributes that a space reads
+        # The attributes that a space reads, as those of the wrapped control. A fixed
+        # control has no coordinates: see `bind_parameters`.
         self.name = control.name
         self.adjusted_defaults = control.adjusted_defaults
         self.on_top = control.on_top
@@ -552,9 +567,10 @@ def _check_range(label: str, value: Tensor, low: float, high: float) -> None:
     if not value.numel():
         return
     smallest, largest = (float(bound) for bound in value.detach().aminmax())
+    # false if an element is NaN, because then both are NaN
     if low - RANGE_TOLERANCE <= smallest and largest <= high + RANGE_TOLERANCE:
         return
-    # Inputs without an upper bound fail if they have NaN or negative light.
+    # Without an upper bound, an element is NaN or below `low` (negative light).
     expected = "numbers"
     hint = ""
     if high < math.inf:

@@ -195,12 +195,13 @@ class TextureControl(Control):
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
         """Return the mesh that the control paints.
 
-        The name after the colon, as in "texture:chair", is that of a mesh, or that of a
-        material of the object.
+        The name after the colon, as in "texture:chair", is that of a mesh; or if there is
+        no such mesh, that of a material of the object.
 
         Raises:
             UnknownNameError: it is neither.
         """
+        # none if there is a mesh of that name
         if self._find_named_materials(scene):
             return scene.meshes[OBJECT]
         try:
@@ -223,12 +224,13 @@ class TextureControl(Control):
         # imported here, as it takes time and most runs do not need it
         from advsearch.scene.importing.files import sanitize_name
 
-        if self.mesh_name in scene.meshes:
+        name_after_colon = self.mesh_name  # of a mesh or a material
+        if name_after_colon in scene.meshes:
             return []
         return [
             material
             for material in scene.object.mesh.materials
-            if self.mesh_name in (material, sanitize_name(material))
+            if name_after_colon in (material, sanitize_name(material))
         ]
 
     def list_materials(self, scene: SceneDescription) -> list[str] | None:
@@ -242,7 +244,7 @@ class TextureControl(Control):
             InputError, UnknownNameError: materials cannot be painted, or are unknown.
         """
         part = self.get_mesh(self.scene)
-        names = self.list_materials(self.scene)
+        names = self.list_materials(self.scene)  # None for all of them
         self._original = self._resample_original(part, names)
         shape = (self._original.shape[0], self._original.shape[1])
         if names is None:
@@ -252,9 +254,10 @@ class TextureControl(Control):
             mask = torch.from_numpy(self._find_painted_texels(part, names, shape))
             self._painted_mask = mask
         self._mesh_name = part.name
-        self._materials = ", ".join(names or ())
+        self._materials = ", ".join(names or ())  # as results describe them
         self._painter = self._make_painter(part, mask)
-        # computed, since rounding makes them differ a little from the original
+        # What the painter returns without a change. Rounding makes it differ a little from
+        # `_original`, which would count as a change.
         self._unchanged_texels = self._painter.paint_texels(self._painter.start)
         self.start = self._painter.start
         self.groups = (self._painter.group,)
@@ -265,9 +268,9 @@ class TextureControl(Control):
         """Return the original texture (h, w, 3) sRGB at the resolution of the search.
 
         It is resized to a square, whose side the user sets. By default that is the
-        longer side of the texture, within the limits `RESOLUTIONS`. If only some
-        materials are painted, the texture is not resized by default, however large, so
-        that the other materials stay exactly the same. Only a small one is enlarged.
+        longer side of the texture, within the limits `RESOLUTIONS`. But if only some
+        materials are painted, a texture that is at least as large as the lower limit is
+        not resized by default, so that the other materials stay exactly the same.
 
         Args:
             part: mesh with the texture.
@@ -277,8 +280,9 @@ class TextureControl(Control):
         longer_side = max(original.shape[:2])
         resolution = self.choice_values["resolution"]
         min_side, max_side = RESOLUTIONS
-        paints_some = materials is not None
-        if not resolution and paints_some and longer_side >= min_side:
+        paints_some_materials = materials is not None
+        is_small = longer_side < min_side
+        if not resolution and paints_some_materials and not is_small:
             return original
         default = min(max(longer_side, min_side), max_side)
         return resize_to_square(original, int(resolution or default))
@@ -386,9 +390,8 @@ class TextureControl(Control):
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
     ) -> dict[str, Value]:
         """Return how much the texels change, and which materials are painted."""
-        change = self._painter.paint_texels(u.detach()) - self._unchanged_texels.to(
-            u.device
-        )
+        texels = self._painter.paint_texels(u.detach())
+        change = texels - self._unchanged_texels.to(u.device)
         described: dict[str, Value] = {}
         if self._materials:
             described[f"{self.name}.materials"] = {
@@ -452,28 +455,35 @@ def make_palette_painter(original: Tensor, centers: Tensor, budget: Budget) -> P
     squared_distance = (original[..., None, :] - centers).square().sum(dim=-1)  # (n, k)
     # Weights are Gaussians of the distance between colors, which sum to 1. Their standard
     # deviation is half the mean distance from a palette color to the nearest other one.
-    # For a single color it does not matter, as its weight is 1.
+    # With a single color any value will do, since the only weight is 1.
     std = 1.0
     if len(centers) > 1:
-        # more than any distance, so that no color is its own nearest
-        self_distance = torch.diag(torch.full((len(centers),), 10.0))
-        distances = torch.cdist(centers, centers) + self_distance
+        # Colors are in [0, 1], so that 10 is more than any distance. It is added to the
+        # distance of each color from itself, which is then never the smallest.
+        large_diagonal = torch.diag(torch.full((len(centers),), 10.0))
+        distances = torch.cdist(centers, centers) + large_diagonal
         std = max(0.5 * float(distances.min(dim=1).values.mean()), 1e-3)
     weights = torch.softmax(-squared_distance / (2.0 * std**2), dim=-1)
     group = Group("palette", centers.numel(), ("adjoint", "differences"), budget)
-    texels = partial(_paint_palette, original, weights, centers)
-    return Painter(centers.reshape(-1), group, texels)
+    paint_texels = partial(_paint_palette, original, weights, centers)
+    return Painter(centers.reshape(-1), group, paint_texels)
 
 
 def _paint_palette(
     original: Tensor, weights: Tensor, centers: Tensor, u: Tensor
 ) -> Tensor:
-    """Return the texels (n, 3) for a changed palette, the coordinates u (3 k,).
+    """Return the texels (n, 3) for a changed palette.
 
-    Each texel changes by the changes of the palette's colors, times its weights (n, k).
-    `centers` (k, 3) is the original palette.
+    Each texel changes by the changes of the palette's colors, times its weights.
+
+    Args:
+        original: (n, 3) texels with the original palette.
+        weights: (n, k) weight of each color for each texel.
+        centers: (k, 3) original palette.
+        u: (3 k,) coordinates, which are the colors of the changed palette.
     """
-    change = weights.to(u.device) @ (u.reshape(-1, 3) - centers.to(u.device))
+    palette = u.reshape(-1, 3)
+    change = weights.to(u.device) @ (palette - centers.to(u.device))
     return (original.to(u.device) + change).clamp(0.0, 1.0)
 
 
@@ -489,19 +499,21 @@ def make_wave_painter(
     Args:
         original: (n, 3) sRGB, the texels that are painted.
         mask: (h, w) bool, the texels that are painted.
-        count: number of waves along each side; wave m has m half periods.
+        count: number of waves along each side; wave m (from 0) has m half periods.
         radius: largest change of a texel value.
     """
     height, width = mask.shape
     down = _make_cosine_waves(height, count)
     right = _make_cosine_waves(width, count)
+    # of each product, in half periods
     wave_index = torch.arange(count)
     frequency = torch.hypot(wave_index[:, None].float(), wave_index[None, :].float())
     max_amplitude = (WAVE_REACH / (1.0 + frequency))[..., None]  # (count, count, 1)
     start = torch.full((count * count * 3,), 0.5)
+    group = Group("amplitudes", len(start), ("adjoint",))
     waves = (down, right, max_amplitude)
-    texels = partial(_paint_waves, original, mask, radius, waves)
-    return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
+    paint_texels = partial(_paint_waves, original, mask, radius, waves)
+    return Painter(start, group, paint_texels)
 
 
 def _make_cosine_waves(side: int, count: int) -> Tensor:
@@ -520,7 +532,7 @@ def _paint_waves(
     """Return the texels (n, 3) with waves added.
 
     Args:
-        original: (n, 3) sRGB, the texels without waves.
+        original: (n, 3) sRGB, the painted texels without waves, row by row.
         mask: (h, w) bool, texels that are painted.
         radius: largest change of a texel value.
         waves: the waves down (h, k) and to the right (w, k), and the largest amplitude
@@ -528,7 +540,9 @@ def _paint_waves(
         u: (3 k^2,) amplitudes, as coordinates in [0, 1].
     """
     down, right, max_amplitude = (wave.to(u.device) for wave in waves)
-    amplitudes = (2.0 * u - 1.0).reshape(*max_amplitude.shape[:2], 3) * max_amplitude
+    n_down, n_right, _ = max_amplitude.shape
+    # (k, k, 3): of wave m down times wave n to the right, in channel c
+    amplitudes = (2.0 * u - 1.0).reshape(n_down, n_right, 3) * max_amplitude
     wave_sum = torch.einsum("hm,wn,mnc->hwc", down, right, amplitudes)
     change = radius * torch.tanh(wave_sum[mask.to(u.device)])
     return (original.to(u.device) + change).clamp(0.0, 1.0)
@@ -550,6 +564,7 @@ def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
     Returns:
         (k, 3) float32 with k <= count: fewer if the image has fewer colors.
     """
+    # The mass of a color is the square root of its weight.
     points, mass = _quantise_colors(image, weight)
     centers = points[_choose_first_centers(points, mass, count)]
     for _ in range(LLOYD_STEPS):
@@ -562,6 +577,7 @@ def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
         means = np.stack(sums, axis=1) / np.maximum(center_mass[:, None], 1e-12)
         # a center without colors stays where it is
         centers = np.where(center_mass[:, None] > 0.0, means, centers)
+    # by the masses of the last step, before the centers moved once more
     order = np.argsort(-center_mass, kind="stable")
     return torch.from_numpy(centers[order].clip(0.0, 1.0).astype(np.float32))
 
@@ -572,8 +588,8 @@ def _quantise_colors(
     """Return the different colors (N, 3) of an image, and their mass (N,).
 
     Colors that are equal after rounding to 5 bits a channel are averaged, by their
-    weights. The mass of such a mean is the square root of their total weight. With the
-    weight itself, all centers of the palette would be shades of the largest surface.
+    weights. The mass of such a mean is the square root of their total weight. (If it
+    were the weight itself, a large surface would get all centers of the palette.)
     Colors without weight are left out.
 
     Args:

@@ -156,10 +156,13 @@ class ThingsControl(Control):
         self._check_things_stand_free()
 
     def _find_moved_things(self) -> set[str]:
-        """Return the things with a searched parameter, or one that the user set."""
+        """Return the things with a searched parameter, or one that the user set.
+
+        A user sets "car.x" for one thing, or "x" for all of them.
+        """
         moved = set()
         for slot in self.parameter_slots:
-            thing, _, short_name = slot.parameter.name.rpartition(".")
+            thing, _, short_name = slot.parameter.name.rpartition(".")  # "car", "x"
             is_set = slot.parameter.name in self.specs or short_name in self.specs
             if slot.n_coordinates or is_set:
                 moved.add(thing)
@@ -196,24 +199,24 @@ class ThingsControl(Control):
                 yield replace(parameter, name=name), spec
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
-        """Return a parameter; x and y are searched within the object's size.
+        """Return a parameter; x and y are searched in a range that fits the object.
 
-        That is at most 2 metres.
+        It is 2 metres in each direction, or the object's size if that is smaller.
         """
         if parameter.name not in ("x", "y"):
             return parameter
-        # With 2 metres around a small object, things would stand beside its table.
+        # Things around a small object stand on a table with it, and should stay on it.
         object_size = self.scene.size_in_metres
-        reach = min(2.0, object_size)
+        reach = min(2.0, object_size)  # metres
         return replace(parameter, search=(-reach, reach))
 
     @property
     def refines(self) -> frozenset[str]:
-        """Scene inputs that this control only reads.
+        """Scene inputs of earlier controls that this control reads.
 
-        So it is evaluated after the controls that move an obstacle or deform a mesh. It
-        sets the poses of the things that it moves itself, but other controls may deform
-        them.
+        It changes none of them. They are listed here so that it is evaluated after the
+        controls that move an obstacle or deform a mesh. The poses of the things that it
+        moves are its own inputs, but other controls may deform these things.
         """
         fixed = [name for name in self.scene.things if name not in self._moved_things]
         poses = [f"{name}.to_world" for name in ("object", "camera", *fixed)]
@@ -237,20 +240,21 @@ class ThingsControl(Control):
         inputs = {}
         for name, stand in self._compute_stands(values, earlier_inputs).items():
             part = self.scene.meshes[name]
+            # the pose in the scene, and the point of the thing on the ground
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_find_foot(part)).to(base)
             pitch, roll = base.new_zeros(2)
             turn = geometry.make_euler_rotation(values[f"{name}.heading"], pitch, roll)
-            # () index of the option: 0 for "there", 1 for "away"
-            absence = values[f"{name}.presence"]
-            if bool(absence):
+            # () index of the option of "presence": 0 for "there", 1 for "away"
+            is_away = values[f"{name}.presence"]
+            if bool(is_away):
                 turn = ABSENT_SCALE * turn
             # without derivatives
             position = base.new_tensor([*stand.position, stand.height])
             absent_depth = base.new_tensor(
                 [0.0, 0.0, ABSENT_DEPTH / self.scene.size_in_metres]
             )
-            depth = absent_depth * absence
+            depth = absent_depth * is_away
             translation = position - depth - turn @ foot
             inputs[f"{name}.to_world"] = geometry.make_affine(turn, translation) @ base
         return inputs
@@ -275,8 +279,8 @@ class ThingsControl(Control):
     ) -> dict[str, Stand]:
         """Compute where the moved things stand, by name, without derivatives.
 
-        They are placed one after the other, and each that is present is an obstacle to
-        those after it.
+        They are placed one after the other, in the order of the scene, and each that is
+        present is an obstacle to those after it.
 
         Args:
             values: values of the control, such as "car.x" and "car.heading".
@@ -296,7 +300,8 @@ class ThingsControl(Control):
                 name, values, footprint, object_center, obstacles, solids
             )
             stands[name] = stand
-            is_present = float(values[f"{name}.presence"]) == 0.0  # 1 is absent
+            # index of the option: 0 for "there", 1 for "away"
+            is_present = float(values[f"{name}.presence"]) == 0.0
             if is_present:
                 obstacles.append(
                     parts.Footprint(outline, footprint.lower, footprint.upper)
@@ -310,8 +315,8 @@ class ThingsControl(Control):
 
         The first is that of the object, the second that of the camera, and the others
         are those of things that this control does not move. The camera's footprint is
-        an octagon, which keeps the view free. It reaches upwards from the camera by its
-        radius.
+        an octagon, so that nothing stands right in front of it. It reaches from the
+        camera's height upwards by its radius: a thing below the camera is allowed.
 
         Args:
             earlier_inputs: inputs of earlier controls, which may have moved object and
@@ -343,9 +348,10 @@ class ThingsControl(Control):
         ]
 
     def _read_numbers(self, name: str, values: Values) -> list[float]:
-        """Return x, y, heading and presence (1 if absent) of a thing.
+        """Return the values of a thing in the order of `parameters`.
 
-        They are in the order of `parameters`.
+        They are x, y, heading, and the index of the option of "presence": 0 for "there",
+        1 for "away".
         """
         return [
             float(values[f"{name}.{parameter.name}"].detach())
@@ -428,9 +434,9 @@ def _find_free_shift(
     """Find how far a thing has to be shifted along a direction to stand free.
 
     If it overlaps with solids (e.g. walls) at its requested position, it is first moved
-    backwards, towards the object, out of all these. There it may overlap with others.
-    From there it is moved forwards past each solid or obstacle that it overlaps with, in
-    their order along the direction.
+    backwards, towards the object, to just before the first of these. If it overlaps with
+    something there, it is moved forwards past each solid or obstacle that it overlaps
+    with, in their order along the direction.
 
     Args:
         footprint: footprint of the thing at the requested position.

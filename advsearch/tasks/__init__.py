@@ -175,10 +175,10 @@ def make_task(task: AnyTask) -> Task:
     """Create a task from any form that names one.
 
     Args:
-        task: a name; a mapping with a `name` and options, which are the fields of the
-            task's dataclass; a task, which is returned; or a function
-            (`make_function_task`). For a joint task, "detection+depth", the options of
-            each stand under its name.
+        task: a name; a mapping with a `name` (by default "classification") and options,
+            which are the fields of the task's dataclass; a task, which is returned; or
+            a function (`make_function_task`). For a joint task, "detection+depth", the
+            options of each stand under its name.
 
     Raises:
         UnknownNameError: there is no such task, or it has no such option.
@@ -204,7 +204,7 @@ def make_task(task: AnyTask) -> Task:
     task_class: Callable[..., Any] = TASKS[name]
     created: Any = task_class(**options)
     if created.judges_rig:
-        # Its option `task` names the task of each image.
+        # A rig is several cameras. Its option `task` names the task of each image.
         created = replace(created, image_task=make_task(created.task))
     result: Task = created
     return result

@@ -114,8 +114,13 @@ class FreeAnswer(Task):
     ) -> list[AnswerWithLogits | AnswersWithoutLogits]:
         """Check what a network returned: a list with an answer for each image.
 
-        An answer is a mapping with its "text", the "logits" of its tokens, and a
-        function "begins" from a word to the tokens that may begin it; or with "texts".
+        An answer is a mapping. With logits, it has its "text", the "logits" of its
+        tokens, and a function "begins" from a word to the tokens that may begin it.
+        Without logits, it has one or several "texts".
+
+        Args:
+            returned: what the network returned.
+            count: number of images, which is not checked here.
 
         Raises:
             ValueError: the network returned something else.
@@ -159,9 +164,10 @@ class FreeAnswer(Task):
         """Compute the loss of each answer, (N,); over 0 for a wrong one.
 
         Without logits it is 1 - 2 s, where s is the fraction of right texts about the
-        image. With logits, let p = sigmoid(m), where m is by how much the best token
-        that begins a right word exceeds all other tokens (`_compute_token_margin`). The
-        loss is log(1 - p) for a right answer and -log(p) for a wrong one.
+        image. With logits, the text decides the sign of the loss, and the tokens its
+        size: it is log(1 - p) for a right answer and -log(p) for a wrong one. Here p is
+        sigmoid(m), and m is by how much the best token that begins a right word exceeds
+        all other tokens (`_compute_token_margin`).
         """
         losses = []
         for answer in output:
@@ -172,8 +178,7 @@ class FreeAnswer(Task):
                 losses.append(1.0 - 2.0 * torch.tensor(is_right).mean())
                 continue
             margin = _compute_token_margin(answer["logits"], answer["begins"], truth)
-            # With p = sigmoid(margin), log(1 - p) is negative and -log(p) is positive:
-            # the text decides the sign of the loss, and the margin only its size.
+            # p = sigmoid(margin) is between 0 and 1: log(1 - p) < 0, and -log(p) > 0
             if has_word(answer["text"], truth):
                 loss = functional.logsigmoid(-margin)  # log(1 - p)
             else:
@@ -216,8 +221,9 @@ class FreeAnswer(Task):
         for answer, margin in zip(output, margins, strict=True):
             texts = _list_texts(answer)
             is_right = margin >= 0.0
-            compared = [text for text in texts if has_word(text, truth) == is_right]
-            [(most_frequent, _)] = Counter(compared or texts).most_common(1)
+            # those that agree with the judgement; if none does, all texts count
+            agreeing = [text for text in texts if has_word(text, truth) == is_right]
+            [(most_frequent, _)] = Counter(agreeing or texts).most_common(1)
             payload: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
             results.append((_make_prediction(most_frequent), payload))
         return results
@@ -234,11 +240,11 @@ def _is_answer(value: Any) -> bool:
 def _compute_token_margin(
     logits: Tensor, begins: Callable[[str], Sequence[int]], words: Words
 ) -> Tensor:
-    """Compute how near an answer is to beginning one of the words.
+    """Compute how near an answer is to a token that begins one of the words.
 
     Args:
         logits: logits of all tokens at each step of the answer, (T, tokens).
-        begins: function from a word to the tokens that may begin it.
+        begins: function that returns the tokens that may begin a word.
         words: at least one word.
 
     Returns:
@@ -255,8 +261,10 @@ def _compute_token_margin(
             "label: the model has no token that begins one of "
             f"{', '.join(words)}; state other words"
         )
+    # mask of the tokens that begin one of the words
     is_begin = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
     is_begin[begin_tokens] = True
+    # (T,) each
     begin_logit = logits.masked_fill(~is_begin, -torch.inf).amax(dim=1)
     other_logit = logits.masked_fill(is_begin, -torch.inf).amax(dim=1)
     return (begin_logit - other_logit).max()

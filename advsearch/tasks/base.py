@@ -325,7 +325,7 @@ class Task(ABC):
         """Make methods of a user's class get copies of their arguments.
 
         So a method may change its arguments in place without changing the search.
-        Classes of this package are not changed (`copy_method_arguments`).
+        `copy_method_arguments` leaves classes of this package as they are.
         """
         super().__init_subclass__(**keywords)
         # the methods that get outputs or the truth
@@ -343,7 +343,7 @@ class Task(ABC):
             Task.as_logits,
         )
         method_names = [method.__name__ for method in receive_copies]
-        all_arguments = slice(None)
+        all_arguments = slice(None)  # which arguments are copied
         copy_method_arguments(cls, **dict.fromkeys(method_names, all_arguments))
 
     def check_numbers(
@@ -416,10 +416,10 @@ class Task(ABC):
 
     @property
     def calibrates(self) -> bool:
-        """Whether the task needs a calibration before it can judge outputs.
+        """Whether the task has to be calibrated before it can judge outputs.
 
-        That is a call of `after_calibration` with the output for a clean image of the
-        scene.
+        Then `after_calibration` is called with the output for a clean image of the
+        scene, and returns the calibrated task.
         """
         return False
 
@@ -461,10 +461,13 @@ class Task(ABC):
     ) -> TaskType:
         """Return the task for one model and a goal of the search.
 
+        Here, the task does not depend on the model. Subclasses override this if theirs
+        does, or if they allow a target.
+
         Args:
             model: model whose outputs the task will evaluate.
             target: label that the model should predict; None for any wrong one.
-            minimise: whether a right prediction is sought.
+            minimise: whether the search seeks a right prediction, not a wrong one.
 
         Raises:
             InputError: there is no such target, or the task has none.
@@ -486,7 +489,7 @@ class Task(ABC):
         Raises:
             InputError: as for `truth`.
         """
-        # A truth that depends on the configuration needs a rendered image.
+        # If the truth varies with the configuration, it needs a rendered image.
         if not self.varies:
             self.truth(facts)  # raises if there is none
 
@@ -606,7 +609,8 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
 
     Of equally frequent predictions it is the one with the lowest class index. Score,
     margin and probability are means over the judgements with this prediction. Whether it
-    is right, and the payload, are those of the first of these judgements.
+    is right, and the payload, can't be averaged: they are those of the first of these
+    judgements.
 
     Args:
         judgements: judgements of several images of the same configuration, at least
@@ -618,7 +622,9 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
     def sort_key(candidate: tuple[str, int | None]) -> tuple[int, int]:
         """Return a key by which the most frequent comes first, then a low index."""
         _, class_index = candidate
-        if class_index is None:  # a task without classes
+        if (
+            class_index is None
+        ):  # without classes, equally frequent ones keep their order
             class_index = 0
         return -counts[candidate], class_index
 

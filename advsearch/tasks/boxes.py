@@ -87,8 +87,9 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     """Apply greedy non-maximum suppression to the boxes of one class.
 
     The greedy method takes the best box, removes the boxes that it overlaps, and
-    repeats this. Here a round takes all undecided boxes that no better undecided box
-    overlaps, which has the same result in fewer steps.
+    repeats this with the remaining ones. Here each round takes all boxes at once that no
+    better remaining box overlaps. The greedy method would take these boxes, too: nothing
+    that could remove them is left. So the result is the same, in fewer steps.
 
     Args:
         boxes: (D, 4).
@@ -100,7 +101,7 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     """
     order = scores.argsort(descending=True)[:MAX_SUPPRESSED]
     sorted_boxes = boxes[order]
-    # 256 rows at a time, to bound the memory of the intermediate results
+    # (256, D) each: 256 boxes against all, to bound the memory of intermediate results
     overlap_chunks = [
         compute_iou(sorted_boxes, chunk[:, None]) >= iou
         for chunk in sorted_boxes.split(256)
@@ -267,8 +268,8 @@ def are_counted_boxes(detections: Detections) -> Tensor:
 def get_possible_scores(detections: Detections) -> Tensor:
     """Return the numbers of each box that are or may be scores, detached, (D, K).
 
-    K is the number of classes, 1 for boxes with labels, or 2 if it is unknown which of
-    two numbers is the score.
+    These are K = classes scores; for boxes with labels K = 1 score; or if it is unknown
+    which of two numbers ("score_or_label") is the score, both of them, K = 2.
     """
     if "score_or_label" in detections:
         values = detections["score_or_label"].detach()
@@ -346,11 +347,12 @@ class BoxFormat:
         center = (fractions[:, :2] + fractions[:, 2:]) / 2.0
         box_size = fractions[:, 2:] - fractions[:, :2]
         size_in_pixels = box_size.abs() * box_size.new_tensor([width, height])
-        # A comparison with NaN is false: a box of NaN has every fault.
+        # These are false for NaN, and negated below: a box of NaN has every fault.
         is_near_image = (center >= -MAX_CENTER_OVERSHOOT) & (
             center <= 1.0 + MAX_CENTER_OVERSHOOT
         )
         has_positive_size = (box_size > 0.0).all(dim=1)
+        # A thin object may be narrower than a pixel in one direction.
         has_a_pixel = (size_in_pixels > 1.0).any(dim=1)
         return {
             "lie far outside the picture": ~is_near_image.all(dim=1),
@@ -376,6 +378,7 @@ class BoxFormat:
         ):
             return ""
         fraction_by_fault = {}
+        # by phrase, such as "are smaller than a pixel"
         for fault, is_faulty in self.find_faults(boxes).items():
             fraction_without = float((~is_faulty).float().mean())
             fraction_by_fault[fault] = 1.0 - fraction_without
@@ -393,8 +396,8 @@ class BoxFormat:
             BoxFormat(form, unit, self.input_size)
             for unit in UNITS
             for form in FORMS
-            # A box with swapped axes is as plausible as before, so that "yxyx" can't be
-            # told from "xyxy".
+            # With swapped axes, a plausible box is still plausible. So "yxyx" can't be
+            # distinguished from "xyxy", and is not suggested.
             if form != "yxyx"
         ]
         plausible = [
@@ -441,7 +444,8 @@ class BoxFormat:
         """
         if not len(boxes):
             return ""
-        # This format comes first, since `max` returns the first of several best ones.
+        # `max` returns the first of several best formats, so this one is the first. (It
+        # is among the others again, as an equal key.)
         candidates = [self]
         candidates += [
             BoxFormat(form, unit, self.input_size) for unit in UNITS for form in FORMS
@@ -466,9 +470,11 @@ def select_best_boxes(images: Sequence[Detections]) -> Tensor:
     for detections in images:
         rows = are_counted_boxes(detections).nonzero().flatten()
         numbers = get_possible_scores(detections)
-        # Without classes there are no scores, and `amax` would fail: the sum is 0.
+        # An output without classes has no scores, and `amax` of nothing fails.
         has_scores = numbers.shape[1] > 0
-        best_score = numbers.amax(dim=1) if has_scores else numbers.sum(dim=1)
+        best_score = numbers.new_zeros(len(numbers))
+        if has_scores:
+            best_score = numbers.amax(dim=1)
         by_score = best_score[rows].argsort(descending=True)
         best_rows = rows[by_score[:MAX_FORMAT_BOXES]]
         boxes_of_images.append(detections["boxes"].detach()[best_rows])
@@ -479,7 +485,10 @@ def infer_unit(boxes: Tensor) -> str:
     """Infer the unit of boxes (D, 4) in any format, one of `UNITS`; "" if unclear."""
     if not len(boxes):
         return ""
+    # The largest number of a box is about the same in all formats: a corner, or a center.
     typical_coordinate = float(boxes.abs().amax(dim=1).median())
     if typical_coordinate <= MAX_FRACTION:
         return "fractions"
-    return "pixels" if typical_coordinate >= MIN_PIXELS else ""
+    if typical_coordinate >= MIN_PIXELS:
+        return "pixels"
+    return ""

@@ -89,7 +89,7 @@ class ClassTask(Task):
         Raises:
             InputError: it was loaded for a task of the other kind.
         """
-        # A model that was loaded for another task has a function that reads its output.
+        # Models that are loaded for other tasks have a function that reads their output.
         returns_logits = model.read is None
         if returns_logits == self.reads_logits:
             return
@@ -216,8 +216,8 @@ class Classification(ClassTask):
     def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
         """Return logits in which classes such as "background" can't be predicted.
 
-        Their logits become minus infinity, unless such a class is right, or no other
-        class could be wrong.
+        Their logits become minus infinity. Such a class is not excluded if it is right,
+        and none is if only classes like this could be wrong.
 
         Args:
             output: logits (N, classes).
@@ -256,7 +256,8 @@ class Classification(ClassTask):
         A row with NaN has the only prediction `NOT_A_NUMBER`.
         """
         probabilities = logits.detach().softmax(dim=1)
-        # Of several largest values `argmax` returns the first, but `topk` any of them.
+        # For a single class `argmax` is used: of several largest values it returns the
+        # first, but `topk` any of them.
         if count == 1:
             top_classes = probabilities.argmax(dim=1, keepdim=True)
             top_probabilities = probabilities.gather(1, top_classes)
@@ -276,8 +277,8 @@ class Classification(ClassTask):
                 for class_id, probability in zip(
                     classes, class_probabilities, strict=True
                 )
-                # Classes that `as_logits` excludes have a probability of 0. A single
-                # prediction is always returned.
+                # Classes that `as_logits` excludes have a probability of 0, and are left
+                # out. But a single prediction is always returned.
                 if probability > 0.0 or count == 1
             )
             predictions_of_images.append(predictions)
@@ -294,17 +295,21 @@ class Classification(ClassTask):
             truth: indices of the right classes.
         """
         logits = self.as_logits(output, truth)
+        # true for a subclass that overrides it, whose methods are called
         overrides_loss = type(self).loss is not Classification.loss
         if overrides_loss:
             losses = self.loss(output, truth)
         else:
+            # over 0 for a wrong prediction, as losses are
             losses = compute_misclassification_margin(logits, truth)
         overrides_score = type(self).score is not Classification.score
         if overrides_score or self.target is not None:
             scores = self.score(output, truth)
         else:  # as `Task.score`
             scores = -losses if self.minimise else losses
-        margins = 0.0 - losses  # not `-losses`, which would be -0.0 for 0
+        # A judgement's margin is over 0 for a right prediction. `-losses` would be -0.0
+        # for 0.
+        margins = 0.0 - losses
         # one prediction for each image
         top_predictions = [
             prediction for (prediction,) in self._rank_classes(logits, count=1)

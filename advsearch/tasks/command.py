@@ -99,9 +99,9 @@ class Command(Task):
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
         """Wrap a policy so that it gets the state of the robot together with images.
 
-        Without a state the network is returned unchanged, with one exception. A policy
-        of LeRobot has a method `select_action`, which only `WithState` calls: so it is
-        wrapped with an empty state.
+        Without a state, `self.state` is empty and the network is returned unchanged. A
+        policy of LeRobot is an exception: it has a method `select_action`, which only
+        `WithState` calls, so that it is wrapped with the empty state.
         """
         if isinstance(network, models.AllAtOnce):
             # `AllAtOnce` passes the images of all cameras to a policy. The policy inside
@@ -112,7 +112,8 @@ class Command(Task):
         if isinstance(network, models.WithState):
             # It was wrapped for another task, whose state is replaced.
             policy = network.network
-        if self.state or hasattr(policy, "select_action"):
+        is_lerobot_policy = hasattr(policy, "select_action")
+        if self.state or is_lerobot_policy:
             return models.WithState(policy, self.state)
         return network
 
@@ -175,11 +176,12 @@ class Command(Task):
             model: the policy, loaded for this task.
             target: an action, ``0.1,-0.3``, or some of its elements by name, ``yaw
                 rate=-0.3``; None for any action outside of the envelope.
-            minimise: not possible, since the clean action is right already.
+            minimise: must be False: a right action can't be sought, since the clean
+                action is right already.
 
         Raises:
             InputError: there is no envelope, the model was loaded for another task or
-                with names of classes, the target is no action, or `minimise` is set.
+                has names of classes, the target is no action, or `minimise` is set.
         """
         if model.read is None:  # its outputs are logits, as those of a classifier
             raise InputError(
@@ -202,9 +204,8 @@ class Command(Task):
                 "minimise: the clean action is already within its envelope; leave it "
                 "out"
             )
-        return replace(
-            self, target=None if target is None else self._parse_target(target)
-        )
+        parsed_target = None if target is None else self._parse_target(target)
+        return replace(self, target=parsed_target)
 
     def _parse_target(self, text: str) -> Tensor:
         """Parse a target action to numbers, (A,).
@@ -268,9 +269,9 @@ class Command(Task):
                 f"target: expected an action of {len(clean_action)} elements, got "
                 f"{len(self.target)}"
             )
-        # The distance in envelopes; elements that the target does not state count 0. If it
-        # is at most 2, both envelopes overlap, and an action in both of them would be
-        # right and a success as well.
+        # The loss is the distance in envelopes, minus 1. (Elements that the target does
+        # not state are at distance 0.) If the distance is at most 2, both envelopes
+        # overlap, and an action in both of them would be right and a success as well.
         distance = float(self.loss(clean_action[None], self.target)) + 1.0
         if distance <= 2.0:
             raise InputError(
@@ -366,6 +367,7 @@ class Command(Task):
         results: list[tasks.PredictionWithPayload] = []
         reaches_target = [False] * len(output)
         if self.target is not None:
+            # a loss of at most 0: within the envelope of the target
             reaches_target = (self.loss(output, self.target) <= 0.0).tolist()
         deviations = self._compute_deviation(output, truth)
         clean_action = truth.tolist()
@@ -382,7 +384,7 @@ class Command(Task):
             payload: tasks.JsonValue = {
                 "action": action,
                 "clean": clean_action,
-                "envelopes": 1.0 - margin,
+                "envelopes": 1.0 - margin,  # the largest deviation
                 "text": f"{self._format_action(action)}, clean {clean_text}",
             }
             results.append((tasks.Prediction(label), payload))

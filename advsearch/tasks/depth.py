@@ -195,10 +195,10 @@ class Depth(Task):
         """Check that all options are within their limits."""
         self.check_numbers(
             lambda value: 0.0 < value < MAX_FACTOR,
-            "a number over 0, under 100",
+            f"a number over 0, under {MAX_FACTOR:g}",
             "tolerance",
         )
-        # The lower bound is a little below 0, because 0 means that no size is set.
+        # 0 means that no size is set. It is allowed here, but not named in the message.
         self.check_numbers(
             lambda value: -1e-9 < value < 1e6, "a number over 0, under 1e+06", "size"
         )
@@ -315,7 +315,8 @@ class Depth(Task):
                 "size: it predicts metres, and the size of the object is unknown; "
                 "set its longest side in metres, such as `size=0.1`"
             )
-        # If the object is out of view, every prediction is right.
+        # Nothing is missing if the pixels outside of the object determine the scale; or if
+        # the object is out of view, when every prediction is right.
         if truth is None or not truth.is_visible or truth.determines_scale:
             return ""
         return (
@@ -362,10 +363,11 @@ class Depth(Task):
         """Return the pixels in which the object is visible, and all distances.
 
         Raises:
-            InputError: the lens sees so far from its axis that z-depth is no distance.
+            InputError: the lens sees so far from its axis that z-depth, the distance
+                along the axis, says little about the distance.
         """
-        # z-depth is the distance times the cosine of the angle to the camera's axis.
-        # Where both are infinite, the comparison is false.
+        # z-depth is the distance times the cosine of the angle to the camera's axis. The
+        # comparison is false where nothing is seen, since both are infinite there.
         is_far_from_axis = facts.z_depth < MIN_AXIS_COSINE * facts.depth
         if bool(is_far_from_axis.any()):
             raise InputError(
@@ -396,11 +398,11 @@ class Depth(Task):
     def score(self, output: Sequence[DepthMap], truth: DepthTruth) -> Tensor:
         """Compute how near each output is to what is sought, (N,), over 0 for a success.
 
-        For "nearer" and "farther" it is the signed mean over pixels of log(predicted /
-        true), minus the tolerance. For "gone" it is the smaller of two numbers: the
-        loss, and by how much the remaining fraction of the object's relief
-        (`_compute_relief_fraction`) is below a half. So an object counts as gone if
-        less than half of its relief is left.
+        For "farther" it is the mean over pixels of log(predicted / true), minus the
+        tolerance; for "nearer" minus the mean, minus the tolerance. For "gone" it is the
+        smaller of two numbers: the loss, and by how much the remaining fraction of the
+        object's relief (`_compute_relief_fraction`) is below a half. So an object counts
+        as gone if its distance is wrong and less than half of its relief is left.
         """
         if self.minimise or not self.seek:
             return super().score(output, truth)
@@ -459,14 +461,13 @@ class Depth(Task):
         predicted, is_inverse = self._align_to_truth(depth_map, truth)
         mask = truth.mask.to(predicted.device)
         z = truth.z_depth.to(predicted.device)
-        # of predicted to true, both z-depth or both its inverse
         if is_inverse:
-            # divided by the true inverse, 1 / z
-            ratio = predicted[mask] * z[mask]
+            ratio = predicted[mask] * z[mask]  # inverse distances: predicted over 1 / z
         else:
-            ratio = predicted[mask] / z[mask]
+            ratio = predicted[mask] / z[mask]  # distances
         # Clamped first, since a prediction may be 0 or negative.
         log_ratio = ratio.clamp(1.0 / MAX_FACTOR, MAX_FACTOR).log()
+        # of distances in both cases
         log_factors = -log_ratio if is_inverse else log_ratio
         # 0, or NaN if the map has a NaN anywhere, also outside the object
         nan_or_zero = predicted.sum() * 0.0
@@ -495,8 +496,9 @@ class Depth(Task):
         if kind == METRIC:
             scale = 1.0
             if self.size:
-                # The option `size` is the real size of the object. The scene has it at
-                # another size, in metres or, if that is unknown, as 1 object size.
+                # The model predicts metres for an object of the real size, the option
+                # `size`. They are converted to the units of the scene, in which the
+                # object has this size: in metres, or 1 object size if that is unknown.
                 scene_size = truth.size_in_metres or 1.0
                 scale = scene_size / self.size
             return values * scale, False
@@ -512,10 +514,11 @@ class Depth(Task):
         """Compute how much of the object's relief is left in a prediction, ().
 
         The relief is how far the object stands out from what is behind it: the disparity
-        of each of its pixels minus that of the background there. The fraction is the
-        least-squares coefficient of the predicted relief on the true one: 1 if all
-        distances are true, 0 if the object is as far as the background. It is 1 as well
-        if the background is unknown, or the true relief is negligible.
+        of each of its pixels minus that of the background there. The predicted relief is
+        fitted by a multiple of the true one (least squares), and the fraction is this
+        multiple: 1 if all distances are true, 0 if the object is as far as the
+        background. It is 1 as well if the background is unknown, or the true relief is
+        negligible.
 
         Args:
             log_factors: log(predicted / true) of the object's pixels, (P,).
@@ -529,7 +532,7 @@ class Depth(Task):
         squared_relief = true_relief.square().sum()
         is_negligible = float(squared_relief) <= 1e-6 * float(disparity.square().sum())
         if is_negligible:
-            # The product keeps the value attached to the graph.
+            # A constant 1, but computed from the factors, so that autograd can go on.
             return log_factors.sum() * 0.0 + 1.0
         # A predicted distance is the true one times exp(log_factors).
         predicted_disparity = disparity * (-log_factors).exp()
@@ -578,6 +581,7 @@ class Depth(Task):
             relief = float(self._compute_relief_fraction(log_factors, truth))
             payload: dict[str, tasks.JsonValue] = {
                 "distance": round(distance, 4),
+                # the predicted distance
                 "judged": round(distance * math.exp(mean_log_factor), 4),
                 "factor": round(math.exp(float(log_factors.abs().mean())), 4),
                 "relief": round(relief, 4),
@@ -628,9 +632,9 @@ class Depth(Task):
         for depth_map in output:
             marks = [true_mark]
             kind = self._get_kind(depth_map)
-            # An option must not be missing. A map of relative values is drawn even if
-            # the pixels outside the object do not determine scale and shift: that is
-            # only checked with the truth, which is left out.
+            # A map whose kind or size is unknown is not drawn. The truth is needed for the
+            # size of a map in metres only. Without the truth it is not checked whether
+            # scale and shift are determined: maps of relative values are always drawn.
             truth_with_size = truth if kind == METRIC else None
             missing = self._describe_missing_option(kind, truth_with_size)
             if truth.is_visible and not missing:
@@ -641,9 +645,10 @@ class Depth(Task):
     def _make_predicted_mark(
         self, depth_map: DepthMap, truth: DepthTruth
     ) -> tasks.Mark:
-        """Return the predicted disparity, with the object's pixels that are right."""
+        """Return the predicted disparity, with a mask of the object's right pixels."""
+        # (P,) log(predicted / true) of the object's pixels
         log_factors = self._compute_log_factors(depth_map, truth).detach()
-        is_right_pixel = log_factors.abs() <= self._log_limit  # (P,) object's pixels
+        is_right_pixel = log_factors.abs() <= self._log_limit
         right_mask = torch.zeros_like(truth.mask)
         right_mask[truth.mask] = is_right_pixel.to(right_mask.device)
         predicted, is_inverse = self._align_to_truth(depth_map, truth)
@@ -669,11 +674,11 @@ def _find_maps(returned: Any) -> tuple[str, Any]:
         if kind:
             return kind, returned[kind]
         return "", returned.get("predicted_depth", returned.get("depth"))
-    if hasattr(returned, "predicted_depth"):
+    if hasattr(returned, "predicted_depth"):  # an output of transformers
         return "", returned.predicted_depth
     if isinstance(returned, (list, tuple)) and returned:
         first = returned[0]
-        # a detector's output begins with boxes, which are no maps
+        # A tuple that begins with boxes is that of a detector, and has no maps.
         is_boxes = isinstance(first, Tensor) and first.shape[-1:] == (4,)
         if is_boxes and len(returned) > 1:
             return "", None

@@ -201,12 +201,14 @@ class EnsembleTask(JointTask):
             InputError: the model is not from `join_models`, or has not one model per
                 task.
         """
-        models = model.module.models if isinstance(model.module, Ensemble) else ()
+        is_ensemble = isinstance(model.module, Ensemble)
+        models = model.module.models if is_ensemble else ()
         if len(models) != len(self.parts):
+            n_models = len(models) if is_ensemble else 1
             raise InputError(
-                f"model: expected {len(self.parts)}, one for each task, "
-                f"got {len(models) or 1}"
+                f"model: expected {len(self.parts)}, one for each task, got {n_models}"
             )
+        # `parts` are the tasks as the user set them, `tasks` those for their models.
         tasks = tuple(
             part.on(
                 network,
@@ -315,9 +317,11 @@ class EnsembleTask(JointTask):
         """Join the models' judgements of one image, in the order of the models.
 
         The margin and the outcome are those of the model with the smallest margin. The
-        payload has the payloads of all models by name, and the outcome. If a model
-        returned NaN, the joint margin is NaN too, and there is no payload.
+        payload has the payloads of all models by name, and the outcome; it is None if no
+        model has a payload. If a model returned NaN, the joint margin is NaN too, and
+        there is no payload.
         """
+        # Any judgement if a margin is NaN: then `from_margin` stores no payload below.
         worst = min(judgements, key=lambda judgement: judgement.margin)
         margin = worst.margin
         if any(judgement.is_non_finite for judgement in judgements):
@@ -336,9 +340,9 @@ class EnsembleTask(JointTask):
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
         """Return the marks to draw on each image.
 
-        They are the boxes and masks of the truth, as the first model's task marks it,
-        the true maps of all models, and the prediction of each model with its name
-        before the text.
+        They are the boxes and masks of the truth, which are the same for all models; the
+        true maps of each model; and the prediction of each model, with the name of the
+        model before its text.
         """
         marks_of_images: list[list[Mark]] = [[] for _ in output]
         for index, (task, model_output, task_truth) in enumerate(
@@ -347,11 +351,12 @@ class EnsembleTask(JointTask):
             model = self.models[index]
             model_marks = task.marks(model_output, task_truth)
             for image_marks, marks in zip(marks_of_images, model_marks, strict=True):
-                # boxes and masks of the truth are the same for all models
+                # Boxes and masks of the truth are taken from the first model only.
+                is_first_model = index == 0
                 image_marks += [
                     mark
                     for mark in marks
-                    if mark.true and (index == 0 or mark.map is not None)
+                    if mark.true and (is_first_model or mark.map is not None)
                 ]
                 image_marks += [
                     replace(mark, text=f"{model.name}: {mark.text}")
@@ -529,8 +534,8 @@ def make_each_thing_task(task: Task) -> EachThingTask:
             f"judge: all is for {' and '.join(PER_THING_TASKS)}, got task {task.name}; "
             "judge one thing, by its name"
         )
-    # Name and objective are attributes of a class, so a class is made for this task. The
-    # goal of the search is that of the task.
+    # `name` and `objective` are attributes of a class, and differ from task to task. So a
+    # subclass is made for this task.
     attributes = {"name": task.name, "objective": task.objective}
     task_class: Any = type("EachThing", (EachThingTask,), attributes)
     result: EachThingTask = task_class(

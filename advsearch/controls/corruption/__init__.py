@@ -65,14 +65,15 @@ def saturate(image: Tensor, level: Tensor, seed: int) -> Tensor:
 def pixelate(image: Tensor, severity: int) -> Tensor:
     """Average an image (H, W, 3) over square cells; linear in the image.
 
-    At the reference size a cell is 1.7 to 4 pixels wide, depending on the severity. In
-    a larger image a cell is larger in proportion; in a smaller one it is not smaller.
+    At the reference size and below, a cell is 1.7 to 4 pixels wide, depending on the
+    severity. In a larger image a cell is larger in proportion to the image.
     """
     height, width = image.shape[:2]
-    fraction = PIXELATE[severity - 1] / max(
-        1.0, min(height, width) / filters.REFERENCE_SIDE
-    )
-    cells = (max(1, int(height * fraction)), max(1, int(width * fraction)))
+    enlargement = max(1.0, min(height, width) / filters.REFERENCE_SIDE)
+    cells_per_pixel = PIXELATE[severity - 1] / enlargement
+    n_rows = max(1, int(height * cells_per_pixel))
+    n_columns = max(1, int(width * cells_per_pixel))
+    cells = (n_rows, n_columns)
     averaged = F.interpolate(images.to_planes(image), cells, mode="area")
     return images.to_image(
         F.interpolate(averaged, (height, width), mode="nearest-exact")
@@ -214,6 +215,8 @@ def apply_corruption(
         (H, W, 3) sRGB in [0, 1]; differentiable in the image and the severity, see
         `docs/controls/corruption.md`.
     """
+    # Each corruption is in one of three tables: defined for integer severities only, for
+    # all severities from 0, or for all from 1.
     if name in STEPPED_CORRUPTIONS:
         return _apply_stepped(image, STEPPED_CORRUPTIONS[name], severity)
     if name in CONTINUOUS_FROM_ZERO:
@@ -241,12 +244,17 @@ def _apply_stepped(
         severity: () in [0, 5]; at 0 the image is unchanged.
     """
     applied_severity = round_severity(severity)
-    result = apply_at(image, applied_severity) if applied_severity else image
+    result = image
+    if applied_severity > 0:
+        result = apply_at(image, applied_severity)
     if severity.requires_grad:
+        # The interpolation is between `below` and `below + 1`, which must exist.
         below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
-        low = apply_at(image, below).detach() if below else image.detach()
+        low = image.detach()
+        if below > 0:
+            low = apply_at(image, below).detach()
         high = apply_at(image, below + 1).detach()
-        # the added term is 0, but has the derivative
+        # The added term is 0, but its derivative is not.
         result = result + (severity - severity.detach()) * (high - low)
     return result.clamp(0.0, 1.0)
 

@@ -68,10 +68,9 @@ def interpolate_severity(
 
     Args:
         severity: () in [1, 5]; the result is differentiable in it, and on its device.
-            Severities below 1 have no result.
         make_at_severity: returns a tensor for an integer severity.
     """
-    # For the largest severity it is 4 with the fraction 1, as there is none above 5.
+    # The severity 5 is 4 plus a fraction of 1, since there is none above 5.
     below = min(int(severity.detach()), MAX_SEVERITY - 1)
     fraction = severity - below
     # At an integer severity the upper result has no weight; computing it takes time.
@@ -117,30 +116,31 @@ def blur_along_line(
 ) -> Tensor:
     """Blur an image along a line, as motion does.
 
-    A pixel becomes the weighted mean of the pixels on one side of it. Weights are a
-    Gaussian of the distance, cut off at twice the radius. Distances are rounded to whole
-    pixels, but weights are continuous, so that the result is differentiable in radius
-    and sigma.
+    A pixel becomes the weighted mean of itself and the pixels on one side of it. Weights
+    are a Gaussian of the distance, and 0 from the distance 2 radius + 1. Distances are
+    rounded to whole pixels, but weights are continuous, so that the result is
+    differentiable in radius and sigma.
 
     Args:
         image: (H, W, C).
-        radius: () half of the largest distance, reference pixels.
+        radius: () the kernel has 2 radius + 1 reference pixels, as many as a kernel that
+            reaches as far to both sides.
         sigma: () standard deviation, reference pixels.
         angle: angle of the line, radians; 0 is to the right, and pi / 2 down.
         step: pixels of this image for a reference pixel.
     """
-    # The kernel has 2 radius + 1 pixels, as one with the radius on both sides has.
     kernel_length = 2.0 * radius + 1.0
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
     # (count,) distance of each weight from the pixel, in reference pixels
     distance = torch.arange(count, device=image.device) / step
-    # falls from 1 to 0 over one pixel: differentiable in the radius
+    # falls from 1 to 0 over the last pixel: differentiable in the radius
     cut_off = (kernel_length - distance).clamp(0.0, 1.0)
     weights = torch.exp(-0.5 * (distance / sigma) ** 2) * cut_off
     weights = weights / weights.sum()
     height, width = image.shape[:2]
-    # enough on each side for lines in any direction
-    padded = F.pad(images.to_planes(image), (count,) * 4, mode="replicate")
+    # enough on all four sides for lines in any direction
+    padding = (count, count, count, count)
+    padded = F.pad(images.to_planes(image), padding, mode="replicate")
     total = torch.zeros_like(image)
     for index, weight in enumerate(weights):
         top = count + round(index * math.sin(angle))
@@ -185,17 +185,17 @@ def speckle_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
 def shot_noise(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Replace the image by photon counts: Poisson numbers with the image as their mean.
 
-    Counts have no derivative. So the noise is written as z standard deviations, where z
-    is treated as a constant. The derivative is then that of the mean and of the
-    standard deviation.
+    Random counts have no derivative. So the noise is expressed as z standard deviations,
+    where z is a constant for the derivative. The derivative is then that of the mean
+    and of the standard deviation.
 
     Args:
         image: (H, W, 3) in [0, 1].
         severity: () in [1, 5]; larger ones have fewer photons.
         seed: chooses the noise.
     """
-    # photons in a white pixel; `quantile` (H, W, 3) is uniform
-    (photons,) = interpolate_table(SHOT, severity)
+    (photons,) = interpolate_table(SHOT, severity)  # in a white pixel
+    # (H, W, 3), uniform; `sample_poisson` returns these quantiles of the distributions
     quantile = _draw_noise(image, seed, "shot noise", normal=False)
     with torch.no_grad():
         noisy = sample_poisson(image * photons, quantile) / photons
@@ -313,8 +313,9 @@ def _convolve(image: Tensor, kernel: Tensor, reach: int) -> Tensor:
     """
     height, width = image.shape[:2]
     padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
-    # The padded image has `reach` more pixels on each side than the image, and the full
-    # convolution another `reach`. So the result begins at 2 * reach.
+    # The full convolution is larger than the padded image by `reach` on each side. A
+    # transform of that size does not wrap around. The padded image is itself larger than
+    # the image by `reach` on each side, so that the result begins at 2 * reach.
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
     convolved = torch.fft.irfft2(product, s=size)
@@ -395,9 +396,9 @@ def _compute_shifts(origin: Tensor, columns: int) -> Tensor:
 def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tensor:
     """Make the shift from each pixel to the pixel that frosted glass shows there.
 
-    Each pixel takes over the content of a random neighbor, one after the other from the
-    bottom right. The neighbor may have taken over other content before, so that a pixel
-    may come from farther away than one step.
+    One after the other, from the bottom right, each pixel takes over what a random
+    neighbor shows. If the neighbor has itself taken over the content of a third pixel
+    before, the pixel shows the third one. So shifts may be longer than `reach`.
 
     Args:
         height: height of the image.
@@ -409,8 +410,9 @@ def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tens
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
     rows, columns = compute_reference_size(height, width)
-    # the first number is the standard deviation of the blur in `glass_blur`
-    _, reach, n_passes = (int(value) for value in GLASS[severity - 1])
+    # The first number is the standard deviation of the blur, which `glass_blur` uses.
+    reach = int(GLASS[severity - 1][1])
+    n_passes = int(GLASS[severity - 1][2])
     source = make_generator(seed, "glass blur")
     # index of the pixel whose content each pixel has, changed in each pass
     origins = list(range(rows * columns))
@@ -432,8 +434,8 @@ def _take_over_origins(
     """Let each pixel take over the origin of its neighbor, from the bottom right.
 
     Pixels near the edges keep their origins, so that all neighbors are inside of the
-    image: those in the first `reach` + 1 and the last `reach` - 1 rows and columns, as
-    in the published code.
+    image. As in the published code, these are the first `reach` + 1 and the last
+    `reach` - 1 rows and columns.
 
     Args:
         origins: index of the origin of each pixel; it is changed in place.
@@ -442,9 +444,10 @@ def _take_over_origins(
         columns: columns of the image.
         reach: largest distance of a neighbor, pixels.
     """
-    for row in range(rows - reach, reach, -1):
-        last_pixel = row * columns + columns - reach
-        for pixel in range(last_pixel, row * columns + reach, -1):
+    first = reach + 1  # first row, and first column, that changes
+    for row in reversed(range(first, rows - reach + 1)):
+        for column in reversed(range(first, columns - reach + 1)):
+            pixel = row * columns + column
             origins[pixel] = origins[pixel + to_neighbor[pixel]]
 
 
@@ -505,11 +508,11 @@ def _make_shear(rows: int, columns: int, corners: Tensor) -> Tensor:
         columns: columns of the image.
         corners: (3, 2) shifts of the lower right, upper right and upper left corner.
     """
-    # An affine map is its value at the center, and its slopes along rows and columns.
+    # An affine map is its value at the center, and its change per row and per column.
     lower_right, upper_right, upper_left = corners.unbind()
     side = 2 * (REFERENCE_SIDE // 3)
     by_row = (lower_right - upper_right) / side
-    # The diagonal from the upper left to the lower right has both slopes.
+    # From the upper left to the lower right corner, it changes by both.
     by_column = (lower_right - upper_left) / side - by_row
     row = torch.arange(rows)[:, None, None] - (rows - 1) / 2.0
     column = torch.arange(columns)[None, :, None] - (columns - 1) / 2.0
@@ -545,16 +548,17 @@ def fog(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Add drifts of white, and scale the image so that its maximum stays the same."""
     height, width = image.shape[:2]
     (density,) = interpolate_table(FOG, severity)
-    # Drifts for two integer severities are blended: noise can't be made for a decay in
-    # between, as the result has to be differentiable in the severity.
+    # The drifts of two integer severities are blended. Drifts for a `FOG_DECAY` in between
+    # would have no derivative by the severity.
     drift = interpolate_severity(
         severity,
         lambda integer: _make_drift(height, width, seed, FOG_DECAY[integer - 1]),
     )
+    foggy = image + density * drift.to(image.device)
     brightest = image.max()
-    return (
-        (image + density * drift.to(image.device)) * brightest / (brightest + density)
-    )
+    # the maximum of `foggy` if the drift is 1 where the image is brightest
+    new_brightest = brightest + density
+    return foggy * brightest / new_brightest
 
 
 @lru_cache(maxsize=8)
@@ -580,8 +584,8 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
 
     Args:
         side: smallest side of the result; it is rounded up to a power of two.
-        decay: the height of the noise is divided by `decay` squared after each step.
-            With more than 1, finer details are lower.
+        decay: the height of the noise is divided by the square of this number after each
+            step. With more than 1, finer details are lower.
         source: generator of random numbers; it advances.
     """
     grid = torch.zeros(1, 1)
@@ -590,13 +594,13 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
         size = grid.shape[0]
         noise = (torch.rand(3, size, size, generator=source) * 2.0 - 1.0) * height
         # neighbors of each point, which wrap around the edges of the torus
-        right = grid.roll(-1, 1)
-        below = grid.roll(-1, 0)
-        lower_right = right.roll(-1, 0)
+        right = grid.roll(-1, dims=1)
+        below = grid.roll(-1, dims=0)
+        lower_right = right.roll(-1, dims=0)
         # diamond step: the centers of the cells, from their four corners
         center = (grid + right + below + lower_right) / 4.0 + noise[0]
-        center_above = center.roll(1, 0)
-        center_left = center.roll(1, 1)
+        center_above = center.roll(1, dims=0)
+        center_left = center.roll(1, dims=1)
         finer = torch.empty(2 * size, 2 * size)
         finer[::2, ::2] = grid
         finer[1::2, 1::2] = center
@@ -643,10 +647,13 @@ def _draw_feathers(height: int, width: int, source: torch.Generator) -> Tensor:
     """
     canvas = Image.new("L", (width, height))
     pen = ImageDraw.Draw(canvas)
-    needles = torch.rand(height * width // FEATHER_AREA, 5, generator=source).tolist()
+    n_needles = height * width // FEATHER_AREA
+    # shine, x, y, turn and size of each needle, all in [0, 1]
+    needles = torch.rand(n_needles, 5, generator=source).tolist()
     # The brightest needles are drawn last, over the others.
     for shine, x, y, turn, size in sorted(needles):
-        _draw_feather(pen, complex(x * width, y * height), turn, size, shine)
+        start = complex(x * width, y * height)
+        _draw_feather(pen, start, turn, size, shine)
     return torch.from_numpy(np.asarray(canvas, dtype=np.float32) / 255.0)[..., None]
 
 
@@ -662,12 +669,14 @@ def _draw_feather(
         size: size in [0, 1].
         shine: brightness in [0, 1].
     """
+    # Points and directions are complex numbers. Numbers are chosen by eye.
     direction = cmath.rect(1.0, 2.0 * math.pi * turn)
-    # in pixels, chosen by eye; by the cube most needles are short
+    # in pixels; the cube of a uniform number makes most needles short
     length = 12.0 + 110.0 * size**3
     _draw_line(pen, start, start + length * direction, shine)
     for step in range(4, int(length), 4):
-        # barbs of uneven length, shorter towards the tip
+        # Barbs get shorter towards the tip. They vary along the needle and, by the turn,
+        # from needle to needle.
         unevenness = 0.5 + 0.5 * math.sin(step + 50.0 * turn)
         barb = (0.2 + 0.35 * unevenness) * (length - step) * direction
         root = start + step * direction
@@ -705,10 +714,11 @@ def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     blurred along the direction in which they fall.
     """
     rows, columns = compute_reference_size(height, width)
+    # of the noise: mean, spread, flake size and threshold; of the blur: radius and sigma
     mean, spread, flake_size, threshold, radius, sigma = SNOW[severity - 1]
     source = make_generator(seed, "snow")
-    # Vertical streaks, up to 45 degrees to either side. -90 degrees is upwards: each
-    # pixel averages those above it, so that flakes are smeared downwards.
+    # Each pixel is averaged with those in a direction from -135 to -45 degrees, where -90
+    # is straight up. So flakes are smeared downwards, up to 45 degrees to either side.
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
     noise = mean + spread * torch.randn(
         math.ceil(rows / flake_size),

@@ -302,10 +302,11 @@ class OcclusionControl(Control):
         the fraction "coverage" of the object. It is placed out of sight if the object
         is not in the image, or if the coverage is 0.
 
-        First the occluder is made to fit between camera and object, and its silhouette
-        is rasterized straight ahead of the camera. Then the angle is searched at which
-        the silhouette covers the fraction of the directions in which the object is
-        visible.
+        1. The size and the distance are reduced until the occluder fits between camera
+           and object.
+        2. Its silhouette is rasterized, in front of a camera that looks at it.
+        3. The angle between occluder and object is searched at which this silhouette
+           covers the fraction of the directions in which the object is visible.
 
         Args:
             values: values of the control, by parameter.
@@ -325,22 +326,27 @@ class OcclusionControl(Control):
         size, distance = _fit_occluder(
             points, requested["size"], requested_distance, view.nearest_distance
         )
-        cover = silhouettes.rasterise_silhouette(
+        occluder_silhouette = silhouettes.rasterise_silhouette(
             _to_facing_camera(points, size, distance), mesh.faces
         )
-        if cover is None:
+        if occluder_silhouette is None:
             return _make_hidden_placement(size, distance)
         passage = silhouettes.Passage(
-            view.directions,
-            cover,
-            silhouettes.compute_center_axes(view.directions),
-            requested["direction"],
+            target_directions=view.directions,
+            occluder_silhouette=occluder_silhouette,
+            axes=silhouettes.compute_center_axes(view.directions),
+            direction=requested["direction"],
         )
         angle = _find_covering_angle(view, passage, requested["coverage"])
-        # The occluder may be too small to hide as much as requested.
+        # less than requested if the occluder is too small
         hidden_fraction = float(passage.compute_coverage(np.array([angle]))[0])
         return Placement(
-            passage.axes, angle, size, distance, hidden_fraction, is_out_of_sight=False
+            axes=passage.axes,
+            angle=angle,
+            size=size,
+            distance=distance,
+            hidden_fraction=hidden_fraction,
+            is_out_of_sight=False,
         )
 
 
@@ -353,9 +359,9 @@ def _find_covering_angle(
     """Find the angle, in radians, at which an occluder hides a fraction of the object.
 
     The angle is that between the occluder's and the object's centers, seen from the
-    camera. At a coverage of 0 the occluder is just outside of the image. Below
-    `EASE_IN_COVERAGE` the angle is interpolated linearly from there, so that the
-    occluder does not jump into the image at a tiny coverage.
+    camera. Below `EASE_IN_COVERAGE` it is interpolated linearly: from the angle at which
+    the occluder is just outside of the image, for a coverage of 0, to the angle for
+    `EASE_IN_COVERAGE`. So the occluder does not jump into the image at a tiny coverage.
 
     Args:
         view: the object as the camera sees it.
@@ -369,11 +375,11 @@ def _find_covering_angle(
         passage.axes,
         passage.direction,
     )
-    angle = passage.find_angle(max(coverage, EASE_IN_COVERAGE), angle_outside)
-    if coverage < EASE_IN_COVERAGE:
-        to_inside = angle - angle_outside
-        angle = angle_outside + to_inside * coverage / EASE_IN_COVERAGE
-    return angle
+    if coverage >= EASE_IN_COVERAGE:
+        return passage.find_angle(coverage, angle_outside)
+    end_of_ease_in = passage.find_angle(EASE_IN_COVERAGE, angle_outside)
+    way_inside = end_of_ease_in - angle_outside
+    return angle_outside + way_inside * coverage / EASE_IN_COVERAGE
 
 
 def _make_hidden_placement(size: float, distance: float) -> Placement:
@@ -427,7 +433,8 @@ class _ObjectView:
             directions_of_image = _spread_directions(
                 model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
             )
-            # The edge of a distorted image is not computed: all directions are used.
+            # `rim` may have further directions than those at the edge. For a distorted
+            # image it has all, as the edge is not computed.
             rim = directions_of_image
             directions = _directions_through_lens(model, points, faces)
         else:
@@ -438,9 +445,9 @@ class _ObjectView:
             directions = None if silhouette is None else silhouette.list_directions()
         center = (points.min(axis=0) + points.max(axis=0)) / 2.0
         return _ObjectView(
-            directions,
-            directions_of_image,
-            rim,
+            directions=directions,
+            directions_of_image=directions_of_image,
+            rim=rim,
             nearest_distance=float(np.linalg.norm(points, axis=1).min()),
             center_distance=float(np.linalg.norm(center)),
         )
@@ -489,6 +496,10 @@ def _directions_through_lens(
 ) -> assets.Float64Array | None:
     """Return the directions in which a mesh is seen through a lens.
 
+    Directions through the lens are spread evenly over the image, and those in which the
+    mesh is seen are returned. A pinhole camera decides that: it looks at the center of
+    the mesh, whose silhouette is rasterized for it.
+
     Args:
         model: model of the camera.
         points: (V, 3) vertices in camera coordinates.
@@ -498,29 +509,40 @@ def _directions_through_lens(
         Unit directions (N, 3), each for the same area of the image; None if the mesh is
         not in the image.
     """
-    # The silhouette is rasterized for a pinhole camera that looks at the mesh. Then
-    # directions through the lens are spread over the image, and those in the silhouette
-    # are returned.
     vertex_directions = points / np.linalg.norm(points, axis=1, keepdims=True)
-    axes = silhouettes.compute_center_axes(vertex_directions)
-    silhouette = silhouettes.rasterise_silhouette(points @ axes.T, faces)
+    # rows right, up and forward of the pinhole camera
+    pinhole_axes = silhouettes.compute_center_axes(vertex_directions)
+    silhouette = silhouettes.rasterise_silhouette(points @ pinhole_axes.T, faces)
     if silhouette is None:
         return None
-    # a camera model has y downwards
-    positions, is_visible = model.project(torch.from_numpy(points * (1.0, -1.0, 1.0)))
-    # Directions are denser in a part of the image: the bounding box of the vertices. If
-    # some are outside of the image, the box is not known, and the full image is used.
-    columns = (0.0, 1.0)
-    rows = (0.0, 1.0)
-    if bool(is_visible.all()):
-        left, top = positions.amin(dim=0).clamp(0.0, 1.0).tolist()
-        right, bottom = positions.amax(dim=0).clamp(0.0, 1.0).tolist()
-        columns = (left, right)
-        rows = (top, bottom)
-    directions = _spread_directions(model, columns, rows, count=silhouettes.RASTER)
-    right_up_forward = (directions @ axes.T).T
-    directions_on_mesh = directions[silhouette.contains(*right_up_forward)]
+    across, down = _find_image_box(model, points)
+    directions = _spread_directions(model, across, down, count=silhouettes.RASTER)
+    right, up, forward = (directions @ pinhole_axes.T).T
+    directions_on_mesh = directions[silhouette.contains(right, up, forward)]
     return directions_on_mesh if len(directions_on_mesh) else None
+
+
+def _find_image_box(
+    model: geometry.CameraModel, points: assets.Float64Array
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the part of the image that contains a mesh, as seen through a lens.
+
+    Args:
+        model: model of the camera.
+        points: (V, 3) vertices in camera coordinates.
+
+    Returns:
+        Left and right bound as fractions of the width, and upper and lower bound as
+        fractions of the height. They are those of the full image if the lens does not
+        see all vertices.
+    """
+    y_downwards = points * (1.0, -1.0, 1.0)  # as a camera model has it
+    positions, is_visible = model.project(torch.from_numpy(y_downwards))
+    if not bool(is_visible.all()):
+        return (0.0, 1.0), (0.0, 1.0)
+    left, top = positions.amin(dim=0).clamp(0.0, 1.0).tolist()
+    right, bottom = positions.amax(dim=0).clamp(0.0, 1.0).tolist()
+    return (left, right), (top, bottom)
 
 
 def _spread_directions(
@@ -569,9 +591,8 @@ def _fit_occluder(
     """Fit an occluder between the camera and the object.
 
     It keeps `MIN_CAMERA_DISTANCE` from the camera, and none of its vertices is farther
-    from the camera than the object's nearest one. It is made smaller until it fits.
-
-    The occluder is treated as a cylinder around the line to the camera.
+    from the camera than the object's nearest vertex. It is made smaller until it fits.
+    Here it is replaced by a cylinder around it, whose axis points to the camera.
 
     Args:
         points: (V, 3) vertices of the occluder, centered on the origin, largest extent
@@ -583,20 +604,21 @@ def _fit_occluder(
     Returns:
         Its size, and its distance from the camera.
     """
-    front = float(points[:, 0].max())
-    back = float(-points[:, 0].min())
-    half_width = float(np.hypot(points[:, 1], points[:, 2]).max())
-    # An object very close to the camera would leave no room for any occluder: there, the
-    # occluder may be behind its nearest vertex.
+    # of the cylinder at size 1: from its center to its front and back, and its radius
+    to_front = float(points[:, 0].max())
+    to_back = float(-points[:, 0].min())
+    radius = float(np.hypot(points[:, 1], points[:, 2]).max())
+    # Largest distance of a vertex from the camera. An object very close to the camera
+    # leaves no room for any occluder, which may then be farther than its nearest vertex.
     limit = max(nearest_distance, 3.0 * MIN_CAMERA_DISTANCE)
-    # 0.95 to the 200th is 1 / 28,000: by then any occluder fits.
-    for _ in range(200):
-        min_distance = MIN_CAMERA_DISTANCE + size * front
+    max_steps = 200  # 0.95 to the 200th is 1 / 28,000: by then any occluder fits
+    for _ in range(max_steps):
+        min_distance = MIN_CAMERA_DISTANCE + size * to_front
         # Pythagoras: the edge of the cylinder's back is `limit` away from the camera.
-        squared_back_distance = limit * limit - (size * half_width) ** 2
+        squared_back_distance = limit * limit - (size * radius) ** 2
         max_distance = 0.0
         if squared_back_distance > 0.0:
-            max_distance = math.sqrt(squared_back_distance) - size * back
+            max_distance = math.sqrt(squared_back_distance) - size * to_back
         if max_distance >= min_distance:
             break
         size *= 0.95
@@ -633,24 +655,24 @@ def _compute_pose(camera: Tensor, placement: Placement, values: Values) -> Tenso
     """Return the occluder's pose (4, 4).
 
     It is differentiable in the camera's pose, the direction and the turn, but not in
-    what the placement was found from. So gradients of this control are estimated by
-    finite differences.
+    the placement, which depends on all values. So gradients of this control are
+    estimated by finite differences.
 
     Args:
         camera: (4, 4) pose of the camera.
-        placement: where the occluder goes.
+        placement: position and size of the occluder.
         values: values of the control, with "direction" and "turn" in degrees.
     """
     axes = torch.from_numpy(placement.axes).to(camera)
     direction = torch.deg2rad(values["direction"])
-    turned_axes = _turn_axes(axes, direction, placement.angle)
-    right, up, to_occluder = turned_axes
-    # Axes of the occluder: its front (x) faces the camera before it is turned about its
-    # vertical axis.
+    right, up, to_occluder = _turn_axes(axes, direction, placement.angle)
+    # Axes of the occluder. Without a turn, its front (x) faces the camera, and y is to the
+    # right. A turn rotates x towards y.
     turn = torch.deg2rad(values["turn"])
     x = -torch.cos(turn) * to_occluder + torch.sin(turn) * right
     y = torch.sin(turn) * to_occluder + torch.cos(turn) * right
-    # from right, up and forward; the first column of a camera's pose is its left
+    # Directions have components to the right, up and forward, but the first column of a
+    # camera's pose is its left.
     to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
     linear = placement.size * to_world @ torch.stack([x, y, up], dim=1)
     center = camera[:3, 3] + placement.distance * (to_world @ to_occluder)
@@ -664,17 +686,19 @@ def _turn_axes(
 
     Args:
         axes: (3, 3) rows right, up and forward of the camera.
-        direction: () direction of the turn in the image, radians: 0 is to the right,
+        direction: () where in the image the camera turns to, radians: 0 is to the right,
             pi / 2 up.
-        angle: angle of the turn, radians.
+        angle: how far it turns, radians.
 
     Returns:
         Right, up and forward (3,) of the turned camera.
     """
     right, up, forward = axes
-    # axes in the image: towards the occluder, and at a right angle to that
+    # Axes in the image: towards the occluder, and at a right angle to that. The camera
+    # turns about the latter, so that only the other two axes change.
     outwards = torch.cos(direction) * right + torch.sin(direction) * up
     sideways = -torch.sin(direction) * right + torch.cos(direction) * up
+    # `forward` is rotated towards `outwards`
     turned_forward, turned_outwards = _rotate_pair(forward, outwards, angle)
     # back from the axes in the image to right and up
     turned_right = (

@@ -43,11 +43,11 @@ class Silhouette:
     window: geometry.Frame
 
     def list_directions(self) -> assets.Float64Array:
-        """Return unit directions (N, 3), one in each covered pixel.
+        """Return unit directions (N, 3) to the right, up and forward, one a covered pixel.
 
         Each stands for the same area of the image. Their positions within the pixels
-        vary by a low-discrepancy sequence (Roberts 2018). With pixel centers, the edge
-        of an occluder would hide whole columns at once.
+        vary by a low-discrepancy sequence (Roberts 2018). If all were at pixel centers,
+        the edge of a moving occluder would hide a full column of them at once.
         """
         row, column = np.nonzero(self.mask)
         height, width = self.mask.shape
@@ -56,6 +56,7 @@ class Silhouette:
         # 1 / g and 1 / g^2 of the plastic number g (Roberts 2018)
         x_in_pixels = column + (0.5 + 0.7548777 * index) % 1.0
         y_in_pixels = row + (0.5 + 0.5698403 * index) % 1.0
+        # Tangents: on the plane at distance 1 in front of the camera. Rows go upwards.
         x = window.left + x_in_pixels * (window.right - window.left) / width
         y = window.low + y_in_pixels * (window.high - window.low) / height
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
@@ -121,12 +122,15 @@ def rasterise_silhouette(
     pixel = max(window_width, window_height) / RASTER
     width = max(1, math.ceil(window_width / pixel))
     height = max(1, math.ceil(window_height / pixel))
-    # Pixel centers are at whole numbers: the window's corner is at -0.5.
+    # In the coordinates of `rasterize_triangles`, pixel centers are at whole numbers. So
+    # the corner of the window, which is the corner of a pixel, is at -0.5.
     in_pixels = (tangents - (window.left, window.low)) * (
         width / window_width,
         height / window_height,
     ) - 0.5
-    _, row, column, _ = images.rasterize_triangles(in_pixels, (height, width))
+    _face, row, column, _weights = images.rasterize_triangles(
+        in_pixels, (height, width)
+    )
     mask = np.zeros((height, width), dtype=np.bool_)
     mask[row, column] = True
     return Silhouette(mask, window) if mask.any() else None
@@ -182,19 +186,23 @@ class Passage:
             angles: (K,) radians, between the centers of occluder and target as seen
                 from the camera.
         """
-        side = math.radians(self.direction)
-        # components of the target's directions
+        direction = math.radians(self.direction)
+        # components of the target's directions, for a camera that looks at the target
         right, up, forward = (self.target_directions @ self.axes.T).T
-        # in the image: towards the side of the occluder, and at a right angle to that
-        outwards = math.cos(side) * right + math.sin(side) * up
-        sideways = -math.sin(side) * right + math.cos(side) * up
+        # The same in other axes of the image: towards the occluder, and at a right angle.
+        outwards = math.cos(direction) * right + math.sin(direction) * up
+        sideways = -math.sin(direction) * right + math.cos(direction) * up
         fractions = []
         for angle in angles:
-            # components after the camera has turned outwards by the angle
+            # Components for a camera that has turned outwards by the angle, to look at
+            # the occluder: the target moves inwards.
             new_outwards = outwards * math.cos(angle) - forward * math.sin(angle)
             new_forward = outwards * math.sin(angle) + forward * math.cos(angle)
-            new_right = math.cos(side) * new_outwards - math.sin(side) * sideways
-            new_up = math.sin(side) * new_outwards + math.cos(side) * sideways
+            # back to the axes right and up
+            new_right = (
+                math.cos(direction) * new_outwards - math.sin(direction) * sideways
+            )
+            new_up = math.sin(direction) * new_outwards + math.cos(direction) * sideways
             is_hidden = self.occluder_silhouette.contains(
                 new_right, new_up, new_forward
             )
@@ -204,9 +212,11 @@ class Passage:
     def find_angle(self, fraction: float, outside: float) -> float:
         """Find the largest angle, in radians, at which a fraction is hidden.
 
-        The occluder moves in from outside and stops where it first hides as much. Its
-        angles are scanned first, then bisected. If it never hides as much, the angle at
-        which it hides most is returned.
+        The occluder moves in from outside and stops where it first hides that fraction.
+        The angle is scanned in steps, and then bisected within a step: the result is
+        right within a tiny interval, so that the fraction may be missed by as little. If
+        the occluder never hides the fraction, the angle at which it hides most is
+        returned.
 
         Args:
             fraction: fraction of the target that should be hidden.
@@ -245,13 +255,15 @@ def compute_center_axes(directions: assets.Float64Array) -> assets.Float64Array:
     Rows are right, up and forward.
 
     Args:
-        directions: (N, 3) unit directions of the silhouette's points.
+        directions: (N, 3) unit directions of the silhouette's points, with components
+            to the right, up and forward of the camera before it is turned.
     """
     forward = directions.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
-    # (0, 1, 0) is up. `forward` is not parallel to it, since the silhouette is in the
-    # image, in front of the camera.
-    right = np.cross((0.0, 1.0, 0.0), forward)
+    # `forward` is not parallel to `camera_up`, since the silhouette is in the image, in
+    # front of the camera. Right, up and forward are left-handed: up x forward = right.
+    camera_up = (0.0, 1.0, 0.0)
+    right = np.cross(camera_up, forward)
     right = right / max(float(np.linalg.norm(right)), 1e-12)
     return np.stack([right, np.cross(forward, right), forward])
 
@@ -276,16 +288,20 @@ def find_angle_outside(
         direction: side that the occluder comes from, in degrees: 0 is the right, 90 the
             top.
     """
-    # The largest angles of the occluder from the forward direction, and of the image
-    # from the target. Corners and rim are unit vectors, so that cosines are components.
+    # Largest angle between the occluder's center and a corner of the window around it.
+    # The center is straight ahead, so that a corner's third component is the cosine.
     corners = cover.window.corners()
     occluder_radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
-    image_radius = float(np.arccos(np.clip(rim @ axes[2], -1.0, 1.0)).max())
+    # largest angle between the target's center and the edge of the image
+    target_center = axes[2]
+    image_radius = float(np.arccos(np.clip(rim @ target_center, -1.0, 1.0)).max())
     # a little beyond the edge (0.02 is about a degree), but not behind the camera
     max_angle = min(image_radius + occluder_radius + 0.02, 0.9 * math.pi)
     # twice as dense as `find_angle` scans a smaller range
     angles = np.linspace(max_angle, 0.0, 2 * N_SCAN_ANGLES)
-    coverage = Passage(directions, cover, axes, direction).compute_coverage(angles)
+    # The target is here the full image: the fraction of it that is covered.
+    image_passage = Passage(directions, cover, axes, direction)
+    coverage = image_passage.compute_coverage(angles)
     indices_inside = np.nonzero(coverage > 0.0)[0]
     if not len(indices_inside):
         return float(angles[0])

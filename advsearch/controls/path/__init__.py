@@ -328,14 +328,15 @@ class PathControl(Control):
             are_all_files: whether every movement is from a file, and none is a named
                 one such as "orbit".
         """
+        # "approach+orbit" moves both the camera and the object, "orbit" what `moves` states
         has_single_mover = any(MOVER_SEPARATOR not in name for name in names)
         if "moves" in self._settings and not has_single_mover:
             raise InputError(
                 f"{self.name}: {names[0]} states the movements of both the camera and "
                 "the object; leave moves out"
             )
-        # Without a path in this control, a setting of the run may state one later.
-        # `prepare` checks that.
+        # Without `path` in the settings of this control, another setting of the run may
+        # still add one. `prepare` checks that.
         if "path" in self._settings:
             self._check_trajectory_choices()
         if any(movement.has_times for movement in self._files):
@@ -355,13 +356,13 @@ class PathControl(Control):
         """Return the movement of the camera, the object or both on a path.
 
         Args:
-            name: a single movement, e.g. "orbit" or "drive.csv", of what the choice
-                `moves` states; or the camera's and the object's with a "+" between
-                them, e.g. "approach+orbit".
+            name: a single movement, e.g. "orbit" or "drive.csv", by the camera or the
+                object, as the choice `moves` states; or the camera's and the object's
+                movement with a "+" between them, e.g. "approach+orbit".
         """
         names = [name]
         halves = name.split(MOVER_SEPARATOR)
-        # The name of a single file may have a "+", too.
+        # The name of a single file may have a "+", too: then the halves are no paths.
         if len(halves) == 2 and all(map(_is_path, halves)):
             names = halves
         is_single = len(names) == 1
@@ -517,8 +518,8 @@ class PathControl(Control):
         Args:
             path: the file, for messages.
             trajectory: what was read from it.
-            assumed: defaults of choices that the user left out, by name. Those of
-                `axes`, `up` and `object_at` are added if they are used.
+            assumed: is changed in place: the defaults of `axes`, `up` and `object_at`
+                are added by name, as texts for a note, if they are used.
 
         Returns:
             Positions (n, 3) relative to the object, in the file's unit. And rotations,
@@ -529,7 +530,7 @@ class PathControl(Control):
             InputError: the file has no rotations, and `axes` is "none".
             FileFormatError: a position is too far from the object.
         """
-        # Without a setting, a choice is None.
+        # A choice is None if the user left it out.
         axes = str(self.choice_values["axes"] or OPTICAL)
         up = str(self.choice_values["up"] or trajectory.default_up)
         origin = self.choice_values["object_at"] or (0.0, 0.0, 0.0)
@@ -555,8 +556,8 @@ class PathControl(Control):
     def get_parameter_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         """Return the spec of a parameter.
 
-        The selection of a path is searched unless the user fixed it, even if the user
-        set a range for the time only.
+        The selection of a path is searched unless the user fixed it. (Other parameters
+        have a fixed default as soon as the user sets a range of one of them.)
         """
         is_path_choice = parameter.name == Control.PATH_PARAMETER
         if is_path_choice and parameter.name not in self.specs:
@@ -581,7 +582,7 @@ class PathControl(Control):
         return shifted
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        """Return the scene with notes on the files, after checking the paths in it.
+        """Return the scene with notes on the files as remarks, after checking the paths.
 
         Raises:
             InputError: something else fixes the camera, or the camera would be at the
@@ -590,11 +591,11 @@ class PathControl(Control):
         if CAMERA in self._movers:
             self._check_camera_is_free(scene)
         self._check_trajectory_choices()
-        in_scene = self.with_scene(scene)
+        control_in_scene = self.with_scene(scene)
         names = _split_paths(self.choice_values["path"])
         for name, movements in zip(names, self._paths, strict=True):
             if CAMERA in movements:
-                in_scene._check_camera_off_target(name, movements)
+                control_in_scene._check_camera_off_target(name, movements)
         notes = self._list_notes()
         if not notes:
             return scene
@@ -602,7 +603,11 @@ class PathControl(Control):
         return replace(scene, remarks=remarks)
 
     def _check_camera_is_free(self, scene: SceneDescription) -> None:
-        """Raise InputError if a camera or a photograph of the scene fixes the pose."""
+        """Raise InputError if the scene's camera or photograph fixes the camera's pose.
+
+        Only the camera "orbit", which is described by azimuth, elevation and distance,
+        can move.
+        """
         if not scene.uses_orbit_camera:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene uses its own "
@@ -620,8 +625,9 @@ class PathControl(Control):
     def _list_notes(self) -> list[str]:
         """Return notes on the files, and one if they have different durations.
 
-        Times are drawn from the duration of the longest file. On a shorter one, the
-        frames after its end all show its last position.
+        The times of frames are drawn from the duration of the longest file. Frames after
+        the end of a shorter file show its last position, and are counted in results
+        like all other frames.
         """
         notes = [note for waypoints in self._files for note in waypoints.notes]
         durations = [float(waypoints.times[-1]) for waypoints in self._files]
@@ -639,8 +645,8 @@ class PathControl(Control):
         """Check that the camera is never at the point that it looks at.
 
         There it would have no direction. The vector from the camera to that point is
-        computed at many times, including those of waypoints, and taken as linear
-        between them.
+        computed at many times, including those of waypoints. In between it is assumed
+        to change linearly.
 
         Args:
             name: name of the path, for messages.
@@ -659,10 +665,10 @@ class PathControl(Control):
         start = get_start_poses(self.scene, times.device)
         shift, _ = self._shift_object(movements, start, times)
         position, target = self._position_camera(movements, start, times, shift)
-        # If nothing moves, there is a single vector for all times.
+        # (n, 3), also if nothing moves, when there is a single vector for all times
         to_target = (target - position).expand(len(times), 3).double()
-        # For each step between two times: the fraction of the step at which the distance
-        # is smallest, and that distance.
+        # For each step from one time to the next: the fraction of the step at which the
+        # distance is smallest, and that distance; (n - 1,) each.
         fraction, distance = _find_closest_to_origin(to_target)
         if float(distance.min()) < MIN_TARGET_DISTANCE:
             index = int(distance.argmin())
@@ -688,15 +694,16 @@ class PathControl(Control):
         """
         if parameter.name == Control.PATH_PARAMETER:
             return parameter
-        # The clean time is that of the first path's first movement. An orbit is an
-        # exception: it is closed, so that its start and its end both are as in the
-        # scene. Then the second movement decides, if there is one.
+        # The first movement of the first path decides. An orbit is an exception: it is
+        # closed, so that both its start and its end are as in the scene. Then the second
+        # movement decides, if there is one. (A movement is a name, or waypoints.)
         movement, *other_movements = self._paths[0].values()
         if other_movements and movement == ORBIT:
             movement = other_movements[0]
         clean_time = 0.0  # for waypoints from a file
         if isinstance(movement, str):
             clean_time = CLEAN_TIME_FRACTION.get(movement, 0.0) * self.seconds
+        # `Parameter.ORBIT` are the estimators for a moving camera, not the movement.
         estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
         return replace(
             parameter,
@@ -807,7 +814,7 @@ class PathControl(Control):
         left, _, forward, scene_position = scene_start.camera[:3].unbind(dim=1)
         center = scene_start.center
         movement = movements.get(CAMERA)
-        if movement is None:
+        if movement is None:  # it keeps its direction, even if the object moves
             return scene_position, center
         if isinstance(movement, Waypoints):
             return self._camera_on_waypoints(movement, center, time, shift)
@@ -816,11 +823,11 @@ class PathControl(Control):
         progress = (time / self.seconds).clamp(0.0, 1.0)
         if movement == APPROACH:
             ahead = _level_direction(forward)
-            # It begins at `reach` times its last distance.
-            to_go = (1.0 - progress)[..., None]
+            # It begins at `reach` times the distance at which it ends.
+            to_go = (1.0 - progress)[..., None]  # (..., 1), from 1 to 0
             position = scene_position - ahead * distance * (reach - 1.0) * to_go
         elif movement == PASS:
-            # 1 at the beginning, 0 at the position in the scene, -1 at the end
+            # (..., 1): 1 at the beginning, 0 at the position in the scene, -1 at the end
             to_the_left = (1.0 - 2.0 * progress)[..., None]
             position = scene_position + left * distance * reach * to_the_left
         else:  # an orbit
@@ -845,14 +852,17 @@ class PathControl(Control):
             The camera's position and the point that it looks at, (..., 3) each, in
             object sizes.
         """
+        # Waypoints of the camera, and targets, are relative to the object's position in
+        # the scene, wherever the object has moved.
         position = (
             center
             + waypoints.interpolate(time, waypoints.positions)
             / self.scene.size_in_metres
         )
         if waypoints.rotations is not None:
-            # the third column points ahead
-            return position, position + waypoints.interpolate_rotation(time)[..., 2]
+            rotation = waypoints.interpolate_rotation(time)  # (..., 3, 3)
+            forward = rotation[..., :, 2]  # the third column
+            return position, position + forward
         if waypoints.targets is None:
             return position, center + shift
         target = (
@@ -900,13 +910,14 @@ class PathControl(Control):
         reach = float(self.choice_values["reach"])
         distance = (position - scene_start.center).norm()
         if movement == APPROACH:
-            # It begins at `reach` times its last distance from the camera.
+            # It begins at `reach` times the distance from the camera at which it ends.
             to_go = distance * (reach - 1.0) * (1.0 - progress)
             return _level_direction(forward) * to_go[..., None], no_turn
-        # On "pass" it is to the right of its position in the scene at first, then to
-        # the left.
+        # On "pass" it is to the right of its position in the scene at first (over 0),
+        # then to the left (under 0).
         to_right = distance * reach * (1.0 - 2.0 * progress)
-        return _level_direction(-left) * to_right[..., None], no_turn
+        right = _level_direction(-left)
+        return right * to_right[..., None], no_turn
 
 
 @geometry.cache_per_scene
@@ -966,13 +977,15 @@ def make_look_at_pose(position: Tensor, target: Tensor, roll: float) -> Tensor:
         target: (3,) point that it looks at.
         roll: degrees by which it is turned about its viewing direction.
     """
-    ahead = (target - position) / (target - position).norm().clamp_min(1e-9)
-    level_left = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
+    forward = (target - position) / (target - position).norm().clamp_min(1e-9)
+    # horizontal, and at right angles to `forward`
+    level_left = torch.stack([-forward[1], forward[0], torch.zeros_like(forward[0])])
     length = level_left.norm()
-    # If it looks straight up or down, there is no level left: y is used.
-    default_left = torch.tensor([0.0, 1.0, 0.0]).to(ahead)
+    # It is zero if the camera looks straight up or down: then y is the left axis.
+    default_left = torch.tensor([0.0, 1.0, 0.0]).to(forward)
     left = torch.where(length > 1e-6, level_left / length.clamp_min(1e-6), default_left)
-    return _roll_camera(position, left, torch.linalg.cross(ahead, left), ahead, roll)
+    up = torch.linalg.cross(forward, left)
+    return _roll_camera(position, left=left, up=up, ahead=forward, roll=roll)
 
 
 def make_camera_pose(position: Tensor, rotation: Tensor, roll: float) -> Tensor:
@@ -995,14 +1008,14 @@ def _roll_camera(
     Args:
         position: (3,) position of the camera.
         left, up, ahead: (3,) its unit axes without roll, at right angles.
-        roll: degrees by which it is turned.
+        roll: degrees by which it is turned, clockwise as seen from behind it.
     """
     cos = math.cos(math.radians(roll))
     sin = math.sin(math.radians(roll))
-    return geometry.make_affine(
-        torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1),
-        position,
-    )
+    rolled_left = cos * left + sin * up
+    rolled_up = cos * up - sin * left
+    axes = torch.stack([rolled_left, rolled_up, ahead], dim=1)
+    return geometry.make_affine(axes, position)
 
 
 def measure_tilt(rotations: Rotation) -> float:
@@ -1079,7 +1092,8 @@ def unwrap_headings(
 
     From 350 to 10 degrees the object then turns by 20 degrees, not back by 340. Only
     headings within one turn are changed: all in [0, 360] or all in [-180, 180], less
-    than 360 apart. A file with other headings counts full turns itself.
+    than 360 apart. Other headings are already unwrapped: e.g. 370 is a full turn and 10
+    degrees.
 
     Args:
         degrees: (n,) headings at the waypoints, in order.
@@ -1091,8 +1105,12 @@ def unwrap_headings(
     high = float(degrees.max())
     # steps for which the other direction is shorter
     jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    is_within_turn = (0.0 <= low and high <= 360.0) or (-180.0 <= low and high <= 180.0)
-    if not len(jumps) or high - low >= 360.0 or not is_within_turn:
+    has_usual_bounds = (0.0 <= low and high <= 360.0) or (
+        -180.0 <= low and high <= 180.0
+    )
+    # Both 0 and 360 in one file are a full turn that is meant.
+    has_full_turn = high - low >= 360.0
+    if not len(jumps) or has_full_turn or not has_usual_bounds:
         return degrees, None
     # headings before and after the first such step, for the note
     first = f"{degrees[jumps[0]]:g}"
@@ -1178,8 +1196,8 @@ def read_waypoints(
         mover: "camera" or "object", which moves along the columns x, y and z.
         text: text of a .csv file with the columns time, x, y, z, and perhaps look_x,
             look_y, look_z (camera) or heading (object).
-        is_single_path: whether a file for the camera may have further columns with the
-            object's movement.
+        is_single_path: whether this file is the full path. Then a file for the camera may
+            have further columns with the object's movement.
 
     Returns:
         The waypoints by mover; times begin at 0.
@@ -1205,6 +1223,8 @@ def read_waypoints(
     seconds = torch.from_numpy(times.astype(np.float32))
     positions = _stack_columns(column, POSITION_COLUMNS)
     assert positions is not None  # `_check_header` requires them
+    # "heading" is only in a file for the object; in one for the camera, the object's is
+    # "object_heading".
     waypoints = {
         mover: Waypoints(
             seconds,

@@ -119,13 +119,13 @@ class Trajectory:
             (x right, y down, z ahead), None if the axes are `NO_AXES` or the file has
             none.
         """
-        world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
-        positions = world.apply(self.positions - np.asarray(origin, np.float64))
+        world_to_z_up = Rotation.from_matrix(WORLD_TO_Z_UP[up])
+        positions = world_to_z_up.apply(self.positions - np.asarray(origin, np.float64))
         if axes == NO_AXES or self.rotations is None:
             return positions, None
-        return positions, world * self.rotations * Rotation.from_matrix(
-            SENSOR_AXES[axes]
-        )
+        # from a camera's axes to the sensor's, to the file's world, to a world with z up
+        camera_to_sensor = Rotation.from_matrix(SENSOR_AXES[axes])
+        return positions, world_to_z_up * self.rotations * camera_to_sensor
 
 
 def read_trajectory(path: Path, text: str) -> Trajectory | None:
@@ -156,11 +156,12 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     headers = [names for names in candidates if _find_columns(names)]
     if not headers:
         is_waypoint_table = any(WAYPOINT_COLUMNS <= set(names) for names in candidates)
-        # With commas, a line before the numbers is an unknown header. Without, it may be
-        # a comment, as files of TUM have them.
+        # Between commas, a line before the numbers is a header of another kind of table.
+        # Without commas it may be a comment, as files of TUM have them.
         has_unknown_header = has_commas and bool(candidates)
         if is_waypoint_table or has_unknown_header:
             return None
+    # without comments between the rows
     rows = [_split(line) for line in lines[first_row:] if not line.startswith("#")]
     if len(rows) > MAX_ROWS:
         raise errors.FileFormatError(
@@ -228,10 +229,12 @@ def _find_column(name: str) -> str | None:
         return "time"
     position = POSITION_NAME.fullmatch(plain)
     if position:
-        return position[1]
+        return position[1]  # the group "x", "y" or "z" of the pattern
     quaternion = QUATERNION_NAME.fullmatch(plain)
     if quaternion:
-        return f"q{quaternion[1] or quaternion[2]}"
+        # The pattern has two ways to write a component, with a group for each.
+        component = quaternion[1] or quaternion[2]
+        return f"q{component}"
     return None
 
 
@@ -254,9 +257,11 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
             return {}
         columns[column] = index
     has_quaternion = set(QUATERNION) <= set(columns)
-    has_part_of_quaternion = not has_quaternion and set(QUATERNION) & set(columns)
+    has_any_component = not set(QUATERNION).isdisjoint(columns)
+    has_part_of_quaternion = has_any_component and not has_quaternion
     if has_part_of_quaternion or not {"time", *POSITION} <= set(columns):
         return {}
+    # A table of waypoints has no quaternion, but the same names for time and position.
     is_waypoint_table = not has_quaternion and WAYPOINT_COLUMNS <= set(names)
     return {} if is_waypoint_table else columns
 
@@ -303,9 +308,10 @@ def _read_named_columns(
     unread = [name for index, name in enumerate(names) if index not in used_indices]
     notes = [f"{path}: not read: {reading.join_names(unread)}."] if unread else []
     times = table[:, columns["time"]]
-    unit = _find_time_unit(path, names[columns["time"]], times, notes)
-    # First the differences: the product of a time since 1970 and the unit would be
-    # rounded.
+    time_name = names[columns["time"]]
+    unit = _find_time_unit(path, time_name, times, notes)  # may add to `notes`
+    # Differences are converted, since the product of a time since 1970 and the unit would
+    # be rounded.
     times = (times - times[0]) * UNITS[unit]
     positions = table[:, [columns[name] for name in POSITION]]
     rotations = None

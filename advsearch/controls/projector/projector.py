@@ -253,8 +253,9 @@ class ProjectorControl(PictureControl):
         if isinstance(pattern, (list, tuple)):
             is_valid = [*pattern] == [0.0, 1.0]
         else:
-            # The setting is missing, or 0, which fixes a black image.
-            is_valid = not pattern
+            is_missing = pattern is None
+            is_fixed_black = not is_missing and not pattern  # a 0
+            is_valid = is_missing or is_fixed_black
         if not is_valid:
             raise InputError(
                 f"{self.name}.pattern: expected no value but [0, 1], got {pattern!r}; "
@@ -282,7 +283,7 @@ class ProjectorControl(PictureControl):
         if fov is None:
             fov = self._compute_covering_fov(scene, aspect=columns / rows)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
-        # Radiance in the scene can be converted to lux.
+        # With candelas per unit of radiance, light in the scene can be converted to lux.
         has_unit = (
             scene.environment is not None and scene.environment.candelas is not None
         )
@@ -305,10 +306,10 @@ class ProjectorControl(PictureControl):
         """
         offsets = scene.base_vertices - geometry.compute_center(scene)
         object_radius = float(np.linalg.norm(offsets, axis=1).max())
-        # In a wide image the height has to cover the object, so that the width is
-        # larger.
+        # The shorter side of the image has to cover the object. In a wide image that is
+        # the height, and the width is larger by the aspect.
         half_width = object_radius * max(1.0, aspect) * scene.size_in_metres
-        distance = self.with_scene(scene)._start_distance()
+        distance = self.with_scene(scene)._start_distance()  # in metres
         covering_fov = math.degrees(2.0 * math.atan(half_width / distance))
         return min(covering_fov, MAX_DEFAULT_FOV)
 
@@ -360,14 +361,15 @@ class ProjectorControl(PictureControl):
         return min(max(lux, 1e-3), 2e5)  # the parameter's range
 
     def _compute_max_lumens(self) -> float:
-        """Return the lumens with which white is `MAX_AMBIENT_FACTOR` times the ambient.
+        """Return the lumens at which white is `MAX_AMBIENT_FACTOR` times the ambient light.
 
         Lumens are lux times the area of the image, which grows with the squared
-        distance; `self.part.area` is that at a distance of 1.
+        distance; `self.projector_part.area` is the area at a distance of 1.
         """
+        ambient_lux = float(self.get_clean_value("ambient"))
         return (
             MAX_AMBIENT_FACTOR
-            * float(self.get_clean_value("ambient"))
+            * ambient_lux
             * self.projector_part.area
             * self._start_distance() ** 2
         )
@@ -476,15 +478,16 @@ class ProjectorControl(PictureControl):
         if self._flashes_off(values):
             light = 0.0 * light  # still depends on the pattern, for its derivative
         distance_in_units = values["distance"].detach() / self.scene.size_in_metres
-        # The irradiance of white at the object, in scene units. At a distance of one
-        # unit it is larger by the squared distance.
+        # The irradiance of a white texel at a distance of one scene unit. It is that at the
+        # object (the ratio to the ambient light times `metered_irradiance`) times the
+        # squared distance.
         white_irradiance = (
             self._compute_ambient_ratio(values)
             * distance_in_units**2
             * self.scene.metered_irradiance
         )
-        # The projector's input is the radiance of a white diffuse screen there, which
-        # is the irradiance over pi.
+        # The projector's input is the radiance of a white diffuse screen at that distance,
+        # which is the irradiance over pi.
         white = white_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
@@ -587,6 +590,7 @@ def make_projector_pose(
         elevation: degrees over the object's center.
         distance: metres from the object's center; object sizes if it has no size.
     """
+    # axes of a camera there, as rows; `outwards` is from the object to the projector
     left, up, outwards = torch.from_numpy(
         geometry.compute_camera_axes(azimuth, elevation, 0.0)
     ).float()

@@ -143,18 +143,20 @@ class SpotControl(ProjectorControl):
 
         Lumens are searched from 0 to a maximum: `DEFAULT_LUMENS`, or less if a spot of
         the default width would be more than `MAX_AMBIENT_FACTOR` times as bright as the
-        ambient light. Their default is 0. But if only other parameters are searched, it
-        is that maximum, because a spot without light has no effect.
+        ambient light. The default of the lumens is 0. But if only other parameters are
+        searched, the default is the maximum, because a spot without light has no
+        effect.
         """
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
+        # The spot is a Gaussian: standard deviation in metres, and integral in squared
+        # metres if its peak is 1.
         std = DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.size_in_metres
-        # integral of a Gaussian spot whose peak is 1
         effective_area = 2.0 * math.pi * std**2
-        ambient = float(self.get_clean_value("ambient"))
+        ambient_lux = float(self.get_clean_value("ambient"))
         max_lumens = min(
             DEFAULT_LUMENS,
-            MAX_AMBIENT_FACTOR * ambient * effective_area,
+            MAX_AMBIENT_FACTOR * ambient_lux * effective_area,
         )
         default = 0.0
         if self.has_requested_range and not self.is_searched("lumens"):
@@ -178,17 +180,19 @@ class SpotControl(ProjectorControl):
             / self.scene.size_in_metres
         )
         rows, columns = self.projector_part.sides
-        # positions of the texels' centers in that plane; rows go downwards
+        # Positions of the texels' centers in that plane. Rows go downwards, but `y` goes
+        # upwards.
         right = _compute_texel_centers(columns).to(half_width) * half_width
         down = _compute_texel_centers(rows).to(half_width) * half_width
         std = values["width"] / WIDTH_PER_DEVIATION
-        squared_distance = (right[None] - values["x"]) ** 2 + (
-            -down[:, None] - values["y"]
-        ) ** 2
+        x_offset = right[None] - values["x"]
+        y_offset = -down[:, None] - values["y"]
+        squared_distance = x_offset**2 + y_offset**2
+        gaussian = torch.exp(-0.5 * squared_distance / std**2)
+        # The Gaussian is scaled so that the mean of the image is about 1.
         image_area = (2.0 * half_width) ** 2
-        integral = 2.0 * math.pi * std**2  # of the Gaussian
-        # with these two factors the mean of the image is about 1
-        spot = torch.exp(-0.5 * squared_distance / std**2) * image_area / integral
+        integral = 2.0 * math.pi * std**2
+        spot = gaussian * image_area / integral
         return spot[..., None] * color.combine_channels(values)
 
     def compute_measurements(

@@ -48,10 +48,10 @@ def enlarge(pixels: Tensor, factor: int) -> Tensor:
 def compress_jpeg(image: Tensor, quality: int) -> Tensor:
     """Compress an image as a JPEG file with subsampled chroma, and read it again.
 
-    The derivative is that of the identity (a straight-through estimate). For changes of
-    the image that are smooth over three pixels or more, it is right within about a third
-    (measured at qualities of 7 to 25). Finer changes are reduced by the compression, so
-    that the derivative is too large.
+    The derivative is that of the identity (a straight-through estimate). Its error is up
+    to about a third for changes of the image that vary over three pixels or more
+    (measured at qualities of 7 to 25). It is too large for finer changes, which the
+    compression reduces.
 
     Args:
         image: (H, W, 3) display-referred sRGB in [0, 1].

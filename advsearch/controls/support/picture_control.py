@@ -68,7 +68,8 @@ class PictureControl(Control):
         """Return the spec that the user set for a parameter, or the default one.
 
         By default a searched image may have all colors, and a number is fixed at its
-        default. An image from a file is fixed, so that it has no coordinates.
+        default. An image from a file is fixed, so that it has no coordinates. Its spec
+        has the placeholder 0, which is not read.
         """
         if parameter.name in self.specs:
             return self.specs[parameter.name]
@@ -89,9 +90,10 @@ class PictureControl(Control):
         spec = self.get_parameter_spec(parameter)
         assert isinstance(spec, Range)
         n_values = 3 * math.prod(self.image_shape)  # three channels for each pixel
-        radius = self.choice_values["epsilon"]
+        radius = self.choice_values["epsilon"]  # in colors, for each norm
         if radius is None:
             radius = compute_default_radius(norm, n_values, self.default_epsilon)
+        # Coordinates are colors divided by the width of the range, and so is any norm.
         return Budget(norm, radius / (spec.high - spec.low))
 
     def compute_values(self, u: Tensor) -> dict[str, Tensor]:
