@@ -353,14 +353,14 @@ FAULTS = (
     Fault(
         "hardening: what judges is trained on",
         "advsearch/questions/harden/training.py",
-        "searched = [copy.copy(lesson) for lesson in held_back]",
-        "searched = list(held_back)",
+        "searched = [copy.copy(lesson) for lesson in validation_items]",
+        "searched = list(validation_items)",
         ("tests/questions/test_hardening.py",),
     ),
     Fault(
         "hardening: plain pictures may be lost",
         "advsearch/questions/harden/rounds.py",
-        "return clean >= self.results[0].clean - self.config.clean_loss - 1e-9",
+        "return clean >= self.finished_rounds[0].clean - self.config.clean_loss - 1e-9",
         "return True",
         ("tests/questions/test_hardening.py",),
     ),
