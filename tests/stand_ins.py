@@ -113,7 +113,7 @@ def attack_on(
         smallest=config.smallest,
         seconds=config.seconds,
         baseline=config.baseline,
-        close_looks=config.max_extra_repeats,
+        max_extra_repeats=config.max_extra_repeats,
         average=config.average,
         trials=config.trial_count if config.trials is not None or config.smallest else None,
         ladder=choose_ladder(config.verify_spp, config.pixel_sampler),

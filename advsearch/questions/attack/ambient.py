@@ -29,8 +29,8 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     configuration fails; then the limit is bisected between the last two lights. Exposure
     follows the ambient light, so that the projector's light gets darker in the image.
     Nothing else changes. The trials have the same seeds in every light, and no other
-    stage uses these seeds. The results are stored in
-    `verifier.state.verification_by_lux`, by lux.
+    stage uses these seeds. The results are stored in `verification_by_lux` of the run
+    state.
 
     Args:
         verifier: verifier of the attack.
@@ -45,7 +45,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
 
     def holds(lux: float) -> bool:
         """Verify the configuration in an ambient light, and store the result."""
-        verification = _verify_in_light(verifier, u, lux, lux / scene_lux)
+        verification = _verify_in_light(verifier, u, lux=lux, factor=lux / scene_lux)
         findings.verification_by_lux[lux] = verification
         return verification.ending is Ending.FOUND
 
@@ -82,15 +82,17 @@ def _verify_in_light(
     n_renders = 2 * verifier.n_trials
     title = f"trying it in ambient light of {lux:.3g} lux"
     verifier.begin_stage(title, n_renders, name="ambient", at_most=True)
-    # Workers find the problem in that light by its key, which is the factor.
+    # Workers make the problem in that light from its key, see `make_problem_finder`.
+    problem_key = factor
     evaluator = ParallelEvaluator(
         with_ambient_light(problem, factor),
         verifier.journal.evaluator.workers,
-        factor,
+        problem_key,
     )
     journal = replace(verifier.journal, evaluator=evaluator)
+    verifier_in_light = replace(verifier, journal=journal)
     return verify(
-        replace(verifier, journal=journal).evaluate_all,
+        verifier_in_light.evaluate_all,
         problem.domain,
         u,
         claim=Ending.FOUND,
@@ -118,14 +120,14 @@ def _find_scene_lux(problem: Problem) -> float | None:
 def make_problem_finder(problem: Problem) -> Callable[[ProblemKey], Problem]:
     """Return the function by which a worker finds the problem of a query.
 
-    If the key of a problem is a float, it is a factor on the ambient light; any other
-    key stands for the problem of the run.
+    A query names its problem by a key. A float is a factor by which the ambient light
+    of the run's problem is multiplied. Any other key stands for the run's problem.
 
     Args:
         problem: problem of the run.
     """
 
-    # Two are enough, since lights are tried one after another.
+    # Lights are tried one after another, so that older problems are not needed again.
     @lru_cache(maxsize=2)
     def make_problem_in_light(factor: float) -> Problem:
         return with_ambient_light(problem, factor)

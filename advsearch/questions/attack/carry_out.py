@@ -47,7 +47,7 @@ from advsearch.engine.transport import CleanMatrix, find_matrix_refusal
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.options import convert_to_setting
+from advsearch.options import Value, convert_to_setting
 from advsearch.progress import Progress
 from advsearch.questions.attack.ambient import make_problem_finder
 from advsearch.questions.attack.settings import (
@@ -131,9 +131,9 @@ def load_parts(
     Args:
         config: the settings.
         scene: scene to use instead of the one that the settings name.
-        model: model to use instead of the one that the settings name. If both are
-            passed, the attack is a step of another experiment. Then it is not stored,
-            and has no metrics, which are columns of stored rows.
+        model: model to use instead of the one that the settings name. If both `scene`
+            and `model` are passed, the attack is a step of another experiment. Then it
+            is not stored, and has no metrics, which are columns of stored rows.
     """
     if scene is None and len(config.objects) > 1:
         raise make_single_value_error("object", config.objects)
@@ -142,7 +142,8 @@ def load_parts(
     )
     task, objective = make_task_and_objective(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **config.policy_options)
-    is_stored = scene is None or model is None
+    is_step_of_experiment = scene is not None and model is not None
+    is_stored = not is_step_of_experiment
     scene = scene or naming.load_configured_scene(config)
     warnings: list[str] = []
     if model is None:
@@ -259,11 +260,13 @@ def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
         )
     # all photographs of a folder have the same kinds of camera files
     view = next(iter(read_photograph_folder(folder).values()))
+    replaced_prefixes = view.replaced_settings  # such as ("camera.", "pose.")
     other_settings = {
         name: value
         for name, value in config.set_.items()
-        if not name.startswith(view.replaced_settings)
+        if not name.startswith(replaced_prefixes)
     }
+    # A camera file may state the occluder and the lens of its photograph.
     changes = {"backdrop": folder, "occluder": None, "set_": other_settings}
     if view.camera is not None:
         changes["camera"] = None
@@ -319,19 +322,22 @@ def make_task_and_objective(
         task: a name, settings or an instance.
         objective: a name or a function; None for the objective of the task.
 
+    Returns:
+        The task, which is not yet bound to a model, and the objective.
+
     Raises:
         InputError: the objective does not fit the task or the goal.
     """
-    unbound_task = make_task(task)  # not yet bound to a model
+    made_task = make_task(task)
     if objective is None:
-        objective = unbound_task.objective
+        objective = made_task.objective
     check_objective(
         objective,
-        unbound_task.name,
+        made_task.name,
         targeted=config.target is not None,
         minimise=config.minimise,
     )
-    return unbound_task, objective
+    return made_task, objective
 
 
 def load_ensemble(
@@ -401,7 +407,7 @@ def make_problem_with_warnings(
     """
     config = parts.config.model_copy(update=changes)
     model, warnings = parts.model_and_warnings
-    warnings = [*warnings]  # a copy: `make_problem` adds to it
+    warnings = [*warnings]  # a copy, since `make_problem` appends to the list
     if "model" in changes:
         model, warnings = load_ensemble(config.model, config, parts.task)
     changed_parts = replace(parts, config=config, model_and_warnings=(model, warnings))
@@ -497,11 +503,11 @@ def _check_printable(
     """
     if not config.printable:
         return
-    # Without the photographs: the control that chooses among them varies by chance, and
-    # is not searched.
+    # `make_space` requires a control that chooses among the photographs of a folder.
+    # That control varies by chance, so the searched controls lack it.
     scene = replace(description, photographs=None)
     searched_space = make_space(parts.controls, scene)
-    # only a check: raises where nothing can be printed
+    # The result is not used: the call raises an error if nothing can be printed.
     judging.measure_print_terms(searched_space, searched_space.start)
 
 
@@ -514,7 +520,8 @@ def _check_objective_inputs(parts: AttackParts, problem: Problem) -> None:
     for name in list_requested_inputs(parts.objective):
         start = problem.make_full_configuration(problem.domain.start)
         get_input = problem.make_objective_inputs(start)
-        get_input(name)  # only a check: raises where there is no such input
+        # The result is not used: the call raises an error if there is no such input.
+        get_input(name)
 
 
 def _bind_task(
@@ -523,8 +530,8 @@ def _bind_task(
     """Bind the task of an attack to its model, check it, and calibrate it.
 
     Args:
-        parts: the parts of the attack. Remarks of the task are added to their warnings
-            of loading the model.
+        parts: the parts of the attack. Their list of warnings gets the remarks of the
+            task.
         is_calibrated: whether the task is calibrated, for which a clean image may be
             rendered; else it is only checked.
 
@@ -539,6 +546,7 @@ def _bind_task(
         task = task.with_objective(parts.objective)
     task = judging.make_ensemble_task(task, model)
     task = task.on(model, target=config.target, minimise=config.minimise)
+
     make_scene_facts = partial(
         make_facts,
         parts.scene.description,
@@ -546,22 +554,10 @@ def _bind_task(
         config.label,
         judge=config.judge,
     )
-    # The facts of the clean scene. Their first argument is a function that describes
-    # the configuration: `dict` returns an empty description, with which all values are
-    # those of the scene. The second one, which renders surfaces, is not needed here.
-    clean_facts = make_scene_facts(dict)
+    # the ground truth of the scene as it is, with no value changed
+    clean_facts = make_scene_facts(_describe_no_changes)
     if isinstance(task, EnsembleTask):
-        members = [
-            _prepare_task(
-                parts,
-                member,
-                member_model,
-                task.select_facts(member, clean_facts),
-                is_calibrated=is_calibrated,
-            )
-            for member, member_model in zip(task.tasks, task.models, strict=True)
-        ]
-        task = replace(task, tasks=tuple(members))
+        task = _prepare_members(parts, task, clean_facts, is_calibrated=is_calibrated)
     else:
         task = _prepare_task(
             parts, task, model, clean_facts, is_calibrated=is_calibrated
@@ -570,6 +566,31 @@ def _bind_task(
         # every thing in the scene is evaluated, not only the object
         task = make_each_thing_task(task)
     return task, make_scene_facts
+
+
+def _describe_no_changes() -> dict[str, Value]:
+    """Return an empty description, with which all values are those of the scene."""
+    return {}
+
+
+def _prepare_members(
+    parts: AttackParts, task: EnsembleTask, clean_facts: Facts, *, is_calibrated: bool
+) -> EnsembleTask:
+    """Check and calibrate the task of each model of an ensemble.
+
+    See `_prepare_task` for the arguments.
+    """
+    members = [
+        _prepare_task(
+            parts,
+            member,
+            model,
+            task.select_facts(member, clean_facts),
+            is_calibrated=is_calibrated,
+        )
+        for member, model in zip(task.tasks, task.models, strict=True)
+    ]
+    return replace(task, tasks=tuple(members))
 
 
 def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
@@ -586,23 +607,37 @@ def choose_search_size(config: AttackConfig, problem: Problem) -> tuple[int, int
     """
     if problem.conditions is None:
         return config.steps or STEPS, 1
-    default_size = SIZE_OVER_PREDICTED
-    if problem.conditions.dim == 1:
-        default_size = SIZE_OVER_SINGLE_PARAMETER
+    default_steps, default_conditions = _choose_default_size(
+        config, problem, problem.conditions.dim
+    )
+    return config.steps or default_steps, config.draws or default_conditions
+
+
+def _choose_default_size(
+    config: AttackConfig, problem: Problem, n_random_numbers: int
+) -> tuple[int, int]:
+    """Return the default of `choose_search_size` if conditions vary by chance.
+
+    Args:
+        config: the settings.
+        problem: problem of the attack.
+        n_random_numbers: how many numbers vary by chance.
+    """
+    size_if_predicted = SIZE_OVER_PREDICTED
+    if n_random_numbers == 1:
+        size_if_predicted = SIZE_OVER_SINGLE_PARAMETER
     # Preparing a matrix costs more than it saves if there are few steps. So whether
     # images are predicted depends on the number of steps.
-    default_steps, _ = default_size
-    refusal = find_matrix_refusal(
-        problem, config.steps or default_steps, config.specialise
+    steps_if_predicted, _ = size_if_predicted
+    matrix_refusal = find_matrix_refusal(
+        problem, config.steps or steps_if_predicted, config.specialise
     )
-    are_images_rendered = refusal is not None
-    if are_images_rendered:
-        # The norm "box" stands for parameters that have a range and no epsilon, such as
-        # a pose; they are few numbers.
-        has_only_ranges = all(block.norm == "box" for block in problem.domain.blocks)
-        default_size = SIZE_OVER_NUMBERS if has_only_ranges else SIZE_OVER_RENDERED
-    default_steps, default_draws = default_size
-    return config.steps or default_steps, config.draws or default_draws
+    if matrix_refusal is None:
+        return size_if_predicted
+    # The norm "box" stands for parameters that have a range and no epsilon, such as a
+    # pose; they are few numbers.
+    has_only_ranges = all(block.norm == "box" for block in problem.domain.blocks)
+    return SIZE_OVER_NUMBERS if has_only_ranges else SIZE_OVER_RENDERED
 
 
 def is_describable_by_setting(
@@ -649,8 +684,8 @@ def _prepare_task(
     """Check that a model can be right about the scene, and calibrate its task.
 
     Args:
-        parts: the parts of the attack. Remarks of the task are added to their warnings
-            of loading the model.
+        parts: the parts of the attack. Their list of warnings gets the remarks of the
+            task.
         task: task of the model.
         model: the model, or one member of an ensemble.
         clean_facts: ground truth of the clean scene.
@@ -666,12 +701,12 @@ def _prepare_task(
         task = judging.calibrate_task(
             task,
             model,
-            [parts.scene],
-            config.label,
-            config.judge,
-            config.image_settings,
+            scenes=[parts.scene],
+            label=config.label,
+            judge=config.judge,
+            image_settings=config.image_settings,
         )
-    _, warnings = parts.model_and_warnings
+    _, warnings = parts.model_and_warnings  # the list itself, which is changed
     warnings += [remark for remark in task.output_remarks if remark not in warnings]
     return task
 
@@ -685,7 +720,8 @@ def open_executor(
 
     Args:
         config: the settings.
-        function: "module:function", which gets the settings.
+        function: path "module:function" of the function that makes a worker's work
+            from the settings.
         progress: reports what the workers do.
 
     Raises:
@@ -695,7 +731,13 @@ def open_executor(
     # A worker gets the settings of the run, but must not start workers itself.
     in_process = {"workers": None, "cluster": None}
     worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
-    work = WorkerTask(function, worker_settings, FILES, config.n_used_threads or 1)
+    work = WorkerTask(
+        function,
+        worker_settings,
+        path_setting_names=FILES,
+        threads=config.n_used_threads or 1,
+    )
+    # not every experiment has these two settings
     workers = getattr(config, "workers", None)
     cluster = getattr(config, "cluster", None)
     if (workers or cluster) and has_model_url(config.model):

@@ -74,8 +74,8 @@ def _matrix_claims(result: MatrixResult) -> Iterator[Claim]:
     """Yield what each scene of a matrix does to each model."""
     for row in result.table:
         for cell in row.tested:
-            # A claim that nothing was found states how much was searched. On another
-            # model than the attacked one nothing was searched, and the scene only tried.
+            # A claim that nothing was found states how much was searched. On models that
+            # were not attacked, the scene was only tried.
             searches = None
             if cell.model == row.attacked:
                 searches = views.format_searches(
@@ -90,7 +90,8 @@ def _view_attack(summary: AttackSummary) -> ShownResult:
 
     Facts with an empty text are not displayed.
     """
-    # the page of an attack replaces the first section, the rates, by one with bars
+    # `page.make_page` has sections of its own; only the first of these, the rates, is
+    # used there, with bars.
     sections = [_rates_part(summary)]
     if summary.failures and summary.failures.tried:
         sections.append(make_failures_part(summary.failures, tried=True))
@@ -113,7 +114,8 @@ def _view_attack(summary: AttackSummary) -> ShownResult:
         "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {steps}: {summary.ending}",
         "renders": wording.renders_text(summary),
-        # Only a page displays these two: it fills them in, in this order.
+        # Only a page displays these two, and sets their texts. Here they have a place in
+        # the order.
         "environment": "",
         "seed": "",
     }
@@ -172,7 +174,7 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     light = summary.ambient
     if light is None:
         return []
-    limit = "also in direct sun"
+    limit = "also in direct sun"  # in every light that was tried
     if light.limit_lux is not None:
         limit = f"no longer at {light.limit_lux:.3g} lux"
     factor = light.holds_to / light.lux
@@ -204,7 +206,8 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
 def failures_text(failures: DifferentFailures) -> str:
     """Return where different failures were found, and how many hold.
 
-    They are counted in cells, into which some policies divide the space, or in draws.
+    Some policies divide the space into cells, and failures are counted in cells. Other
+    policies draw configurations, and failures are counted in draws.
     """
     where = f"{failures.found} of {words.format_count(failures.examined, 'draw')}"
     has_cells = failures.cells is not None
@@ -214,10 +217,9 @@ def failures_text(failures: DifferentFailures) -> str:
             f"{' and '.join(failures.over)} ({failures.examined} were evaluated)"
         )
     if failures.share is not None:
+        interval = words.format_interval(failures.share.interval)
         where += (
-            f"; of all configurations {words.format_interval(failures.share.interval)} "
-            "fail "
-            "in one render (95 % interval)"
+            f"; of all configurations {interval} fail in one render (95 % interval)"
         )
         if failures.share.estimate is not None:
             where += f", {words.percent(failures.share.estimate)} by the estimate"
@@ -225,8 +227,7 @@ def failures_text(failures: DifferentFailures) -> str:
         return f"claimed in {where}; none of these was tried with fresh renders"
     return (
         f"claimed in {where}; with fresh renders {failures.verified} of the "
-        f"{failures.tried} "
-        "that were tried hold"
+        f"{failures.tried} that were tried hold"
     )
 
 
@@ -289,11 +290,12 @@ CURVE_NOTE = (
 def _view_curve(result: CurveResult) -> ShownResult:
     """Return the view of robust accuracy against epsilon.
 
-    A notebook always draws the chart. A page has it only if there are several epsilons.
+    With several epsilons, a page has the chart and the table. With a single one, only a
+    notebook has the chart.
     """
     known = [point for point in result.curve if point.accuracy is not None]
-    # A point without an epsilon stands for attacks in which each control had an epsilon
-    # of its own ("own" in the table): it has no position on the axis of the chart.
+    # A point without an epsilon stands for attacks in which each control had its own. It
+    # has no position on the axis of the chart, and "own" in the table.
     points = [point for point in known if point.epsilon is not None]
     has_chart = len(points) > 1
     points_text = "; ".join(
@@ -373,10 +375,10 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
 
     Args:
         result: result of the curve.
-        known: the epsilons with a robust accuracy.
+        known: the points of the curve with a robust accuracy.
     """
 
-    def at(epsilon: float | None) -> str:
+    def format_at(epsilon: float | None) -> str:
         """Return " at epsilon 0.1"; empty if each control has an epsilon of its own."""
         return "" if epsilon is None else f" at epsilon {epsilon:g}"
 
@@ -385,7 +387,7 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
     if len(result.objects) > 1:
         first_and_last = [known[0]] if len(known) == 1 else [known[0], known[-1]]
         rates = [
-            f"{point.robust} of {point.objects}{at(point.epsilon)}"
+            f"{point.robust} of {point.objects}{format_at(point.epsilon)}"
             for point in first_and_last
         ]
         return f"Still recognised: {' and '.join(rates)}."
@@ -393,7 +395,7 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
     if row.ending == "already wrong":
         return f"The model is wrong about {row.object} as it is."
     if row.flips_at is None:
-        return f"{row.object} is recognised{at(row.tried)}."
+        return f"{row.object} is recognised{format_at(row.tried)}."
     return f"{row.object} is first got wrong at epsilon {epsilon_text(row.flips_at)}."
 
 
@@ -431,13 +433,14 @@ def _draw_curve(result: CurveResult, points: Sequence[CurvePoint], axes: Any) ->
 
 
 def _curve_claims(result: CurveResult) -> Iterator[Claim]:
-    """Yield the robust accuracy at each epsilon, and the average of each object."""
+    """Yield the robust accuracy at each epsilon, and each object's average-case accuracy."""
     renders: Counter[str] = Counter()
     for row in result.table:
         renders.update(row.renders or {})
     searches = ""
     if renders:
-        spent = views.format_searches(renders, result.policy, bool(renders["baseline"]))
+        has_random_search = bool(renders["baseline"])
+        spent = views.format_searches(renders, result.policy, random=has_random_search)
         searches = f"Searched were, of all objects and epsilons together, {spent}. "
     for point in result.curve:
         if point.accuracy is None:
@@ -462,6 +465,7 @@ def _curve_claims(result: CurveResult) -> Iterator[Claim]:
 
 def _view_matrix(result: MatrixResult) -> ShownResult:
     """Return the view of a matrix."""
+    # rows of scenes that were tried on models
     n_rows = sum(bool(row.tested) for row in result.table)
     figure = ResultPart(
         draw=lambda axes: _draw_matrix(result, axes),
@@ -507,8 +511,10 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     for row in result.table:
         cells = [words.shorten_name(row.attacked), row.ending]
         for cell in row.tested:
-            # the row and the column that this cell is about to get
-            rate_of_cell[len(rows), len(cells)] = cell.verified.rate
+            # the position that the cell gets below, in `rows` and in `cells`
+            row_index = len(rows)
+            column_index = len(cells)
+            rate_of_cell[row_index, column_index] = cell.verified.rate
             rate = ", ".join(words.format_rate_cells(cell.verified))
             cells.append(rate + ENDING_MARKS.get(cell.ending, ""))
         rows.append(cells)
@@ -535,17 +541,19 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
 def _matrix_text(result: MatrixResult) -> str:
     """Return the result of a matrix in a sentence.
 
-    An adversarial scene counts on a model if its trials there end as "found".
+    An adversarial scene holds on a model if its trials there end as "found".
     """
-    same_model = list[str]()
-    other_model = list[str]()
+    # how the trials ended, on the model that was attacked and on other models
+    endings_on_same = list[str]()
+    endings_on_other = list[str]()
     for row in result.table:
         for cell in row.tested:
-            endings = same_model if cell.model == row.attacked else other_model
+            is_same = cell.model == row.attacked
+            endings = endings_on_same if is_same else endings_on_other
             endings.append(cell.ending)
-    n_held = same_model.count("found")
-    n_transferred = other_model.count("found")
-    n_pairs = len(same_model) + len(other_model)
+    n_held = endings_on_same.count("found")
+    n_transferred = endings_on_other.count("found")
+    n_pairs = len(endings_on_same) + len(endings_on_other)
     if not n_pairs:
         return "No adversarial scene was tried on any model."
     if result.ensemble is not None:
@@ -554,8 +562,8 @@ def _matrix_text(result: MatrixResult) -> str:
             f"{n_held + n_transferred} of {n_pairs}."
         )
     return (
-        f"{n_held} of {len(same_model)} answers hold on the model that they were "
-        f"searched on; {n_transferred} of {len(other_model)} on another one."
+        f"{n_held} of {len(endings_on_same)} answers hold on the model that they were "
+        f"searched on; {n_transferred} of {len(endings_on_other)} on another one."
     )
 
 

@@ -189,8 +189,9 @@ def _find_twins(
 ) -> TwinEvidence | None:
     """Return how well renders agreed with photographs in a run of twins, if any.
 
-    The agreement was measured under certain conditions, among them the environment and
-    whether the renders were in a photograph. Those nearest to the attack are chosen.
+    A run of twins measures the agreement under several conditions, such as an
+    environment, or renders inside a photograph. The result is that of the conditions
+    which are most like those of the attack.
 
     Args:
         twins: name or folder of a run of `advsearch twins`, which compared renders with
@@ -329,10 +330,12 @@ def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, A
     """
     verification = findings.verification
     adversarial_trials = verification.adversarial_trials if verification else ()
-    samples = findings.sample_count
     # If the random search found a worse configuration than the policy, `verification`
     # is about that configuration, and `outdone` about the policy's.
     outdone = findings.outdone_verification
+    sample_count = None
+    if findings.sample_count is not None:
+        sample_count = VerificationSamples.from_values(findings.sample_count)
     return {
         "verified": _make_rate(verification),
         "tried_objective": TriedObjective(
@@ -342,7 +345,7 @@ def _summarize_verification(problem: Problem, findings: RunState) -> dict[str, A
         "baseline": _summarize_baseline(problem, findings),
         "adversarial_from": None if outdone is None else "random",
         "policy_verified": _make_rate(outdone),
-        "sample_count": samples and VerificationSamples.from_values(samples),
+        "sample_count": sample_count,
     }
 
 
@@ -506,8 +509,9 @@ def _summarize_average(findings: RunState) -> AverageCase | None:
 def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon | None:
     """Return the bounds of the smallest epsilon, by control; None if not searched.
 
-    The bounds of the bracket are factors of the budgets: `high` is the smallest at
-    which a wrong prediction was found, and `low` the largest at which none was found.
+    The scales of the bracket are factors of the budgets. A search passes if it finds a
+    wrong prediction: `smallest_passing_scale` is the smallest at which one was found,
+    and `largest_failing_scale` the largest at which none was found.
     """
     bracket = findings.smallest_change_bracket
     if bracket is None:
@@ -545,23 +549,21 @@ def _make_search_claim(search: SearchResult) -> SearchClaim:
 
 def _summarize_gradients(search: SearchResult) -> SearchGradients:
     """Return the statistics of the gradients of a search."""
-    # without steps whose objective was not finite
     norms = [
         record.gradient_norm
         for record in search.history
         if not math.isnan(record.objective)
     ]
-    # `agreement` has the cosine of each gradient with the previous one.
-    median_cosine = None
-    if search.agreement:
-        median_cosine = statistics.median(search.agreement)
+    # the cosine of each gradient with the previous one
+    cosines = search.agreement
+    median_cosine = statistics.median(cosines) if cosines else None
     return SearchGradients(
         count=search.gradients,
         cosine_with_the_one_before=median_cosine,
         zero=sum(norm == 0.0 for norm in norms),
-        cut=search.counts.cut,  # gradients in which single outliers were clipped
-        shortened=search.counts.shortened,  # gradients that were outliers in length
-        rejected=search.counts.rejected,  # steps that were taken back
+        cut=search.counts.cut,  # gradients in which single elements were clipped
+        shortened=search.counts.shortened,  # gradients whose norm was scaled down
+        rejected=search.counts.rejected,  # steps that were undone
     )
 
 
@@ -597,8 +599,9 @@ def name_objective(task: Task, objective: str | None) -> str:
     """
     name = objective or task.objective
     is_score = name == Task.objective  # "score", the default of all tasks
-    goal = getattr(task, "seek", "")  # other tasks than detection have none
-    has_special_goal = goal not in ("", Detection.seek)
+    default_goal = Detection.seek  # "vanish"
+    goal = getattr(task, "seek", default_goal)  # only detection has goals
+    has_special_goal = goal not in ("", default_goal)
     return str(goal) if is_score and has_special_goal else name
 
 
@@ -621,32 +624,40 @@ def _summarize_printability(problem: Problem, findings: RunState) -> Printabilit
     margin from a search without them, if that was verified, too.
     """
 
-    def measure_terms(search: SearchResult | None) -> PrintTerms | None:
-        """Measure the print terms of what a search found; None without a search."""
-        if search is None:
-            return None
-        u = problem.domain.project(search.best_u)
-        return measure_print_terms(problem.searched_space, u)
+    search = findings.search_result
+    return Printability(
+        clean=measure_print_terms(problem.searched_space, problem.domain.start),
+        adversarial=None if search is None else _measure_found_terms(problem, search),
+        cost=_measure_print_cost(problem, findings),
+    )
 
-    cost = None
+
+def _measure_found_terms(problem: Problem, search: SearchResult) -> PrintTerms:
+    """Measure the print terms of the configuration that a search found."""
+    u = problem.domain.project(search.best_u)
+    return measure_print_terms(problem.searched_space, u)
+
+
+def _measure_print_cost(problem: Problem, findings: RunState) -> PrintCost | None:
+    """Return what print terms cost in margin.
+
+    None if no search without print terms was made, or if it was not verified.
+    """
     verification = findings.verification
     unprinted = findings.result_without_print_terms
     unprinted_verification = findings.unprinted_verification
-    unprinted_terms = measure_terms(unprinted)
-    if verification and unprinted_verification and unprinted and unprinted_terms:
-        margin = make_verified_rate(verification).margin
-        unprinted_rate = make_verified_rate(unprinted_verification)
-        cost = PrintCost(
-            steps=len(unprinted.history),
-            margin_with=margin,
-            margin_without=unprinted_rate.margin,
-            cost=margin - unprinted_rate.margin,
-            verified=unprinted_rate,
-            terms=unprinted_terms,
-        )
-    clean = measure_print_terms(problem.searched_space, problem.domain.start)
-    return Printability(
-        clean=clean, adversarial=measure_terms(findings.search_result), cost=cost
+    if verification is None or unprinted is None or unprinted_verification is None:
+        return None
+    margin = make_verified_rate(verification).margin
+    unprinted_rate = make_verified_rate(unprinted_verification)
+    return PrintCost(
+        steps=len(unprinted.history),
+        margin_with=margin,
+        margin_without=unprinted_rate.margin,
+        # A search lowers the margin: print terms cost what it is higher with them.
+        cost=margin - unprinted_rate.margin,
+        verified=unprinted_rate,
+        terms=_measure_found_terms(problem, unprinted),
     )
 
 
@@ -677,8 +688,8 @@ def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
     """Return the range of each searched parameter that is a single number.
 
     Each searched number has a coordinate in [0, 1]. Its range goes from the value at
-    coordinate 0 to the value at 1. Parameters whose values there are no numbers in
-    ascending order are left out.
+    coordinate 0 to the value at 1. A parameter is left out if these two values are not
+    numbers, or not in ascending order.
     """
     start = problem.domain.start
     # The searched parameters come first in the space, and the start has their
@@ -734,10 +745,12 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
     if problem.conditions is None:
         return ranges
     start = problem.make_full_configuration(problem.domain.start)
-    domain = make_domain(problem.space.controls)
-    # Each parameter has a group in the space and a block in the domain. The group knows
-    # its first coordinate, the block how many options a choice has (0 for a number).
-    for group, block in zip(problem.space.groups, domain.blocks, strict=True):
+    # `problem.domain` has the searched controls only.
+    full_domain = make_domain(problem.space.controls)
+    # Each parameter has a group in the space and a block in the domain. The group has
+    # the index of its first coordinate. The block has the number of options of a
+    # choice, which is 0 for a number.
+    for group, block in zip(problem.space.groups, full_domain.blocks, strict=True):
         # The searched controls come first in the space.
         is_random = group.begin >= len(problem.domain.start)
         if group.size != 1 or not is_random:
@@ -787,9 +800,9 @@ def _to_range(described: Sequence[Value], *, is_choice: bool) -> VariedValue:
 def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     """Count the images of an attack by what they were rendered for.
 
-    An evaluation of a search takes an image for each of the `n_draws` conditions that
-    it averages over. Images that were rendered to prepare a predictor count for the
-    search, and the first renders of the clean scene for the verification.
+    An evaluation of a search takes an image for each of the conditions that it averages
+    over. Images that were rendered to prepare a predictor count for the search, and the
+    first renders of the clean scene for the verification.
 
     Args:
         findings: findings of the attack.
@@ -802,14 +815,15 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
         gradients).
     """
     predictor = findings.predictor
+    n_conditions = problem.conditions_per_evaluation
     counts = dict.fromkeys(
         ("search", "gradient", "baseline", "verification", "products"), 0
     )
     counts["verification"] = findings.verification_renders + len(
         findings.first_look_trials
     )
-    # Searches by the kind of their queries. The kind `UNPRINTED` is a sentence; its
-    # count has the shorter key "unprinted".
+    # Searches by the kind of their queries. `UNPRINTED` is a long text, and its count
+    # has the key "unprinted".
     searches = {
         "search": findings.search_result,
         "baseline": findings.random_search_result,
@@ -818,12 +832,13 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     for kind, search in searches.items():
         if search is None:
             continue
-        n_predicted = 0
+        n_predicted_steps = 0
         if predictor:
             n_predicted_steps = predictor.count_predicted(kind, len(search.history))
-            n_predicted = n_predicted_steps * problem.conditions_per_evaluation
-        n_rendered = search.renders * problem.conditions_per_evaluation - n_predicted
-        # A predicted image has its gradient without further renders.
+        n_predicted = n_predicted_steps * n_conditions
+        n_rendered = search.renders * n_conditions - n_predicted
+        # The gradients of predicted images need no renders. There may be fewer
+        # gradients than predicted images.
         n_gradients = max(0, search.gradients - n_predicted)
         counts["products"] += n_predicted
         if kind == UNPRINTED:
@@ -833,7 +848,8 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
             if kind == "search":  # the random search has no gradients
                 counts["gradient"] += n_gradients
     if predictor:
-        counts["search"] += predictor.n_traced
+        n_rendered_to_prepare = predictor.n_traced
+        counts["search"] += n_rendered_to_prepare
     return counts
 
 
@@ -850,6 +866,7 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
     if rendering_remark:
         remarks.append(rendering_remark)
     samples = findings.sample_count
+    # `table` has the sample counts that were compared. It is empty if the count is set.
     if samples is not None and samples.table and not samples.converged:
         has_conditions = problem.conditions is not None
         remarks.append(_make_samples_remark(samples.spp, has_conditions=has_conditions))
@@ -858,8 +875,8 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
         for search in (findings.search_result, findings.random_search_result)
         if search is not None
     )
-    # The renderer counts those of rendered searches, too, so that the two counts
-    # overlap: the larger one is stated, not the sum.
+    # Both counts include those of rendered images of a search. So the larger one is
+    # stated, and not their sum.
     n_non_finite = max(problem.renderer.n_non_finite, n_in_searches)
     if n_non_finite:
         remarks.append(
@@ -911,12 +928,11 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     if known.failure_rate is not None:
         failing_fraction = FailingShare.from_values(known.failure_rate)
     # A policy may divide the space of some parameters into cells, and count in cells.
-    # `over` has the columns of u that span the cells.
+    cell_parameters = [
+        problem.domain.element_names[column] for column in known.cell_parameter_indices
+    ]
     return DifferentFailures(
-        over=[
-            problem.domain.element_names[column]
-            for column in known.cell_parameter_indices
-        ],
+        over=cell_parameters,
         found=known.n_failures,
         examined=known.n_visited,
         cells=known.n_cells,
@@ -965,7 +981,7 @@ def _describe_failure(
         holds=verification.ending is Ending.FOUND,
         verified=make_verified_rate(verification),
         picture=f"images/{_name_failure_image(number)}.png",
-        pictured=_make_prediction(verification.adversarial_trials[0], 0),
+        pictured=_make_prediction(verification.adversarial_trials[0], trial=0),
     )
 
 
@@ -984,23 +1000,24 @@ def _describe_failure_ranges(
     """
     ranges: dict[str, tuple[float, float] | str] = {}
     for column, bounds in failure.ranges.items():
+        name = problem.domain.element_names[column]
         block = problem.domain.find_block(column)
-        # the parameter's value at each bound
-        values = list[Any]()
+        values_at_bounds = list[Any]()
         for bound in bounds:
             u = failure.u.clone()
             is_choice = bool(block.n_options)
-            if not is_choice:  # a choice stays as the failure has it
+            if not is_choice:  # the option of a choice is that of the failure itself
                 u[column] = bound
             described = problem.describe(u).get(block.name)
-            values.append(bound if described is None else described["value"])
-        option_names = [value for value in values if isinstance(value, str)]
-        name = problem.domain.element_names[column]
+            values_at_bounds.append(bound if described is None else described["value"])
+        option_names = [value for value in values_at_bounds if isinstance(value, str)]
         if option_names:
             ranges[name] = option_names[0]
         elif block.size == 1:
-            ranges[name] = (min(values), max(values))
-        else:  # the values are those of the full vector, not of this component
+            ranges[name] = (min(values_at_bounds), max(values_at_bounds))
+        else:
+            # A value describes the full vector, and the bounds are those of one
+            # component, which has no description of its own.
             ranges[name] = (min(bounds), max(bounds))
     return ranges
 

@@ -130,12 +130,12 @@ def _frames_data(frames: list[str], objectives: Sequence[float | None]) -> Html:
     evaluations, and each has its step and the objective of that step.
 
     Args:
-        frames: images of the frames as data URLs.
+        frames: images of the frames as data URLs, at least two.
         objectives: objectives of all evaluations of the search.
     """
     last_step = max(len(objectives) - 1, 0)
-    # without the last frame, which belongs to no step
-    steps = [round(step) for step in np.linspace(0, last_step, len(frames) - 1)]
+    n_search_frames = len(frames) - 1  # without the adversarial scene
+    steps = [round(step) for step in np.linspace(0, last_step, n_search_frames)]
     # an interrupted search may have no objective yet
     frame_objectives = [
         objectives[step] if step < len(objectives) else None for step in steps
@@ -149,7 +149,7 @@ def _image_parts(
 ) -> Iterator[ResultPart]:
     """Yield the sections with images.
 
-    A script of the page fills the sections with `live`. They are hidden without it.
+    A section with `live` is filled by a script of the page, and is hidden without it.
 
     Args:
         run: the run directory.
@@ -312,7 +312,8 @@ def _textures_part(run: Path) -> ResultPart:
         pictures.append(Picture(f"artifacts/{name}", "original texture", "Original"))
         pictures.append(Picture(adversarial, caption, "Adversarial"))
     title = "The textures" if len(originals) > 1 else "The texture"
-    return ResultPart(title, pictures=[pictures] if pictures else [], layout="pair")
+    picture_rows = [pictures] if pictures else []
+    return ResultPart(title, pictures=picture_rows, layout="pair")
 
 
 def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
@@ -324,16 +325,17 @@ def _failures_parts(summary: AttackSummary) -> Iterator[ResultPart]:
     for failure in known.listed:
         if not failure.picture or not failure.holds:
             continue
-        name = ""
-        if failure.pictured:
-            name = words.format_prediction(summary.task, failure.pictured)
-        name = name or display.most_frequent_label(failure)
+        prediction = ""
+        if failure.pictured:  # the prediction of this image
+            prediction = words.format_prediction(summary.task, failure.pictured)
+        name = prediction or display.most_frequent_label(failure)
         pictures.append(Picture(failure.picture, display.range_text(failure), name))
+    picture_rows = [pictures] if pictures else []
     yield replace(
         display.make_failures_part(known),
         title="Different failures",
         text=[f"Failures are {display.failures_text(known)}."],
-        pictures=[pictures] if pictures else [],
+        pictures=picture_rows,
     )
 
 
@@ -352,11 +354,12 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
         rates.append(summary.verified)
     if summary.baseline:
         rates.append(summary.baseline.verified)
-    # each bar is an interval with a mark at the rate
+    # A bar is an interval with a mark at the rate: (begin, end, mark).
     bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rates]
     if average:
         bars.append((*average.interval, average.accuracy))
-    if not any(bars):
+    has_rates = any(bars)
+    if not has_rates:
         return ResultPart()
     spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
     note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
@@ -400,8 +403,10 @@ def _search_part(
     zero_means = ""
     if summary.objective in words.SUCCESS_ABOVE_ZERO:
         # With the setting `minimise` the search seeks a right prediction.
-        above = "right" if summary.minimises else wording.format_success_word(summary)
-        zero_means = f"above: {above}"
+        prediction = wording.format_success_word(summary)
+        if summary.minimises:
+            prediction = "right"
+        zero_means = f"above: {prediction}"
     label = words.format_objective(summary.objective)
     return ResultPart(
         "The search",

@@ -113,7 +113,7 @@ def attack(
             stopped. All other arguments have to be the same as before.
     """
     options = _drop_unset(settings)
-    if callable(task):  # a function; names, mappings and instances are read below
+    if callable(task):  # a function of the caller
         task = make_task(task)
     _check_policy(policy)
     session_controls = [
@@ -123,7 +123,7 @@ def attack(
     _check_can_use_workers(scene, model, task, objective, session_controls, options)
     scene = _load_scene(scene, object, options)
 
-    # the settings as `run.yaml` states them
+    # the settings as `run.yaml` states them, with the names of the caller's objects
     config = _make_config(
         scene, model, task, controls, objective, policy, over, metrics, run, options
     )
@@ -135,7 +135,7 @@ def attack(
     config = config.with_python_only_parts(python_only)
     _check_single_attack(config)
 
-    # Objects of the caller are used as they are. What is only named is made.
+    # The caller's own objects are used. The others are made from the settings.
     searched, random_controls = make_attack_controls(config, controls, over)
     if not isinstance(policy, Policy):
         policy = make_policy(config.policy_name, **config.policy_options)
@@ -144,7 +144,7 @@ def attack(
         task if isinstance(task, Task) else config.task,
         objective if callable(objective) else config.objective,
     )
-    # None if nothing is stored, or if `run_attack` makes the directory itself
+    # `directory` is None if nothing is stored, or if another run is overwritten.
     with _open_run(run, resume, config) as directory:
         parts = AttackParts(
             config=config,
@@ -337,12 +337,12 @@ def _load_scene(
     scene_options = {
         name: options[name] for name in naming.SCENE_SETTINGS if name in options
     }
-    # The setting `object` is required, but its value "mug" is not used below.
+    # The setting `object` is required, but only the other settings are used.
     config = SceneConfig(**{"object": "mug", **scene_options})
     environment = config.environment
     keywords = naming.make_scene_kwargs(config)
-    # `load_scene` takes the object first. That is a shape of a scene with several, or
-    # else `scene` itself is the name or the file of an object.
+    # The first argument of `load_scene` is the object: one shape of a scene with several
+    # shapes, or the name or file that `scene` is.
     if shape is not None:
         return loading.load_scene(shape, environment, scene=scene, **keywords)
     if isinstance(scene, Mapping):
@@ -371,8 +371,9 @@ def _check_single_attack(config: AttackConfig) -> None:
     """Check that the settings describe a single attack, which can be made.
 
     Raises:
-        InputError: they describe several attacks. Or they request workers, but not with
-            functions that these can load; or layers, but no run directory for them.
+        InputError: they describe several attacks; or they request workers, which cannot
+            load one of the metrics; or they request image layers (`aov`), but no run
+            directory in which these are saved.
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_metrics_importable(config.metrics)

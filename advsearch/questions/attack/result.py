@@ -352,6 +352,7 @@ class StoredImage:
             configuration = problem.make_full_configuration(u, None)
             spp = UNTRIED_SPP
         else:
+            # as in the trial, which has the same seed
             seed = seeds.derive_seed(problem.seed, "verification", trial)
             configuration = problem.make_full_configuration(u, seed)
             spp = findings.spp
@@ -372,37 +373,36 @@ class StoredImage:
 def choose_stored_trial(findings: RunState) -> int | None:
     """Return the number of the trial whose images of both scenes are stored.
 
-    A trial renders both scenes under the same conditions. The chosen trial is typical:
-    the adversarial scene has its most frequent prediction among the successes. If no
-    trial is a success, it has the most frequent one among the trials that count. If
-    possible, the clean scene has its most frequent prediction, too. The first such
-    trial is chosen. None if there were no trials.
+    A trial renders both scenes under the same conditions. In the chosen trial, the
+    adversarial scene has its most frequent prediction among the successes, or among all
+    trials that count if none is a success. If possible, the clean scene has its most
+    frequent prediction, too. The first such trial is chosen. None if there were no
+    trials.
     """
     verification = findings.verification
     if verification is None:
         clean_labels = _list_labels(findings.clean_trials)
         return clean_labels.index(mode(clean_labels)) if clean_labels else None
     clean_labels = _list_labels(verification.clean_trials)
-    # The outcome of a trial is True for a success, False for a failure, and None if the
-    # trial does not count. A typical trial is a success if there are any.
-    typical_outcome = bool(verification.successful_trials)
+    # A trial is a success (True), a failure (False), or does not count (None).
+    has_successes = bool(verification.successful_trials)
     typical_trials = verification.successful_trials or verification.valid_trials
     frequent_label = mode(_list_labels(typical_trials))
     frequent_clean_label = mode(clean_labels)
-    # The criteria that each trial meets, the most important first. Tuples of bools are
-    # compared in this order, so that the largest one is the most typical trial.
-    ranks = list[tuple[bool, bool, bool]]()
-    for label, outcome, clean_label in zip(
+    # The criteria that each trial meets, the most important first.
+    criteria = list[tuple[bool, bool, bool]]()
+    for label, is_success, clean_label in zip(
         _list_labels(verification.adversarial_trials),
         verification.trial_successes,
         clean_labels,
         strict=False,  # trials of one scene may have ended earlier
     ):
         has_label = label == frequent_label
-        has_label_and_outcome = has_label and outcome is typical_outcome
+        is_typical = has_label and is_success is has_successes
         has_clean_label = clean_label == frequent_clean_label
-        ranks.append((has_label_and_outcome, has_label, has_clean_label))
-    first_best = ranks.index(max(ranks))
+        criteria.append((is_typical, has_label, has_clean_label))
+    # Tuples are compared element by element, and True is larger than False.
+    first_best = criteria.index(max(criteria))
     return verification.first_index + first_best
 
 
@@ -435,8 +435,8 @@ def save_images(
     )
     run.save_image("difference", difference)
     verification = findings.verification
-    # The kind under which the images of trials are cached. If the random search found
-    # a worse configuration, this is the adversarial one, verified as the baseline.
+    # Images of trials are cached by the kind of the verification. If the random search
+    # found a worse configuration, the adversarial one was verified as the baseline.
     kind = "verification"
     if findings.outdone_verification is not None:
         kind = "baseline verification"
@@ -454,10 +454,10 @@ def save_images(
     if findings.search_frames:
         last_frame = scene_images["adversarial"].image
         if problem.conditions is not None and findings.search_result is not None:
-            # That image may have the conditions of a trial. Frames of the search have
-            # the start values of the conditions, and so must the last one.
+            # The image of the adversarial scene may have the conditions of a trial. All
+            # frames have the start values of the conditions, and so must the last one.
             u = problem.domain.project(findings.search_result.best_u)
-            last_frame = StoredImage.render(problem, findings, u, None).image
+            last_frame = StoredImage.render(problem, findings, u, trial=None).image
         run.save_animation("search", [*findings.search_frames, last_frame.numpy()])
 
 
@@ -533,7 +533,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
 
     Other meshes that controls move or paint are written, too, if they are near. Meshes
     with many faces are simplified, so that all together have at most about `MAX_FACES`.
-    A note in the file states which.
+    A note in the file names the simplified ones.
 
     Args:
         run: run directory into which it is written.
@@ -543,13 +543,14 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     scene = problem.space.scene
     if scene is None:
         return
+    # the inputs of both scenes
     adversarial = _assemble(problem, u)
     clean = _assemble(problem, problem.domain.start)
     # An input of the scene is named as "mug.bsdf.reflectance": the mesh comes first.
     changed_names = {OBJECT, *(name.partition(".")[0] for name in adversarial)}
     meshes = [mesh for name, mesh in scene.meshes.items() if name in changed_names]
     max_faces = MAX_FACES // len(meshes)
-    # functions by the name of the mesh; None if it has few faces already
+    # the function that simplifies each mesh; None if the mesh has few faces already
     simplifiers = {mesh.name: make_simplifier(mesh.mesh, max_faces) for mesh in meshes}
 
     def make_shapes(inputs: Mapping[str, Tensor]) -> list[Shape]:
@@ -646,8 +647,9 @@ def evaluate_drive(
     first_time = _read_time(problem, path, frames[0])
     last_time = _read_time(problem, path, frames[-1])
     seconds = last_time - first_time
-    # The animation has the paths one after another; a single path has no name.
-    total_seconds = seconds * max(1, len(path_names))
+    # The animation has the paths one after another.
+    n_paths = max(1, len(path_names))  # a single path has no name
+    total_seconds = seconds * n_paths
     right_counts: dict[str, int] = {}
     # the configuration of each scene, by the name of its files
     for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
@@ -706,10 +708,11 @@ def _make_frames(
         of one path after those of the other.
     """
     start = problem.make_full_configuration(problem.domain.start)
-    # A path with a weight comes several times among the choices.
+    # A path with a weight is repeated among the choices.
     choices = _list_path_choices(path)
     names = list(dict.fromkeys(choices))
-    frames = start.repeat(max(1, len(names)), FRAMES, 1)  # (paths, FRAMES, d)
+    n_paths = max(1, len(names))  # a single path has no name
+    frames = start.repeat(n_paths, FRAMES, 1)  # (paths, FRAMES, d)
     frames[..., time_column] = torch.linspace(0.0, 1.0, FRAMES)
     path_column = time_column + 1  # the choice of path is the next coordinate
     for index, name in enumerate(names):

@@ -105,7 +105,8 @@ def run_attack(
     """
     config = parts.config
     if config.twins is not None:
-        read_twins(config.twins)  # only a check, before the work: raises if corrupt
+        # The result is not used: the call raises an error if the run is corrupt.
+        read_twins(config.twins)
     model, loading_notes = parts.model_and_warnings
     with ExitStack() as stack:
         run = None
@@ -116,6 +117,7 @@ def run_attack(
         problem = make_problem(parts)
         warnings = _report_warnings(parts, progress, problem, loading_notes)
         policy = choose_policy(parts.policy, problem, _find_gradient_setting(config))
+        # The directory of a new run is made only now, as the parts fit together.
         if run is None and parts.is_stored:
             run = stack.enter_context(RunDirectory.open(config))
         if run is not None:
@@ -180,14 +182,14 @@ def _report_warnings(
 def _report_search_size(
     progress: Progress, config: AttackConfig, problem: Problem
 ) -> None:
-    """Report how many steps and conditions were chosen for a search over conditions."""
+    """Report the chosen numbers of steps and conditions, if conditions vary by chance."""
     is_size_chosen = config.steps is None or config.draws is None
     if problem.conditions is not None and is_size_chosen:
+        steps = format_count(problem.steps, "step")
+        conditions = format_count(problem.conditions_per_evaluation, "condition")
         progress.message(
-            "One configuration for many conditions: "
-            f"{format_count(problem.steps, 'step')}, each over "
-            f"{format_count(problem.conditions_per_evaluation, 'condition')}; `steps` and `draws` change "
-            "that."
+            f"One configuration for many conditions: {steps}, each over {conditions}; "
+            "`steps` and `draws` change that."
         )
 
 
@@ -210,8 +212,8 @@ def _search(
     Returns:
         The findings, a `RunState`.
     """
-    # Without a fixed number, trials end as soon as the verdict is clear. The search of
-    # the smallest change needs many verdicts, so its number of trials is fixed.
+    # Trials end as soon as the verdict is clear, unless their number is fixed. The
+    # search of the smallest change, which needs many verdicts, has a fixed number.
     has_trial_count = config.trials is not None or config.smallest
     return search_and_verify(
         policy,
@@ -222,7 +224,7 @@ def _search(
         seconds=config.seconds,
         baseline=config.baseline,
         printable=config.printable,
-        close_looks=config.max_extra_repeats,
+        max_extra_repeats=config.max_extra_repeats,
         average=config.average,
         trials=config.trial_count if has_trial_count else None,
         ladder=choose_ladder(config.verify_spp, config.pixel_sampler),
@@ -243,7 +245,7 @@ def search_and_verify(
     seconds: float | None = None,
     baseline: bool = True,
     printable: bool = False,
-    close_looks: int = 0,
+    max_extra_repeats: int = 0,
     average: int = 0,
     trials: int | None = None,
     ladder: Sequence[int] = LADDER,
@@ -267,8 +269,8 @@ def search_and_verify(
         baseline: whether a random search with as many renders is made.
         printable: whether the objective includes print terms, which keep colors
             printable. Then a search without them is made, too.
-        close_looks: maximum number of further renders of candidates that are close to
-            the best.
+        max_extra_repeats: maximum number of further renders of candidates that are
+            close to the best.
         average: number of random configurations to evaluate.
         trials: renders that verify a configuration; None for as many as its verdict
             needs.
@@ -282,17 +284,21 @@ def search_and_verify(
             search.
     """
     problem = journal.problem
-    first_spp = (
-        problem.search_spp
-    )  # `plan_renders` may choose another one for the search
+    # for the first renders, as `plan_renders` may choose another one for the search
+    first_spp = problem.search_spp
     findings = RunState()
-    looks = _choose_looks(problem, trials)
-    verifier = Verifier(journal, ladder, stages, findings, looks)
+    look_sizes = _choose_look_sizes(problem, trials)
+    verifier = Verifier(journal, ladder, stages, findings, look_sizes)
     searches = Searches(
-        journal, stages, findings, printable=printable, max_extra_repeats=close_looks
+        journal,
+        stages,
+        findings,
+        printable=printable,
+        max_extra_repeats=max_extra_repeats,
     )
     if smallest:
-        # only a check: raises if there is no budget, before anything is rendered
+        # The result is not used: the call raises an error if there is no budget, before
+        # anything is rendered.
         scale_domain(problem.domain, 1.0)
     try:
         with reraise_lost_interrupt():
@@ -332,11 +338,11 @@ def search_and_verify(
     return findings
 
 
-def _choose_looks(problem: Problem, trials: int | None) -> tuple[int, ...]:
+def _choose_look_sizes(problem: Problem, trials: int | None) -> tuple[int, ...]:
     """Return the numbers of trials after which a verification may end.
 
-    A verification evaluates its trials after each of these numbers, and ends as soon as
-    they suffice for a verdict. Conditions that vary by chance need more trials.
+    After each of these numbers a verification looks at its trials, and ends if they
+    suffice for a verdict. Conditions that vary by chance need more trials.
 
     Args:
         problem: problem of the attack.
@@ -380,14 +386,18 @@ def search_with_baselines(
         seconds=seconds,
     )
     if seconds is not None:
-        # The other searches get as many steps as the first one had renders for its steps
-        # within the time. `history` lacks the ranking that follows the steps.
+        # The other searches get as many steps as the first one rendered images within
+        # the time, without its ranking, which `history` lacks.
         history = findings.search_result.history
-        steps = max(1, history[-1].renders) if history else 1
+        n_renders = history[-1].renders if history else 0
+        steps = max(1, n_renders)
     if searches.printable:
         title = "searching without print terms, to see what they cost"
         searches.begin_stage(
-            "without print terms", title, steps, "`printable=false` leaves both out"
+            "without print terms",
+            title,
+            steps,
+            "`printable=false` leaves out this search and the print terms",
         )
         findings.result_without_print_terms = searches.run_search(
             UNPRINTED, policy, steps, problem.seed
@@ -414,12 +424,11 @@ def choose_policy(
     what is searched: ranges, such as a pose, or budgets with an epsilon, such as a
     texture's.
 
-    - If the model is behind an address (a remote one), it has no gradient. For ranges
-      alone, `auto` leaves out its gradient steps, and keeps its samples and its
-      surrogate model. Otherwise "nes" replaces it, which estimates a gradient from
-      differences.
-    - If a local model has no gradient, "nes" replaces `auto` for budgets alone. If any
-      range is searched, `auto` stays.
+    - A remote model, behind an address, has no gradient. If only ranges are searched,
+      `auto` leaves out its gradient steps, and keeps its samples and its surrogate
+      model. Otherwise "nes" replaces it, which estimates a gradient from differences.
+    - If a local model has no gradient, and only budgets are searched, "nes" replaces
+      `auto`. If any range is searched, `auto` stays.
 
     Args:
         policy: the requested policy.
@@ -435,7 +444,8 @@ def choose_policy(
     norms = {block.norm for block in problem.domain.blocks}
     has_only_ranges = norms == {"box"}
     has_only_budgets = "box" not in norms
-    if isinstance(problem.model.module, RemoteNetwork):
+    is_remote = isinstance(problem.model.module, RemoteNetwork)
+    if is_remote:
         if policy.name == "auto":
             # `WithoutAscent` is `auto` without gradient steps
             policy = WithoutAscent() if has_only_ranges else make_policy("nes")
@@ -468,6 +478,7 @@ def find_user_functions(parts: AttackParts) -> dict[str, Callable[..., Any] | No
     """Return the caller's own functions by their role, such as "objective".
 
     A run stores their digests, since it can only be continued with the same functions.
+    The value of "task" is None if the task is not a function.
     """
     functions: dict[str, Callable[..., Any] | None] = {
         f"metric {name}": metric for name, metric in parts.metrics.items()

@@ -88,9 +88,9 @@ def plan_renders(
     """Choose light bounces, gradient estimators and samples of a search by measurement.
 
     The choice is set in the journal's problem and stored, so that a run that is
-    continued uses the same. Bounces are not measured if light on surfaces may predict
-    the images of the search. Gradient estimators are not measured if matrices of light
-    transport may, unless a full measurement is requested.
+    continued uses the same. Bounces are measured only if light on surfaces cannot
+    predict the images of the search. Gradient estimators are measured if matrices of
+    light transport cannot, or if a full measurement is requested.
 
     Args:
         policy: policy of the search. Gradients are measured only if it uses them.
@@ -116,11 +116,13 @@ def plan_renders(
         surface_light_refusal = surface_light.find_surface_light_refusal(
             problem, problem.steps, policy, specialise
         )
-        if surface_light_refusal is not None:
+        can_surface_light_predict = surface_light_refusal is None
+        if not can_surface_light_predict:
             _choose_bounces(problem, stages)
     if policy.uses_gradient and measure != "no":
         matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
-        if is_full or matrix_refusal is not None:
+        can_matrices_predict = matrix_refusal is None
+        if is_full or not can_matrices_predict:
             _measure_gradients(
                 problem,
                 stages,
@@ -150,8 +152,8 @@ def _choose_bounces(problem: Problem, stages: Stages) -> None:
         at_most=True,
     )
     tick = stages.progress.advance
-    bounces = planning.measure_problem_bounces(problem, problem.seed, tick=tick)
-    problem.search_depth = bounces.depth
+    path_length = planning.measure_problem_bounces(problem, problem.seed, tick=tick)
+    problem.search_depth = path_length.depth
 
 
 def _measure_gradients(
@@ -179,11 +181,11 @@ def _measure_gradients(
     counts_renders = not full or deterministic
     seed = seeds.derive_seed(problem.seed, "measure")
     bench = Bench(
-        renderer,
-        problem.compute_loss,
-        find_interior_point(renderer),
-        seed,
-        problem.search_spp,
+        renderer=renderer,
+        loss=problem.compute_loss,
+        u=find_interior_point(renderer),
+        seed=seed,
+        spp=problem.search_spp,
         tick=lambda samples: progress.advance(1),
     )
     n_gradients = planning.count_plan_gradients(renderer.plan, with_all=full)
@@ -211,13 +213,14 @@ def _choose_gradient_steps(
 
     Args:
         problem: problem whose plan gets the steps.
-        bench: bench of the gradients.
+        bench: measures gradients of the problem's loss.
         stages: reports what is measured.
 
     Returns:
         The samples per pixel that suffice for gradients; None if that is not known.
     """
-    # The measurement compares gradients by their cosine; its cost is in samples.
+    # Gradients of several steps and sample counts are compared by their cosine with a
+    # reference. Progress is counted in samples, since the sample counts differ.
     samples = planning.count_cosine_samples(problem.gradient_plan)
     stages.begin(
         "setup",
@@ -226,8 +229,8 @@ def _choose_gradient_steps(
         hint="counted in samples a pixel; `measure=quick` leaves it out",
         at_most=True,
     )
-    measured = replace(bench, tick=stages.progress.advance)
-    table = list(planning.measure_cosines(measured))
+    cosine_bench = replace(bench, tick=stages.progress.advance)
+    table = list(planning.measure_cosines(cosine_bench))
     problem.gradient_plan, spp = planning.choose_steps(problem.gradient_plan, table)
     return spp
 
@@ -261,9 +264,9 @@ def evaluate_clean_scene(
 def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     """Return whether the clean scene is wrong, so that there is nothing to search for.
 
-    The full trials decide. They are made only if the model was wrong in every one of
-    the first renders, or with `in_any_case`. If the rule of success does not compare
-    with the clean scene, a wrong clean scene is no reason to stop.
+    The full trials of the clean scene decide. They are made only if the model was wrong
+    in every one of the first renders, or with `in_any_case`. If the rule of success does
+    not compare with the clean scene, a wrong clean scene is no reason to stop.
 
     Args:
         verifier: verifier of the attack, whose state has the first renders.
@@ -271,15 +274,15 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     """
     problem = verifier.problem
     findings = verifier.run_state
-    if not problem.verification_rule.has_control:
+    compares_with_clean = problem.verification_rule.has_control
+    if not compares_with_clean:
         return False
     was_right_once = any(trial.right for trial in findings.first_look_trials)
     if was_right_once and not in_any_case:
         return False
     verifier.choose_spp({"clean": problem.domain.start})
-    min_trials = verifier.look_sizes[
-        0
-    ]  # trials after which a verdict is first possible
+    # trials after which a verdict is first possible
+    min_trials = verifier.look_sizes[0]
     verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.run_clean_trials()
     return problem.verification_rule.is_already_wrong(
@@ -300,9 +303,10 @@ def choose_predictor(
 
     A predictor replaces renders by something faster: a matrix of light transport, or a
     bank of matrices if conditions vary, or light on surfaces. Predictors are tried in
-    turn. If one is too inaccurate, the next one is tried; if one takes too much memory,
-    no other is. A refusal is the reason why a predictor is not used, or None if it may
-    be used. Refusals are stored in `findings` and reported.
+    turn, the cheapest first. If one is too inaccurate, the next one is tried. If one
+    takes too much memory, no other one is tried. A refusal is the reason why a
+    predictor is not used, or None if it may be used. Refusals are stored in `findings`
+    and reported.
 
     Args:
         policy: policy of the search.
@@ -322,15 +326,17 @@ def choose_predictor(
     surface_refusal = surface_light.find_surface_light_refusal(
         problem, steps, policy, specialise
     )
+    can_use_matrices = matrix_refusal is None
+    can_use_surface_light = surface_refusal is None
 
     candidates: list[Callable[[], PredictedSearch]] = []  # cheapest first
-    if matrix_refusal is None and problem.conditions is None:
+    if can_use_matrices and problem.conditions is None:
         # a single matrix predicts all images, if no condition varies
         candidates.append(lambda: Transport(problem, steps, clean_matrix=clean))
     else:
-        if surface_refusal is None:
+        if can_use_surface_light:
             candidates.append(lambda: SurfaceLight(problem, steps))
-        if matrix_refusal is None:
+        if can_use_matrices:
             candidates.append(lambda: Bank(problem, steps, journal.evaluator))
 
     for make_predictor in candidates:
@@ -340,18 +346,20 @@ def choose_predictor(
             return predictor
         if refusal.cause is RefusalCause.TOO_LARGE:
             return _crop_search(problem, refusal, stages, findings)
-        # The accuracy of matrices is not checked here, so this is light on surfaces.
+        # It is light on surfaces: matrices are never refused for their accuracy here.
         surface_refusal = refusal
         findings.surface_light_refusal = refusal
-        # the next candidate is the bank of matrices, unless it was refused above
-        instead = "rendered" if matrix_refusal else "predicted by matrices"
+        # The next candidate, if there is one, is the bank of matrices.
+        instead = "predicted by matrices" if can_use_matrices else "rendered"
         stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
-    # A matrix and a bank end the loop if they are tried at all, so they were refused
-    # before it. Light on surfaces was refused before it or in it.
+    # If matrices could be used, the loop has returned. Light on surfaces was refused
+    # before the loop or in it.
     assert matrix_refusal is not None and surface_refusal is not None
     refusal = surface_refusal
-    if _is_about_matrices(problem, surface_refusal, findings, specialise=specialise):
+    if _is_matrix_refusal_more_helpful(
+        problem, surface_refusal, findings, specialise=specialise
+    ):
         refusal = matrix_refusal
     if not specialise:
         _report_rendering(refusal, stages, findings)
@@ -359,15 +367,14 @@ def choose_predictor(
     return _crop_search(problem, refusal, stages, findings)
 
 
-def _is_about_matrices(
+def _is_matrix_refusal_more_helpful(
     problem: Problem, surface_refusal: Refusal, findings: RunState, *, specialise: bool
 ) -> bool:
-    """Return whether the reported refusal is that of matrices, not of surface light.
+    """Return whether to report the refusal of matrices instead of that of surface light.
 
-    Neither a matrix nor light on surfaces predicts the images, and one reason is
-    reported. It is that of matrices if only the number of steps is too small for them,
-    which the user could change. It is also that of matrices if no camera moves: then
-    light on surfaces would not help anyway.
+    Neither predicts the images, and only one reason is reported. The user can act on
+    the refusal of matrices if they need only more steps. If no camera moves, light on
+    surfaces would not help anyway.
 
     Args:
         problem: problem of the attack.
@@ -375,7 +382,7 @@ def _is_about_matrices(
         findings: findings of the attack.
         specialise: whether images may be predicted.
     """
-    # This refusal is stored only if light on surfaces was tried and was inaccurate.
+    # stored only if light on surfaces was tried and was inaccurate
     was_inaccurate = findings.surface_light_refusal is not None
     refusal_with_any_steps = find_matrix_refusal(
         problem, steps=None, specialise=specialise
@@ -392,8 +399,8 @@ def _crop_search(
 
     Args:
         problem: problem of the attack.
-        refusal: why nothing predicts the images. It is stored in any case, but reported
-            only if full images are rendered.
+        refusal: why nothing predicts the images. It is always stored, and it is
+            reported if full images are rendered.
         stages: reports the preparation.
         findings: gets the refusals.
 
@@ -407,7 +414,7 @@ def _crop_search(
         if findings.crop_refusal is None:
             findings.predictor_refusal = refusal
             return crop
-    _report_rendering(refusal, stages, findings)  # also stores it
+    _report_rendering(refusal, stages, findings)
     return None
 
 
@@ -476,19 +483,22 @@ class Searches:
         samples = format_count(self.problem.search_spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
         predictor = self.run_state.predictor
-        # For the hint, a search is predicted if the main search ("search") is.
-        if predictor is not None and predictor.count_predicted("search", steps):
+        # The hint assumes that every search is predicted if the main one is ("search").
+        is_predicted = predictor is not None and bool(
+            predictor.count_predicted("search", steps)
+        )
+        if is_predicted:
             # A search ends with a ranking of the best configurations, always rendered.
-            n_traced = n_renders - steps
-            hint = f"{steps} pictures predicted and {n_traced} traced; {shorter}"
+            n_rendered = n_renders - steps
+            hint = f"{steps} pictures predicted and {n_rendered} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
 
     def _mark_domain(self, domain: Domain, policy: Policy[Any]) -> Domain:
         """Return the domain, marked with what its evaluations are like.
 
-        `exact` means that evaluations have no noise; rendered ones always have some.
-        `draws_conditions` means that the predictor itself draws the conditions of an
-        evaluation, which it does for policies that use gradients.
+        `is_noise_free` means that evaluations have no noise; rendered ones always have
+        some. `draws_conditions` means that the predictor samples the conditions of an
+        evaluation by itself, which it does for policies that use gradients.
 
         Args:
             domain: domain to search.
@@ -523,15 +533,15 @@ class Searches:
             policy: proposes configurations.
             steps: number of evaluations.
             seed: seed of the policy; renders have the seed of the problem.
-            frames: list to fill with images of the search, (H, W, 3) 8-bit values in
-                [0, 1], at most `MAX_FRAMES` and evenly spaced; None for none.
+            frames: list to fill with images of the search, (H, W, 3) in [0, 1] rounded
+                to 8 bits, at most `MAX_FRAMES` and evenly spaced; None for none.
             seconds: seconds that the search may take; None for no limit.
             domain: domain to search; None for that of the problem.
             ranked: whether the best configurations are rendered again.
 
         Raises:
             KeyboardInterrupt: the search was interrupted. If it was the first search,
-                its result so far is stored in `findings.search`.
+                its result so far is stored in `run_state.search_result`.
         """
         result = search(
             self._make_evaluate(steps, has_frames=frames is not None),
@@ -612,9 +622,8 @@ class Searches:
     def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
         """Evaluate queries with predicted or rendered images.
 
-        If there is a predictor, it predicts the steps of the search. The ranking at the
-        end, which compares the best configurations, is rendered. If the predictor
-        covers only a window of the image, only the window is rendered. If colors are to
+        If there is a predictor, it evaluates the steps of the search. The ranking at
+        the end, which compares the best configurations, is rendered. If colors have to
         be printable, print terms are subtracted from the objective.
 
         Args:
@@ -627,7 +636,7 @@ class Searches:
         elif queries[0].phase == "ranking":
             evaluations = predictor.rank_all(queries, evaluate_rendered)
         else:
-            # it may need rendered images, too: to check itself, or once it is given up
+            # It renders, too: to check its predictions, and after it was given up.
             evaluations = predictor.evaluate_all(queries, evaluate_rendered)
         for query, evaluation in zip(queries, evaluations, strict=True):
             # `UNPRINTED` is the kind of the search that measures what the terms cost
@@ -645,7 +654,8 @@ def _choose_verification_samples(
 
     Args:
         verifier: verifier of the attack.
-        results: results of all searches; their cost limits what the choice may cost.
+        results: results of all searches. If conditions vary, the verification may not
+            render more samples than they did.
         adversarial: (d,) the adversarial configuration.
     """
     problem = verifier.problem
@@ -662,12 +672,14 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
 
     First the samples per pixel are chosen, so that more samples would not change the
     sign of the margin. A search of the smallest change keeps the count that was chosen
-    for the clean scene: its result has a margin near 0, whose sign no count settles.
+    for the clean scene: the margin of its result is near 0, so that noise decides its
+    sign at any count.
+
     Then the clean configuration, the adversarial one, that of the search without print
     terms and that of the random search are tried with equal seeds. If the random search
     found something worse for the model, that becomes the adversarial configuration.
-    Finally, different failures of the policy are verified, and it is measured in how
-    bright ambient light an adversarial light still holds.
+    Finally, different failures of the policy are verified. If the attack searches a
+    projector's light, it is measured up to which ambient light it holds.
 
     Args:
         verifier: verifier of the attack, whose state gets the results.
@@ -683,8 +695,8 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     results = [
         result for result in (candidate, baseline, unprinted) if result is not None
     ]
-    has_sample_count = findings.sample_count is not None
-    if not is_smallest or not has_sample_count:
+    keeps_sample_count = is_smallest and findings.sample_count is not None
+    if not keeps_sample_count:
         _choose_verification_samples(verifier, results, adversarial)
     # Groups of trials in this stage, one for each configuration. Failures and ambient
     # light have stages of their own.
@@ -699,9 +711,9 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     verifier.run_clean_trials()
     findings.verification = verifier.verify("verification", candidate)
     if findings.verification.ending is Ending.ALREADY_WRONG:
-        # The clean scene is wrong at the sample count of the verification, which is
-        # another one than in the search. So no change is needed at all, and bounds of
-        # the smallest one (the bracket) mean nothing.
+        # The model is wrong about the clean scene at this sample count, which is not
+        # that of the search. So no change is needed, and bounds of the smallest change
+        # mean nothing.
         findings.smallest_change_bracket = None
     if unprinted is not None:
         findings.unprinted_verification = verifier.verify(
@@ -717,7 +729,7 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         _replace_if_random_is_worse(verifier, candidate, baseline)
     if not is_smallest:
         verify_failures(verifier, candidate)
-    # the verification of the random search's configuration, if that replaced it above
+    # read again: `_replace_if_random_is_worse` may have replaced it
     verification = findings.verification
     if verification.ending is Ending.FOUND:
         find_ambient(verifier, verification.u)
@@ -739,21 +751,24 @@ def _replace_if_random_is_worse(
     """
     findings = verifier.run_state
     policy_verification = findings.verification
-    random = findings.baseline_verification
-    if policy_verification is None or random is None:
+    random_verification = findings.baseline_verification
+    if policy_verification is None or random_verification is None:
         return
-    if random.ending is not Ending.FOUND:
+    if random_verification.ending is not Ending.FOUND:
         return
-    if _rank(random) <= _rank(policy_verification):
+    if _rank(random_verification) <= _rank(policy_verification):
         return
     # twice the trials: of the configuration, and of the clean scene with their seeds
     title = "checking what the random search found again"
     verifier.begin_stage(title, 2 * verifier.n_trials, at_most=True)
-    random = verifier.verify("baseline verification", baseline, with_new_trials=True)
-    findings.baseline_verification = random
-    if _rank(random) > _rank(policy_verification):
+    random_verification = verifier.verify(
+        "baseline verification", baseline, with_new_trials=True
+    )
+    findings.baseline_verification = random_verification
+    if _rank(random_verification) > _rank(policy_verification):
         findings.outdone_verification = policy_verification
-        findings.verification = random
+        findings.verification = random_verification
+        # what the random search found, with the policy's history and counts
         findings.search_result = replace(
             result,
             best_u=baseline.best_u,
@@ -791,8 +806,8 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
     n_trials = verifier.n_trials
     max_failures = problem.verification_rule.count_allowed_failures(n_trials)
     results: list[SearchResult] = []
-    # A matrix of light transport predicts scores without noise. It estimates which
-    # configurations are likely to pass, and learns from the trials how far it is off.
+    # A matrix of light transport predicts scores without noise. By them it estimates
+    # which configurations are likely to pass. The scores of trials correct its bias.
     transport = None
     is_likely = None
     if isinstance(findings.predictor, Transport):
@@ -823,6 +838,8 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
         if transport is not None:
             transport.update_score_bias(u, scores)
         if has_passed:
+            # The other fields are those of the last search, until the end of
+            # `find_smallest`. This result is used only after an interrupt.
             findings.search_result = replace(results[-1], best_u=u)
         return has_passed
 
@@ -843,7 +860,7 @@ def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -
 def _search_budget(
     searches: Searches, policy: Policy[Any], domain: Domain, number: int
 ) -> SearchResult:
-    """Search one of the smaller and smaller budgets.
+    """Search in one of the shrinking budgets by which the smallest change is found.
 
     Args:
         searches: searches of the attack.
@@ -888,7 +905,7 @@ def _confirm(
         verifier: verifier that tries it.
         domain: domain with the full budget.
     """
-    # as many full checks as have `MIN_CONFIRMING_TRIALS` trials in total
+    # full checks that together have at least `MIN_CONFIRMING_TRIALS` trials
     n_checks = math.ceil(MIN_CONFIRMING_TRIALS / verifier.n_trials)
     if bracket.u is not None:
         verifier.begin_stage(
@@ -917,13 +934,13 @@ def _try_until_decided(
     Returns:
         The scores of the trials, and whether the configuration has passed.
     """
-    n_trials = verifier.n_trials
     scores = list[float]()
     n_failures = 0
-    while len(scores) < n_trials and n_failures <= max_failures:
-        if n_failures == 0 and len(scores) >= min_trials:
+    for trial_index in range(verifier.n_trials):
+        has_failed = n_failures > max_failures
+        has_passed_early = n_failures == 0 and trial_index >= min_trials
+        if has_failed or has_passed_early:
             break
-        trial_index = len(scores)
         (trial,) = verifier.try_configurations(f"check {check_index}", {trial_index: u})
         scores.append(trial.score)
         if not trial.success:
@@ -932,7 +949,7 @@ def _try_until_decided(
 
 
 def _combine_results(results: Sequence[SearchResult], bracket: Bracket) -> SearchResult:
-    """Return one result of several searches in smaller and smaller budgets.
+    """Return one result of several searches in shrinking budgets.
 
     It is the result of the search that found the smallest change, or of the first if
     none found any, but with the renders and gradients of all.
@@ -988,8 +1005,8 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
     rule = problem.verification_rule
     if known is None or not known.examples or rule.has_varying_conditions:
         return
-    # If the model is wrong about the clean scene, a failure proves nothing. `spp` is
-    # only recorded in the counts, and does not matter here.
+    # If the model is wrong about the clean scene, a failure proves nothing. Only the
+    # counts matter here, and not the `spp` that is stored with them.
     clean_counts = count_right(findings.clean_trials, spp=1)
     if rule.is_already_wrong(clean_counts):
         return

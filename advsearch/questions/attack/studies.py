@@ -123,13 +123,13 @@ def _matrix_chains(config: AttackConfig) -> list[Chain]:
         changes = {} if config.ensemble else {"model": name}
         attack_config = AttackConfig.from_config(config, **changes)
         directory = f"{index:02d}-" + make_default_name(name, [])
-        chains.append([StudyAttack(attack_config, directory, name)])
+        chains.append([StudyAttack(attack_config, directory, object_or_model=name)])
     return chains
 
 
 def _curve_chains(config: AttackConfig) -> list[Chain]:
     """Return the attacks of each object, with the smallest epsilon first."""
-    # None if the setting has no list of epsilons: `config.epsilon` is used as it is
+    # None if there is no list of epsilons: then `config.epsilon` stays as it is.
     epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
     chains: list[Chain] = []
     for index, name in enumerate(check_distinct(config.objects, "object")):
@@ -144,7 +144,11 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
                 epsilon=config.epsilon if epsilon is None else epsilon,
             )
             directory = f"{index:02d}-" + make_default_name(name, name_parts)
-            chain.append(StudyAttack(attack_config, directory, name, epsilon))
+            chain.append(
+                StudyAttack(
+                    attack_config, directory, object_or_model=name, epsilon=epsilon
+                )
+            )
         chains.append(chain)
     return chains
 
@@ -164,7 +168,7 @@ def make_chain_worker(settings: JsonObject) -> BatchFunction:
     def run_chain(batch: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
         """Make the attacks of the chain whose index is the only item of the batch."""
         finished = []
-        clean = CleanMatrix()
+        clean = CleanMatrix()  # shared by the attacks, which have the same clean scene
         (chain_index,) = batch
         with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
             for study_attack in chains[chain_index]:
@@ -175,7 +179,7 @@ def make_chain_worker(settings: JsonObject) -> BatchFunction:
                 ending = attack_once(config, clean=clean).summary.ending
                 finished.append((study_attack.name, str(path), _read_files(path)))
                 if ending in SETTLED:
-                    break  # no larger epsilon is needed
+                    break  # the attacks with larger epsilons are not needed
         return finished
 
     return run_chain
@@ -217,8 +221,8 @@ def distribute_attacks(
     work = WorkerTask(
         "advsearch.questions.attack.studies:make_chain_worker",
         worker_settings,
-        FILES,
-        config.n_used_threads or 1,
+        path_setting_names=FILES,
+        threads=config.n_used_threads or 1,
         min_timeout_seconds=MAX_ATTACK_SECONDS,
     )
     with open_workers(
@@ -231,7 +235,8 @@ def distribute_attacks(
         if executor is None:  # none are requested: this process makes the attacks
             return
         progress.stage("attacks on workers", len(missing_chains))
-        # Each batch is a single chain: the longest one ends last, and delays no other.
+        # Each batch is a single chain, so that no chain waits for another one in its
+        # batch.
         for result in executor.compute([index] for index in missing_chains):
             _check_not_lost(chains, result)
             for name, worker_path, files in result.value:
@@ -247,7 +252,7 @@ def _check_not_lost(chains: Sequence[Chain], result: BatchResult) -> None:
     The chain is named by its object, and in a matrix also by the attacked model.
     """
     if result.failure_reason:
-        (chain_index,) = result.items
+        (chain_index,) = result.items  # a batch is a single chain
         first_attack = chains[chain_index][0]  # all have the same object and model
         title = first_attack.config.object
         if first_attack.object_or_model != title:
@@ -291,7 +296,7 @@ class StudyRun:
 
     Attributes:
         chains: all attacks.
-        names: names of the attacks so far.
+        names: names of the directories of the attacks so far.
         warnings: warnings of these attacks, each sentence once.
     """
 
@@ -339,7 +344,7 @@ class StudyRun:
         config = attack.config
         path = self.run.path / PARTS / attack.name
         self.names.append(attack.name)
-        # epsilon may also be None or a mapping by control, which is not reported
+        # None and a mapping by control are not reported.
         budget = ""
         if isinstance(config.epsilon, float):
             budget = f", epsilon {config.epsilon:.3g}"
@@ -431,7 +436,8 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
         if summary is None:  # interrupted
             break
         renders.update(summary.renders)
-        # Without an epsilon of the curve, the summary has those of the controls.
+        # Without an epsilon of the curve, each control has its own, which may be a
+        # mapping by control.
         epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
         margin = None
         if summary.verified is not None:
@@ -459,21 +465,22 @@ def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
 
     It is known if the object was attacked with this epsilon or a larger one, if a wrong
     prediction was found, or if the clean scene is wrong already. It is not known if the
-    objective was not a number, or if the model is so often wrong about the clean scene,
-    because of noise, that no adversarial scene can be verified.
+    objective was not a number. It is not known either if the model is wrong about the
+    clean scene in so many trials that no adversarial scene can be verified.
 
     Args:
         row: row of the last attack on the object.
         epsilon: the epsilon; None for the own epsilon of each control.
     """
-    if row.ending in (None, "non-finite objective"):
+    if row.ending in (None, "non-finite objective"):  # None: no attack was made
         return False
     if row.ending in SETTLED:
         return True
     if row.clean is None:
         return False
     min_correct = WORST_CASE.count_needed_successes(row.clean.trials)
-    if row.clean.correct < min_correct:
+    can_be_verified = row.clean.correct >= min_correct
+    if not can_be_verified:
         return False
     return epsilon is None or (row.tried is not None and row.tried >= epsilon)
 
@@ -518,8 +525,9 @@ def _has_flipped(row: ObjectRow, epsilon: float | None) -> bool:
     """
     if row.ending != "found":
         return False
-    if epsilon is None:  # the object was attacked with these epsilons only
+    if epsilon is None:  # the object was attacked with the controls' own epsilons
         return True
+    # `flips_at` is a mapping if each control has an epsilon.
     return isinstance(row.flips_at, float) and row.flips_at <= epsilon
 
 
@@ -635,7 +643,8 @@ def _try_on_models(
         hint = f"{n_predictions} predictions; `trials` or `verify_spp` shorten it"
         title = "trying the clean scene on every model"
         study.progress.stage(title, n_predictions, hint=hint)
-        models += [_try_clean(retrials, condition) for condition in conditions]
+        for condition in conditions:
+            models.append(_try_clean(retrials, condition))
         for name, u in configurations.items():
             title = f"trying the scene against {name} on every model"
             study.progress.stage(title, n_predictions, hint=hint)
@@ -648,7 +657,7 @@ def _try_on_models(
 def _make_conditions(
     names: Sequence[str], spp: int, config: AttackConfig
 ) -> list[RetrialCondition]:
-    """Return a condition of trials for each model: its problem and the image size."""
+    """Return what trials need of each model: its problem, the samples and the image size."""
     conditions = []
     for name in names:
         problem, _ = problem_from_config(_with_model(config, name))
@@ -658,7 +667,7 @@ def _make_conditions(
 
 
 def _try_clean(retrials: Retrials, condition: RetrialCondition) -> MatrixModel:
-    """Return what a model predicts of the clean scene."""
+    """Try the clean scene on a model, and return how often it is right."""
     problem = condition.problem
     return MatrixModel(
         model=condition.name,
@@ -672,7 +681,7 @@ def _try_clean(retrials: Retrials, condition: RetrialCondition) -> MatrixModel:
 def _try_adversarial(
     retrials: Retrials, name: str, u: Tensor, condition: RetrialCondition
 ) -> MatrixCell:
-    """Return what a model predicts of an adversarial scene.
+    """Try an adversarial scene on a model, and return how often the model is wrong.
 
     Args:
         retrials: makes the trials.

@@ -110,7 +110,7 @@ def _name_thing(summary: AttackSummary) -> str:
     It is the object or a thing near it. An object that was loaded from a file has the
     name of the file.
     """
-    name = summary.judge
+    name = summary.judge  # the name of the thing, unless the object is evaluated
     if summary.judge in JUDGES_OF_OBJECT:
         name = PurePath(summary.object).stem
     thing = "this " + name.replace("-", " ").replace("_", " ")
@@ -122,7 +122,7 @@ def _random_search_remark(summary: AttackSummary, verified: VerifiedRate) -> str
     if summary.adversarial_from == "random":
         return " Random search found it, and the policy found nothing as bad."
     random_rate = summary.baseline.verified if summary.baseline else None
-    # If neither had a success, there is nothing to compare.
+    # Without any success of the policy, there is nothing to compare.
     if random_rate is None or verified.rate <= 0:
         return ""
     is_random_as_good = random_rate.rate >= verified.rate
@@ -168,8 +168,8 @@ def _clean_remark(summary: AttackSummary) -> str:
     n_failures = control.trials - control.correct
     if not n_failures:
         return ""
-    outcomes = words.format_outcomes(control.outcomes, summary.task)
-    outcomes = f" ({outcomes})" if outcomes else ""
+    outcome_text = words.format_outcomes(control.outcomes, summary.task)
+    outcomes = f" ({outcome_text})" if outcome_text else ""
     not_a_number = ""
     if control.not_a_number:
         not_a_number = f"; in {control.not_a_number} the output is not a number"
@@ -185,8 +185,8 @@ def _baseline_remark(summary: AttackSummary) -> str:
     """Return a remark if the random search did as well as the policy; else empty."""
     verified = summary.verified
     random_rate = summary.baseline.verified if summary.baseline else None
-    # Stored only if the random search found a configuration that is worse for the
-    # model: then `verified` is about that configuration, and this about the policy's.
+    # If the random search found a configuration that is worse for the model, `verified`
+    # is about that one, and `policy_verified` about the policy's. Else it is None.
     policy_rate = summary.policy_verified
     if summary.adversarial_from == "random" and policy_rate:
         return (
@@ -224,8 +224,8 @@ def goal_text(summary: AttackSummary) -> str:
 def objective_text(summary: AttackSummary) -> str:
     """Return the mean and the range of the objective in the trials.
 
-    Empty if it is not known, or if a trial is a success exactly when its objective is
-    above 0: then the rate is enough.
+    Empty if it is not known. It is also empty for objectives that are above 0 exactly in
+    trials that are a success: then the rate of success is enough.
     """
     objective = summary.tried_objective
     if objective is None or summary.objective in words.SUCCESS_ABOVE_ZERO:
@@ -262,6 +262,7 @@ def smallest_text(summary: AttackSummary) -> str:
         return ""
     smallest = _epsilons_text(bracket.epsilon)
     not_found_at = _epsilons_text(bracket.not_found_at)
+    # a search "fails" if it finds no wrong prediction
     if not smallest:
         return f"none found up to {not_found_at}"
     if not not_found_at:
@@ -287,7 +288,8 @@ def changed_text(summary: AttackSummary) -> str:
     """
     text = budget_text(summary)
     for norm, meaning in NORMS.items():
-        text = text.replace(f"({norm})", f"({norm}: {meaning})", 1)  # at its first use
+        # `budget_text` has a norm in parentheses. The first one gets the explanation.
+        text = text.replace(f"({norm})", f"({norm}: {meaning})", 1)
     return text
 
 
@@ -332,7 +334,8 @@ def renders_text(summary: AttackSummary) -> str:
 def print_cost_text(summary: AttackSummary) -> str:
     """Return what print terms cost; empty if that is not known.
 
-    ``margin -4.1 with the print terms, -6.3 without (200 steps): they cost 2.2 logits``
+    ``margin -4.1 with the print terms, -6.3 without (another search of 200 steps, 20
+    trials each): they cost 2.2 logits``
     """
     cost = None if summary.printability is None else summary.printability.cost
     if cost is None:
@@ -340,10 +343,11 @@ def print_cost_text(summary: AttackSummary) -> str:
     cost_text = "they cost nothing that shows here"
     if cost.cost > 0:
         cost_text = f"they cost {cost.cost:.3g} logits"
+    steps = format_count(cost.steps, "step")
     return (
         f"margin {cost.margin_with:.3g} with the print terms, "
-        f"{cost.margin_without:.3g} without (another search of "
-        f"{format_count(cost.steps, 'step')}, {cost.verified.trials} trials each): {cost_text}"
+        f"{cost.margin_without:.3g} without (another search of {steps}, "
+        f"{cost.verified.trials} trials each): {cost_text}"
     )
 
 
@@ -354,7 +358,7 @@ def _error_clause(
 
     - For a scene that is easier to recognise (setting `minimise`), or for a commanded
       action (task "command"), the clause is `claim`. If all actions deviate in the same
-      direction, it has the direction, too.
+      direction, the clause states the direction, too.
     - If all trials have the same prediction, the clause names it.
     - If they have several, it names the most frequent one, or the outcomes of a
       detector.
@@ -373,7 +377,7 @@ def _error_clause(
         return _begin_upper(claim)
     if summary.task == words.COMMAND:
         if only_label is not None and not summary.target:
-            # "action outside its envelope (steering above it)" gives the text in ()
+            # of "action outside its envelope (steering above it)", the end
             direction = only_label.replace("action outside its envelope ", "")
             claim = f"{claim} {direction}" if direction else claim
         return _begin_upper(claim)
@@ -385,10 +389,10 @@ def _error_clause(
         return _mixed_error_clause(summary, verified, thing)
     if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
-    name = "something else"
-    if summary.adversarial:
-        name = words.add_article(summary.adversarial.label)
-    return f"The model takes {thing} for something else ({name})"
+    error = f"The model takes {thing} for something else"
+    if not summary.adversarial:
+        return f"{error} (something else)"
+    return f"{error} ({words.add_article(summary.adversarial.label)})"
 
 
 def _begin_upper(clause: str) -> str:
@@ -403,7 +407,7 @@ def _mixed_error_clause(
 
     It names the most frequent prediction: "The model is wrong about this mug, most often
     calling it a vase,". A detector's predictions have outcomes, such as missed and
-    loose. If there are several, it names these instead.
+    loose. If there are several, the clause names the outcomes instead of a prediction.
 
     Args:
         summary: summary of the attack.
@@ -512,7 +516,7 @@ def _sample_count_text(summary: AttackSummary) -> str:
     """Return the samples of the verification, and whether they suffice.
 
     They suffice if more samples would not change the sign of the margin. If conditions
-    vary by chance (`over`), the rate must not change much.
+    vary by chance (`over`), they suffice if more would not change the rate much.
     """
     samples = summary.sample_count
     if samples is None:
@@ -543,7 +547,8 @@ def _rejected_text(summary: AttackSummary) -> str:
 
     A policy clips elements of a gradient that are outliers (`cut`), and scales a
     gradient down whose norm is an outlier (`shortened`). It undoes steps that make the
-    objective worse (`rejected`); it can do so without gradients, too.
+    objective worse (`rejected`). The text is empty without gradients and without steps
+    that were undone.
     """
     gradients = summary.gradients
     if gradients is None or not (gradients.count or gradients.rejected):
@@ -603,6 +608,7 @@ def transport_text(summary: AttackSummary) -> str:
     if not transport.used:
         text = "every picture was rendered"
         return f"{text}: {transport.reason}" if transport.reason else text
+    # "products" is the key of predicted images
     n_predicted = format_count(summary.renders.get("products"), "picture")
     if transport.method == "crop":
         parts = ["only the part of each picture was rendered that can change"]
@@ -611,11 +617,12 @@ def transport_text(summary: AttackSummary) -> str:
     else:
         parts = [f"a matrix predicted {n_predicted}"]
     if transport.error is not None:
+        levels = _short(transport.error.levels)
+        bias = _short(transport.error.margin_bias)
         parts.append(
-            "at the last comparison with a rendered picture its error was "
-            f"{_short(transport.error.levels)} of 255 levels of the picture's change "
-            "(root mean square) and "
-            f"{_short(transport.error.margin_bias)} of the objective"
+            f"at the last comparison with a rendered picture its error was {levels} of "
+            f"255 levels of the picture's change (root mean square) and {bias} of the "
+            "objective"
         )
     if transport.renewed:
         parts.append(f"made again {format_count(transport.renewed, 'time')}")

@@ -105,7 +105,7 @@ def list_bundled(config: CheckConfig) -> Iterator[CheckConfig]:
         if environment is not None:
             skipped.add("sky")  # it would replace the environment
         for control, control_type in workbench.CONTROLS.items():
-            # A control without parameters of its own gets them from a scene file.
+            # Bundled scenes define no parameters for controls without their own.
             if not control_type.parameters or control in skipped:
                 continue
             scene_fields = {
@@ -184,8 +184,7 @@ class GradientCheck:
         for finding in measure(part, title):
             findings.append(finding.to_dict())
             yield finding
-            # Reported after it was yielded: who collects findings may stop the check
-            # there.
+            # Reported after the `yield`, at which the caller may end the check.
             if isinstance(finding, CheckedRow):
                 self._report_row(finding)
         self.measurements.put(part.key, findings)
@@ -216,8 +215,8 @@ class GradientCheck:
         renderer = problem.renderer
         # The raw image has no tone curve.
         renderer.formation = replace(renderer.formation, transfer="linear")
-        # Differences have steps over which outlines move by a pixel: a smooth loss is
-        # not linear over wider steps.
+        # The steps of differences move outlines by at most about a pixel, since the loss
+        # is not linear over wider steps.
         renderer.plan = renderer.plan.with_pixel_steps()
         loss = gradients.make_smooth_loss(renderer.formation.resolution, config.seed)
         spp = config.spp if isinstance(config.spp, int) else RAW_SPP
@@ -240,8 +239,8 @@ class GradientCheck:
         Three kinds of results are yielded. First come the cosines between noisy
         gradients and a converged one, by which steps and samples are chosen. Then comes
         the plan of the search, except in a check of all bundled scenes (setting `all`).
-        The derivatives come last. Each has the factor between the step of differences
-        that the measurement has chosen and the one before it.
+        The derivatives come last. Each has the ratio of its chosen step of differences
+        to the default one.
 
         Args:
             part: controls and settings that are measured.
@@ -254,19 +253,19 @@ class GradientCheck:
             part, renderer, problem.compute_loss, problem.search_spp
         )
 
-        renderer.plan = self._choose_plan(title, bench, config)
+        renderer.plan = self._choose_estimators(title, bench, config)
+        default_steps = {group.name: group.step for group in renderer.plan.groups}
 
-        steps_before = {group.name: group.step for group in renderer.plan.groups}
         rows = list[results.Measured]()
         for row in self._measure_cosines(problem, bench, config.seed, title):
             rows.append(row)
             yield part.make_row(row)
-        renderer.plan, tuned_spp = planning.choose_steps(renderer.plan, rows)
-        spp = tuned_spp or problem.search_spp
+        renderer.plan, sufficient_spp = planning.choose_steps(renderer.plan, rows)
+        spp = sufficient_spp or problem.search_spp
 
         if not config.all:
             yield from self._plan_search(problem, part, spp)
-        step_factors = _divide_steps(renderer.plan.groups, steps_before)
+        step_factors = _divide_steps(renderer.plan.groups, default_steps)
         derivatives = gradients.measure_derivatives(
             replace(bench, spp=spp),
             reference_spp=planning.CONVERGED_SPP,
@@ -275,18 +274,20 @@ class GradientCheck:
         )
         for row in derivatives:
             # A coordinate of a vector is "center.0"; its group is the full vector.
-            group_name = f"{row.control}.{row.parameter.partition('.')[0]}"
+            parameter, _, _ = row.parameter.partition(".")
+            group_name = f"{row.control}.{parameter}"
             yield part.make_row(row, factor=step_factors.get(group_name, 1.0))
 
-    def _choose_plan(
+    def _choose_estimators(
         self, title: str, bench: gradients.Bench, config: CheckConfig
     ) -> Any:
         """Return the plan with the best estimators, by measurement."""
         n_gradients = planning.count_plan_gradients(bench.renderer.plan)
         stage_title = f"{title}: comparing ways to differentiate"
         self.progress.stage(stage_title, n_gradients, hint=HINT)
-        measure_bench = replace(bench, seed=seeds.derive_seed(config.seed, "measure"))
-        return planning.choose_estimators(measure_bench, count_renders=True)
+        # the seed with which an attack measures, too
+        seed = seeds.derive_seed(config.seed, "measure")
+        return planning.choose_estimators(replace(bench, seed=seed), count_renders=True)
 
     def _measure_cosines(
         self, problem: Problem, bench: gradients.Bench, seed: int, title: str
@@ -357,13 +358,13 @@ class GradientCheck:
     ) -> Iterator[Finding]:
         """Yield the plan of a search, its longest light paths, and what it saves.
 
-        What it saves is stated by a row for each item that is left out of the
-        rendering, such as bounces, and a row for the visible texels of each texture.
+        There is a row for each item that the rendering leaves out, such as bounces, with
+        the time that this saves. A further row for each texture has its visible texels.
         With `specialise=false` nothing is left out, and only the plan is yielded.
 
         Args:
             problem: problem of the scene.
-            part: what is measured.
+            part: part of the check; its key names the stored measurements.
             spp: samples per pixel of the search.
         """
         config = part.config
@@ -436,16 +437,16 @@ class GradientCheck:
 
 
 def _divide_steps(
-    groups: Sequence[Any], steps_before: dict[str, float]
+    groups: Sequence[Any], default_steps: dict[str, float]
 ) -> dict[str, float]:
-    """Return the factor between the step of each group and the one before, by name.
+    """Return the step of each group as a multiple of its default step, by name.
 
-    A group that takes no differences has a step of 0, and no factor.
+    A group that takes no differences has a step of 0, and is left out.
     """
     return {
-        group.name: group.step / steps_before[group.name]
+        group.name: group.step / default_steps[group.name]
         for group in groups
-        if steps_before[group.name] != 0.0
+        if default_steps[group.name] != 0.0
     }
 
 
@@ -473,7 +474,7 @@ def list_left_out(renderer: gradients.Renderer) -> list[str]:
     if not renderer.scene.is_volumetric:
         sentences.append("the volumetric integrator: there is no medium")
     if "material" in estimators:
-        # what this estimator leaves out or gets wrong
+        # effects that this estimator ignores or approximates
         sentences += [
             f"by the material form: {limit}" for limit in renderer.scene.material_limits
         ]

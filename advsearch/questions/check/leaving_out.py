@@ -60,11 +60,12 @@ def measure_gains(
 ) -> list[GainRow]:
     """Measure what a renderer saves by each item that it leaves out.
 
-    For each item there is a variant of the renderer that computes it, and one variant
-    computes all. Its images and gradients are compared with the search's. They are
-    rendered with two seeds, as the difference between seeds shows how much is noise.
-    Then gradients are timed in rounds over all variants, so that a slow moment of the
-    machine affects all of them alike.
+    The search's renderer computes no item. For each item there is a variant of the
+    renderer that computes it, and one variant computes all. The images and gradients of
+    each variant are compared with those of the search's renderer. All are rendered with
+    two seeds, and the difference between these shows how much is noise. Then gradients
+    are timed in rounds over all variants, so that a slow moment of the machine affects
+    all of them alike.
 
     Args:
         renderer: renderer of a search.
@@ -78,7 +79,8 @@ def measure_gains(
         tick: called after each gradient.
 
     Returns:
-        A row for each item, one for the bounces if these are limited, and one for all.
+        A row for each item, one for the bounces if the search limits them, and one for
+        all items together.
     """
     variants = _make_variants(renderer, depth)
     measurements = {item: _Measurements() for item in variants}
@@ -111,7 +113,7 @@ def _make_variants(
     """Return variants of a search's renderer, by the item that they compute.
 
     The variant `SEARCH` leaves out everything that it can. Each of the others computes
-    one of these items, and `ALL` computes all.
+    one of these items, and `ALL` computes all. `BOUNCES` has light paths of full length.
 
     Args:
         renderer: renderer that leaves out everything it can, except bounces: its light
@@ -131,7 +133,7 @@ def _make_variants(
         )
     leaves_out_bounces = depth < scene.max_depth
     if leaves_out_bounces:
-        variants[BOUNCES] = renderer
+        variants[BOUNCES] = renderer  # its light paths have their full length
     variants[ALL] = renderer.copy_with(scene.copy_with(leave_out=NO_ITEMS))
     return variants
 
@@ -157,8 +159,9 @@ def _compare_item(
     """Compare the renderer that computes an item with that of the search.
 
     `time_gain` is how many times longer the renderer with the item takes for an equally
-    noisy image. That is (ratio of seconds) * (ratio of variances), since the variance
-    of a Monte Carlo estimate falls as 1 / time.
+    noisy image. That is (ratio of seconds) * (ratio of variances), both of the renderer
+    with the item to that of the search, since the variance of a Monte Carlo estimate
+    falls as 1 / time.
 
     Args:
         item: name of the item.
@@ -168,15 +171,16 @@ def _compare_item(
     image_difference = _relative_difference(search.images, with_item.images)
     gradient_difference = _relative_difference(search.gradients, with_item.gradients)
     # Two images of the same renderer differ only by noise.
-    search_noise = _difference(search.images)
-    variance_gain = 1.0
+    search_noise = _seed_difference(search.images)
+    variance_ratio = 1.0
     if search_noise > 0.0:
-        variance_gain = (_difference(with_item.images) / search_noise) ** 2
+        variance_ratio = (_seed_difference(with_item.images) / search_noise) ** 2
     seconds = statistics.median(with_item.seconds)
+    search_seconds = statistics.median(search.seconds)
     return GainRow(
         item=item,
         what=WHAT[item],
-        time_gain=variance_gain * seconds / statistics.median(search.seconds),
+        time_gain=variance_ratio * seconds / search_seconds,
         picture_difference=image_difference,
         gradient_difference=gradient_difference,
         safe=max(image_difference, gradient_difference) <= AGREEMENT_LIMIT,
@@ -184,7 +188,7 @@ def _compare_item(
     )
 
 
-def _difference(pair: list[Tensor]) -> float:
+def _seed_difference(pair: list[Tensor]) -> float:
     """Return the norm of the difference between two seeds."""
     first, other = pair
     return float((other - first).norm())
@@ -201,7 +205,7 @@ def _relative_difference(without: list[Tensor], with_item: list[Tensor]) -> floa
         with_item: the same with the item, at the same seeds.
     """
     noise = math.sqrt(
-        statistics.fmean(_difference(pair) ** 2 for pair in (without, with_item))
+        statistics.fmean(_seed_difference(pair) ** 2 for pair in (without, with_item))
     )
     difference = float((with_item[0] - without[0]).norm())
     return difference / noise if noise > 0.0 else difference
@@ -257,7 +261,8 @@ def _find_sufficient_side(side: int, n_visible: int, n_pixels: int) -> int:
     sufficient = side
     while sufficient > 2:
         # The number of texels falls with the square of the side.
-        n_visible_of_half = n_visible * (sufficient / 2 / side) ** 2
+        half_fraction = sufficient / 2 / side
+        n_visible_of_half = n_visible * half_fraction**2
         if n_visible_of_half < TEXELS_PER_PIXEL * n_pixels:
             break
         sufficient //= 2
@@ -289,7 +294,8 @@ def _count_pixels(
     white_albedo, _ = scene.render_guides(white, seed, spp)
     black_albedo, _ = scene.render_guides(black, seed, spp)
     difference = white_albedo - black_albedo
-    return int((difference.amax(dim=-1) > 0.0).sum())
+    shows_texture = difference.amax(dim=-1) > 0.0
+    return int(shows_texture.sum())
 
 
 def _count_visible_texels(
@@ -314,7 +320,10 @@ def _count_visible_texels(
     """
     scene = renderer.scene
     with scene.limit_depth(2):
-        # gradient of the sum of all pixels
-        ones = torch.ones(*scene.resolution, 3)
-        gradient = scene.render_adjoint(inputs, ones, seed, spp, wrt=[name])[name]
-    return int((gradient.abs().amax(dim=-1) > 0.0).sum())
+        # The sum of all pixels has the derivative 1 by each of them.
+        pixel_gradient = torch.ones(*scene.resolution, 3)
+        gradients_by_input = scene.render_adjoint(
+            inputs, pixel_gradient, seed, spp, wrt=[name]
+        )
+    is_visible = gradients_by_input[name].abs().amax(dim=-1) > 0.0
+    return int(is_visible.sum())

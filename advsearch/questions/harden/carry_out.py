@@ -115,12 +115,13 @@ def run_hardening(
     splits = scenes.make_splits(config, original_model)
     work = SceneJobs(config, original_model, splits, context.progress)
     trainer = make_trainer(work, optimiser, examples=beside, loss=loss)
-    # A run that continues has to get the same Python arguments as before. Only those
-    # that the task uses are compared: `beside` is for classifiers, `loss` for the other
-    # tasks.
-    arguments: dict[str, Any] = {"optimiser": optimiser, "loss": loss}
+    # Only the arguments that the task uses are compared with those of an earlier
+    # session: `beside` is for classifiers, `loss` for the other tasks.
+    arguments: dict[str, Any] = {"optimiser": optimiser}
     if config.task_name == "classification":
-        arguments = {"optimiser": optimiser, "beside": beside}
+        arguments["beside"] = beside
+    else:
+        arguments["loss"] = loss
     check_same_arguments(context.run, arguments)
     workbench.check_digests(context.run, [original_model])
 
@@ -202,8 +203,9 @@ def load_task_model(config: HardenConfig, model: Any = None) -> tuple[Model, lis
     except errors.ModelError as error:
         if config.task_name != "classification":
             raise
-        # "classification" is the default task: perhaps none was named. An error like
-        # "...: use `task=depth`" advises a task that harden may not train for.
+        # "classification" is the default task: perhaps the user named none. The end of a
+        # message such as "...: use `task=depth`" is cut off, as harden may not train
+        # for that task.
         reason, _, _ = str(error).partition(": use `task=")
         raise errors.ModelError(
             f"{reason}; harden trains classifiers, and with `task` detectors and "
@@ -213,18 +215,21 @@ def load_task_model(config: HardenConfig, model: Any = None) -> tuple[Model, lis
 
 
 def check_same_arguments(run: RunDirectory, arguments: Mapping[str, Any]) -> None:
-    """Check that a resumed run gets the same Python arguments, and store which.
+    """Check that a resumed run gets each Python argument that it began with.
+
+    Only whether an argument is passed is stored and compared, and not its value.
 
     Args:
         run: the run.
         arguments: arguments by name; None for those that were not passed.
 
     Raises:
-        InputError: the run began with other arguments.
+        InputError: the run began with an argument that is missing, or without one that
+            is passed.
     """
     is_passed = {name: value is not None for name, value in arguments.items()}
     was_passed = json.loads(run.store.read_note(ARGUMENTS_NOTE) or "{}")
-    # What an earlier session stored stays.
+    # Entries of an earlier session are not overwritten.
     run.store.write_note(ARGUMENTS_NOTE, json.dumps({**is_passed, **was_passed}))
     for name, began_with_it in was_passed.items():
         if began_with_it != is_passed[name]:
@@ -240,8 +245,9 @@ class Hardening:
     """A run that measures a model, trains it, and measures it again.
 
     Attributes:
-        is_wrong_by_search: whether a search found a wrong prediction, by the kind of its row,
-            such as "before texture", and the number of the scene.
+        is_wrong_by_search: whether a search found a wrong prediction, by the kind of
+            its row, "MEASUREMENT CONTROL", such as "before texture", and the number of
+            the scene.
         clean_is_right: whether the model is right about each plain image of the
             held-out scenes, "before" and "after".
         outcomes: counts of what becomes of the object in the plain images that are not
@@ -263,9 +269,9 @@ class Hardening:
         self.clean_is_right: dict[str, list[bool]] = {}
         self.outcomes: dict[str, dict[str, int]] = {}
         n_training = self.config.scenes * self.config.rounds
-        # `measured` scenes are attacked. Plain images, which are cheaper, are evaluated
-        # in `CLEAN_SCENES` times as many.
-        n_held_out = scenes.CLEAN_SCENES * self.config.measured
+        n_attacked = self.config.measured
+        # Plain images are cheaper than attacks, so they are evaluated in more scenes.
+        n_held_out = scenes.CLEAN_SCENES * n_attacked
         self.n_scenes = {
             TRAINING: n_training,
             FURTHER: trainer.n_further_scenes * n_training,
@@ -316,6 +322,7 @@ class Hardening:
             for number in range(self.n_scenes[HELD_OUT])
         ]
         title = "looking at plain pictures of held-out scenes"
+        # without the indices of the jobs: the order of the scenes does not matter
         evaluations = [value for _, value in self.scene_jobs.run_jobs(title, jobs)]
         for when in ("before", "after"):
             is_right = list[bool]()
@@ -335,10 +342,10 @@ class Hardening:
                 those that the model was loaded with.
         """
         measurement = MEASUREMENTS[name]
-        steps_factor = 1
+        is_stronger = measurement.weaker_measurement is not None
+        steps_factor = scenes.STRONGER_STEPS_FACTOR if is_stronger else 1
         if measurement.weaker_measurement is not None:
-            steps_factor = scenes.STRONGER_STEPS_FACTOR
-            # If the weaker search has found a failure, the stronger one is not run.
+            # The stronger search is not run where the weaker one has found a failure.
             self._record_weaker(name, measurement.weaker_measurement)
         to_attack = self._list_unmeasured(name)
         jobs = [
@@ -369,7 +376,10 @@ class Hardening:
         ]
 
     def _record_weaker(self, name: str, weaker: str) -> None:
-        """Record the failures of the usual search for the stronger one, too.
+        """Record the failures that the usual search found for the stronger one, too.
+
+        A failure that a weaker search finds counts for the stronger search, which then
+        need not be run in that scene. The weaker measurement is complete.
 
         Args:
             name: the measurement with the stronger search.
@@ -388,7 +398,7 @@ class Hardening:
             measurement: a key of `MEASUREMENTS`.
             control: control that was searched.
             number: number of the scene.
-            is_wrong_by_search: whether it found a wrong prediction.
+            is_wrong: whether it found a wrong prediction.
         """
         kind = f"{measurement} {control}"
         self.is_wrong_by_search[kind, number] = is_wrong
@@ -405,7 +415,7 @@ class Hardening:
     ) -> list[bool] | None:
         """Return whether each measured scene withstood the searches of all controls.
 
-        None if any search in any scene is missing.
+        None if the measurement is not complete.
 
         Args:
             measurement: a key of `MEASUREMENTS`.
@@ -487,9 +497,10 @@ class Hardening:
 
     def _describe_workers(self) -> results.SharedWork | None:
         """Return how workers shared the scenes; None without workers."""
-        if not self.scene_jobs.executor or not self.scene_jobs.executor.facts:
+        executor = self.scene_jobs.executor
+        if not executor or not executor.stats:
             return None
-        stats = self.scene_jobs.executor.facts
+        stats = executor.stats
         return results.SharedWork.from_worker_stats(stats, stats.machines)
 
     def _make_clean_share(self, when: str) -> Share | None:
@@ -537,11 +548,12 @@ class Hardening:
 
     def _make_hardened_name(self) -> str | None:
         """Return the name that loads the hardened model; None if no name can."""
-        name = self.config.model.partition("@")[0].strip()
-        # With a colon, such as "mypackage:network", the name is that of code which
-        # makes the network; the weights are named after it.
-        if name == "reference" or ":" in name:
-            return f"{name}@{self.run.path / WEIGHTS_FILE}"
+        # The name of a model is "NETWORK" or "NETWORK@WEIGHTS".
+        network_name = self.config.model.partition("@")[0].strip()
+        # A name with a colon, such as "mypackage:network", names the code of a network.
+        is_made_by_code = network_name == "reference" or ":" in network_name
+        if is_made_by_code:
+            return f"{network_name}@{self.run.path / WEIGHTS_FILE}"
         return None
 
 
@@ -556,9 +568,9 @@ def _compare_robustness(
     """
     if before is None or after is None:
         return {}
-    pairs = list(zip(before, after, strict=True))
-    gained = pairs.count((False, True))
-    lost = pairs.count((True, False))
+    before_and_after = list(zip(before, after, strict=True))
+    gained = before_and_after.count((False, True))
+    lost = before_and_after.count((True, False))
     return {
         "gained": gained,
         "lost": lost,

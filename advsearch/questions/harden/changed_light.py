@@ -34,7 +34,8 @@ def vary_environment(
         radiance = radiance[:, ::-1]
     tint = np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
     radiance = radiance * tint
-    # contrast: a power of the radiance relative to the mean
+    # A power above 1 raises the contrast, one below 1 lowers it. Radiance at the mean
+    # stays the same.
     mean = float(radiance.mean()) + 1e-6  # not 0
     power = np.float32(rng.uniform(0.8, 1.15))
     radiance = mean * (radiance / mean) ** power
@@ -64,7 +65,7 @@ def sample_lobe(
     # zenith angle and azimuth of each texel, and of the light
     theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
     phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
-    # Zenith angles up to 1.3 rad (74 degrees) are above the horizon.
+    # A zenith angle of 1.3 rad (74 degrees) is 16 degrees above the horizon.
     light_theta = rng.uniform(0.1, 1.3)
     light_phi = rng.uniform(0.0, 2.0 * math.pi)
     # Spherical law of cosines: cos(angle) = cos(a) cos(b) + sin(a) sin(b) cos(phi -
@@ -72,7 +73,8 @@ def sample_lobe(
     vertical = np.cos(theta) * math.cos(light_theta)
     horizontal = np.sin(theta) * math.sin(light_theta)
     cosine = vertical + horizontal * np.cos(phi - light_phi)
-    # Sharpness 20 is a light of about 15 degrees to half its strength, 150 one of 5.5.
+    # The light falls to half its strength at about 15 degrees from its direction with
+    # sharpness 20, and at 5.5 degrees with 150.
     sharpness = rng.uniform(20.0, 150.0)
     strength = rng.uniform(2.0, 12.0)
     return np.asarray(strength * np.exp(sharpness * (cosine - 1.0)))

@@ -98,13 +98,14 @@ class Example(NamedTuple):
         truth: Any = problem.find_truth(
             problem.make_full_configuration(configuration, seed)
         )
-        # A region of segmentation has no box, nor has an object out of view.
+        # There is no box in segmentation, or if the object is out of view.
         box = getattr(truth, "box", None)
         boxes = torch.zeros(0, 4, dtype=torch.float32)
+        labels = torch.zeros(0, dtype=torch.int64)
         if box:
             boxes = torch.tensor([box], dtype=torch.float32)
-        # If several labels are right, training uses the first.
-        labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
+            # If several labels are right, training uses the first.
+            labels = torch.tensor([truth.labels[0]], dtype=torch.int64)
         return cls(
             image_uint8=color.to_uint8(problem.picture(configuration, seed, SPP)),
             boxes=boxes,
@@ -161,7 +162,7 @@ def read_coco(directory: Path, model: Model) -> list[Example]:
             file = _locate_image(image_directory, str(image["file_name"]), path)
             levels = _read_levels(file, image)
             boxes, labels = _read_boxes(annotations_of_image, image, label_of_category)
-            examples.append(Example(levels, boxes, labels))
+            examples.append(Example(image_uint8=levels, boxes=boxes, labels=labels))
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise errors.FileFormatError(
@@ -269,12 +270,14 @@ def compute_network_loss(
     """
     # `advsearch` wraps networks of both libraries: `inner` is the original network.
     inner: Any = getattr(network, "network", network)
+    is_wrapped = inner is not network
+    is_of_transformers = hasattr(inner, "config")
     loss: Any = None
-    if hasattr(inner, "config"):  # a network of transformers
+    if is_of_transformers:
         loss = inner(pixel_values=x, labels=_transformers_labels(x, targets)).loss
-    elif inner is not network:  # a network of torchvision
+    elif is_wrapped:  # a network of torchvision
         loss = inner(list(x), list(targets))
-    elif len(inspect.signature(network.forward).parameters) > 1:
+    elif _takes_targets(network):
         loss = network(x, list(targets))
     if isinstance(loss, Mapping):
         # `sum` makes a scalar of each loss, which may have shape () or (1,).
@@ -287,6 +290,11 @@ def compute_network_loss(
         )
     # The sum of a single element: a scalar, which `backward` needs.
     return loss.sum()
+
+
+def _takes_targets(network: nn.Module) -> bool:
+    """Return whether a network's `forward` takes more than its input."""
+    return len(inspect.signature(network.forward).parameters) > 1
 
 
 def _transformers_labels(
@@ -334,7 +342,7 @@ class DetectorTrainer(Trainer):
             optimiser: function from a list of parameters to an optimizer; None for
                 AdamW.
             custom_items: the user's own images, which each round trains on.
-            loss: training loss; None for `default_loss`.
+            loss: training loss; None for that of `default_loss`.
         """
         super().__init__(work, student, optimiser, custom_items)
         self.loss = loss or self.default_loss()
@@ -377,18 +385,20 @@ class DetectorTrainer(Trainer):
     def _render_further_views(
         self, split: str, number: int, control: str
     ) -> list[Example]:
-        """Return plain images of the views after the first, which a search has rendered.
+        """Return plain images of further views of a scene.
 
-        What is not searched varies at random from view to view, such as the camera.
+        `_attack` has rendered the first view. What is not searched varies at random from
+        view to view, such as the camera.
 
         Args:
             split: name of the split that the scene belongs to.
             number: number of the scene.
-            control: control that is searched, because a problem needs one; its search
-                has given the seed.
+            control: any searched control, which a problem needs; plain images do not
+                change it.
         """
         scene_split = self.scene_jobs.splits[split]
         problem, _ = self.scene_jobs.make_problem(scene_split, number, (control,))
+        # the same seed as in `sample_items`
         seed = seeds.derive_seed(scene_split.seed, f"search {control}", number)
         return [
             Example.render(problem, seeds.derive_seed(seed, "plain", view))
@@ -399,6 +409,9 @@ class DetectorTrainer(Trainer):
         self, scene: workbench.Scene, name: str, control: str, seed: int
     ) -> tuple[Example, Example]:
         """Attack the student in a scene; return a plain image and the worst one.
+
+        The worst image is that of the search's best configuration, even if the model is
+        right about it.
 
         Args:
             scene: scene to attack.
@@ -411,6 +424,7 @@ class DetectorTrainer(Trainer):
             (control,), name, seed=seed, trials=TRIALS, verify_spp=SPP
         )
         u = workbench.attack_on(config, scene, model).u
+        # a problem that only renders, without derivatives
         problem = workbench.make_problem_on(config, scene, model, differentiated=False)
         plain = Example.render(problem, seeds.derive_seed(seed, "plain", 0))
         worst = Example.render(problem, seeds.derive_seed(seed, "worst", 0), u)
@@ -508,6 +522,7 @@ class DetectorTrainer(Trainer):
         directory = f"{IMAGE_DIRECTORY}/round-{number:03d}"
         images = []
         annotations = list[dict[str, Any]]()
+        # Each image is written before it is yielded.
         written_items = write_images(run, f"{directory}/images", new)
         for image_id, (item, name) in enumerate(written_items, start=1):
             height, width = item.image_uint8.shape[:2]
@@ -587,7 +602,7 @@ def write_images(
         directory: directory of the images inside the run.
         items: items with their images.
     """
-    for number, item in enumerate(items, 1):
+    for number, item in enumerate(items, start=1):
         (run.path / directory).mkdir(parents=True, exist_ok=True)
         name = f"{number:05d}-{'worst' if item.is_adversarial else 'plain'}"
         run.save_image(name, item.image_uint8 / 255.0, directory)
@@ -626,8 +641,8 @@ class SegmenterTrainer(DetectorTrainer):
         with torch.no_grad():
             original_output = self.scene_jobs.model(levels[None] / 255.0)
         original_classes = original_output[0].argmax(dim=0)
-        size = tuple(original_classes.shape)
-        is_object = region.resize_mask(size).to(original_classes.device)
+        output_size = tuple(original_classes.shape)
+        is_object = region.resize_mask(output_size).to(original_classes.device)
         if is_mirrored:
             is_object = is_object.flip(1)
         x = _prepare_single(self.student.model, levels)

@@ -63,8 +63,8 @@ class Lesson:
 
     Attributes:
         right_classes: indices of the right classes.
-        plain_image_uint8: the plain image (H, W, 3) uint8, to save memory. If a scene is rendered
-            twice, a single control has changed in it.
+        plain_image_uint8: the plain image (H, W, 3) uint8, to save memory. In a lesson
+            with two rendered images, a single control has changed in it.
     """
 
     right_classes: tuple[int, ...]
@@ -107,11 +107,10 @@ class TextureLesson(Lesson):
             u: the texture as a configuration (d,), without the conditions.
         """
         inputs = self.space.inputs(u)
-        # The matrix belongs to the inputs of the scene in which images are linear.
+        # `linearized_at` has the inputs of the scene in which the image is linear.
         linear_names = self.image_predictor.linearized_at.keys()
         texture_inputs = {name: inputs[name] for name in linear_names}
-        # Some controls change the finished image, for which the full configuration is
-        # needed, too.
+        # Controls that change the finished image read the full configuration.
         configuration = torch.cat([u, self.conditions])
         image: Tensor = self.image_predictor.predict_image(
             texture_inputs, configuration
@@ -147,7 +146,7 @@ class RenderedLesson(Lesson):
         Args:
             right_classes: indices of the right classes.
             plain: the plain image (H, W, 3) in [0, 1].
-            images_uint8: the other images (N, H, W, 3) in [0, 1].
+            images: the other images (N, H, W, 3) in [0, 1].
         """
         never_evaluated = torch.full((len(images),), torch.inf)
         return cls(
@@ -211,9 +210,9 @@ def _make_texture_lessons(
 ) -> list[TextureLesson]:
     """Make a lesson with a matrix of light transport for each view of a scene.
 
-    Each view has sampled conditions of its own. Its texture starts at a random
-    configuration whose values are all at a bound. With `shares_texture` all lessons
-    have the same tensor, so that a step of one of them changes the texture of all.
+    Each view has sampled conditions of its own. All values of its first texture are at
+    a bound, chosen at random. With `shares_texture` all lessons have the same tensor, so
+    that a step of one of them changes the texture of all.
 
     Args:
         problem: the scene with the controls that are searched.
@@ -223,9 +222,8 @@ def _make_texture_lessons(
     """
     right_classes = _find_right_classes(problem)
     domain = problem.domain
-    # The lessons stay in memory during the full training. So they do not hold the scene,
-    # which is large. A lesson maps the searched coordinates to textures; its renderer
-    # also needs the controls that vary by chance.
+    # The lessons stay in memory during the full training, so they have spaces without
+    # the scene, which is large.
     searched_space = replace(problem.searched_space, scene=None)
     full_space = replace(problem.space, scene=None)
     shared_texture = _sample_texture(domain, seed)
@@ -235,7 +233,7 @@ def _make_texture_lessons(
         configuration = problem.make_full_configuration(domain.start, view_seed)
         linear = problem.make_linear_renderer(configuration, view_seed, MATRIX_SPP)
         levels = color.to_uint8(linear(configuration))
-        linear.release_scene(full_space)  # only the matrix is needed from here on
+        linear.release_scene(full_space)  # keeps only the matrix and this space
         texture = shared_texture
         if not shares_texture:
             texture = _sample_texture(domain, view_seed)
@@ -266,9 +264,9 @@ def _make_rendered_lessons(
 ) -> list[RenderedLesson]:
     """Make a lesson with renders of random configurations for each view of a scene.
 
-    With `n_tries`, the plain image is that of the clean configuration, and `n_tries`
-    others have random ones. Without it, the plain image has one random control changed,
-    and the only other image has all controls changed.
+    With `n_tries`, the plain image is that of the clean configuration, and there are
+    `n_tries` images of random ones. If it is None, one random control has changed in the
+    plain image, and all controls have changed in the only other image.
 
     Args:
         problem: the scene with the controls that are varied.
@@ -312,10 +310,12 @@ def _sample_lesson_configurations(
     if n_tries is not None:
         return [domain.start, *sample_configurations(domain, generator, n_tries)]
     n_controls = len(problem.searched_space.controls)
-    # each control by itself, then all together
     samples = sample_configurations(domain, generator, n_controls + 1)
+    # `sample_configurations` changes each control by itself, then all together.
+    single_changes = samples[:n_controls]
+    all_changed = samples[n_controls]
     index = torch.randint(n_controls, (), generator=generator)
-    return [samples[index], samples[-1]]
+    return [single_changes[index], all_changed]
 
 
 def _make_plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
@@ -336,11 +336,13 @@ def sample_configurations(
 ) -> Tensor:
     """Sample configurations (count, d) at random.
 
-    In about half of the configurations, each value is moved with probability 1/2 to the
-    nearer bound of its range, since searches often end with values at bounds. Choices
-    and periodic values have no bounds. In the first sample only the first control
-    changes, in the next only the second, and so on, then all together, and then only
-    the first again. A control that does not change has its start values.
+    Controls take turns: in the first sample only the first control changes, in the next
+    only the second, and so on. Then all change together, and the turns begin again. A
+    control that does not change has its start values.
+
+    Searches often end with values at bounds. So in about half of the configurations,
+    each changed value is moved with probability 1/2 to the nearer bound of its range.
+    Choices and periodic values have no bounds.
 
     Args:
         domain: the searched space with its bounds.
@@ -367,23 +369,22 @@ def sample_configurations(
 def _alternate_controls(domain: policies.Domain, count: int) -> Tensor:
     """Return a mask (count, d) of the values that stay as they are at the start.
 
-    The controls change each by itself in turn, then all together, then the first by
-    itself again.
+    The controls take turns: each changes by itself, then all change together.
     """
     # the name of a block of coordinates is "CONTROL.PARAMETER"
     control_of_block = [
         block.name.rpartition(".")[0] for block, _ in domain.list_block_slices()
     ]
     controls = list(dict.fromkeys(control_of_block))
-    all_change = len(controls)
-    # (count,) the index of the control that changes, or `all_change`
+    turn_of_all = len(controls)
+    # (count,) the index of the control that changes, or `turn_of_all`
     turn = torch.arange(count) % (len(controls) + 1)
     is_unchanged = torch.zeros(count, domain.dim, dtype=torch.bool)
     for control, (_, columns) in zip(
         control_of_block, domain.list_block_slices(), strict=True
     ):
-        changes = (turn == controls.index(control)) | (turn == all_change)
-        is_unchanged[:, columns] = ~changes[:, None]
+        is_changed = (turn == controls.index(control)) | (turn == turn_of_all)
+        is_unchanged[:, columns] = ~is_changed[:, None]
     return is_unchanged
 
 
@@ -421,7 +422,7 @@ def search_worse_images(
 ) -> None:
     """Search for worse images of lessons, which are changed in place.
 
-    Textures take `steps` of the search. For lessons with several rendered images, the
+    Textures take `steps` steps of ascent. For lessons with several rendered images, the
     loss of each image is computed again: it decides which one is the worst.
 
     Args:
@@ -494,7 +495,7 @@ def ascend_textures(
             texture_id = id(lesson.texture)
             gradient_sums[texture_id] = gradient + gradient_sums.get(texture_id, 0.0)
         for texture_id, lesson in lesson_of_texture.items():
-            # one unit step uphill, in the norm of the domain
+            # Its length is 1 in the norm of the domain.
             direction = lesson.domain.compute_steepest_step(
                 lesson.texture, gradient_sums[texture_id]
             )
@@ -565,9 +566,10 @@ def _write_webdataset(directory: Path) -> None:
         tarfile.open(temporary_path, "w") as tar,
     ):
         for path in sorted(directory.glob("*/*.png")):
-            # CLASS-LABEL/ROUND-LESSON-KIND.png, with four digits for the class
-            class_index = int(path.parent.name[:4])
-            kind = path.stem.rpartition("-")[2]
+            # CLASS-LABEL/ROUND-LESSON-KIND.png
+            class_digits, _, _ = path.parent.name.partition("-")
+            class_index = int(class_digits)
+            _, _, kind = path.stem.rpartition("-")
             metadata = json.dumps({"class": class_index, "kind": kind})
             data_by_suffix = {
                 "png": path.read_bytes(),

@@ -34,9 +34,9 @@ class Trainable:
         Args:
             images: (N, H, W, 3) sRGB in [0, 1].
         """
-        # `self.model` has no gradients for its weights. This copy has the network that
-        # is trained, and respects `detach` inside of it (`attached=False`), as ordinary
-        # training does.
+        # `self.model` has no gradients for its weights, so its network is replaced by
+        # the one that is trained. With `attached=False`, a `detach` inside the network
+        # stops gradients, as in ordinary training.
         trained_model = replace(self.model, module=self.network, attached=False)
         with self._mixed_precision():
             x = trained_model.preprocessing(images.to(trained_model.device))
@@ -51,8 +51,8 @@ class Trainable:
 
     def copy_for_thread(self) -> Trainable:
         """Return the same weights with gradients of their own, for another thread."""
-        # `with_network` copies a network whose weights stay shared. The copy's
-        # parameters collect no gradients until `requires_grad_` is set again.
+        # `with_network` returns a model with a copy of the network that shares its
+        # weights, and whose parameters collect no gradients. They get that back here.
         network: nn.Module = self.model.with_network(self.network).module  # type: ignore[assignment]
         for parameter, original in zip(
             network.parameters(), self.network.parameters(), strict=True
@@ -70,9 +70,8 @@ class Trainable:
         """Return a context that uses bfloat16 if the processor has instructions for it.
 
         Without such instructions bfloat16 is slow. It is also slow if torch divides a
-        product among several threads while others use the cores: they wait for each
-        other busily, and take five times as long as in float32. With
-        `open_single_threaded_pool` a product is not divided.
+        product among several threads while other threads use the cores: that takes five
+        times as long as in float32. `open_single_threaded_pool` prevents it.
         """
         # torch 2.8 has no `get_capabilities`: `dict` returns no capabilities instead
         get_capabilities = getattr(torch.cpu, "get_capabilities", dict)
@@ -100,7 +99,9 @@ def make_trainable(
         ModelError: the network cannot be trained, has no parameters, or returns
             something other than logits.
     """
-    if logits and (model.probabilities or model.read is not None):
+    # a model that returns probabilities, or whose output a function of its own reads
+    returns_no_logits = model.probabilities or model.read is not None
+    if logits and returns_no_logits:
         raise errors.ModelError(
             f"model {model.name}: only a classifier that returns logits can be hardened"
         )
@@ -130,7 +131,10 @@ def open_single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
     """
     count = torch.get_num_threads()
     with ThreadPoolExecutor(
-        count, "advsearch-torch", torch.set_num_threads, (1,)
+        max_workers=count,
+        thread_name_prefix="advsearch-torch",
+        initializer=torch.set_num_threads,
+        initargs=(1,),
     ) as pool:
         try:
             yield pool
@@ -154,7 +158,8 @@ class Augmentation:
         contrast: bound of the relative change of deviations from the image's mean.
         max_channel_change: bound of the relative change of each channel.
         blur: probability of a 3 x 3 binomial blur.
-        max_noise_deviation: bound of the standard deviation of gaussian noise, display-referred.
+        max_noise_deviation: bound of the standard deviation of gaussian noise,
+            display-referred.
         noise_probability: probability of noise.
         cutout_probability: probability that a gray square hides a part.
         largest_cutout: bound of the square's side, as a fraction of the image's side.
@@ -177,6 +182,7 @@ class Augmentation:
         """Return augmented images (N, 3, H, W), float32 in [0, 1]."""
         x = self._crop(images, generator)
         x = self._change_colors(x, generator)
+        # The rest changes x in place.
         self._blur_some(x, generator)
         self._add_noise(x, generator)
         x.clamp_(0.0, 1.0)
@@ -192,12 +198,13 @@ class Augmentation:
         scale = _uniform(
             self.smallest_crop, self.largest_crop, count, generator=generator
         )
-        # In the coordinates of `affine_grid` the image extends from -1 to 1. Without a
-        # rotation, a smaller crop is inside the image, and a larger one contains it, if
-        # its center is moved by at most |1 - scale|.
+        # In the coordinates of `affine_grid` the image extends from -1 to 1, and a crop
+        # from -scale to scale around its center. If the center is moved by at most
+        # |1 - scale|, a smaller crop stays inside the image, and a larger one contains
+        # it. (A rotation is ignored here.)
         relative_shift = _uniform(-1.0, 1.0, count, 2, generator=generator)
         max_shift = (1.0 - scale).abs()
-        # all samples are independent: the first half is for x, the second for y
+        # The samples are flat: the first half of them is for x, the second for y.
         shift_x, shift_y = relative_shift.view(2, count) * max_shift
         is_mirrored = _choose(self.flip, count, generator)
         mirror = 1.0 - 2.0 * is_mirrored.float()  # -1 or 1

@@ -90,7 +90,7 @@ class Trainer(ABC):
         """Set up the trainer.
 
         Args:
-            scene_jobs: samples scenes and items of the run.
+            work: samples scenes of the run, and makes items from them.
             student: the copy of the network that is trained.
             optimiser: function from a list of parameters to an optimizer; None for
                 AdamW.
@@ -167,15 +167,14 @@ class Trainer(ABC):
             parameters, self.count_steps(training_items)
         )
         average = [parameter.detach().clone() for parameter in parameters]
-        # Gradients draw from the same generator, so an epoch is shuffled when it
-        # begins, and not before.
+        # `_iterate_batches` shuffles an epoch when it begins. Gradients draw from the same
+        # generator in between.
         rng = np.random.default_rng(
             [seeds.derive_seed(self.config.seed, "order"), number]
         )
         with self.open_gradient_context(new) as compute_gradient:
-            for n_steps, batch in enumerate(
-                self._iterate_batches(training_items, rng), start=1
-            ):
+            batches = self._iterate_batches(training_items, rng)
+            for n_steps, batch in enumerate(batches, start=1):
                 compute_gradient(batch, rng)
                 # Without a limit, a few very wrong images could make a step so large
                 # that it undoes others.
@@ -191,7 +190,7 @@ class Trainer(ABC):
     ) -> Iterator[list[Any]]:
         """Yield the batches of all epochs, each epoch in another order.
 
-        An epoch has some items several times, see `uses_per_epoch`.
+        An epoch has each item as often as `uses_per_epoch` states.
         """
         item_indices = self._list_uses(pool)
         for _ in range(self.config.epochs):
@@ -240,7 +239,8 @@ class Trainer(ABC):
             torch.optim.AdamW, lr=self.config.rate, weight_decay=self.weight_decay
         )
         optimizer = make_optimizer(parameters)
-        # The schedule also makes a step after the last step of the optimizer.
+        # `train_round` calls `schedule.step` after each step, also after the last one. So
+        # the schedule has a further rate, which is not used.
         n_rates = n_steps + 1
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer,
@@ -279,10 +279,15 @@ def _interpolate(
 def adjust_warm_up(fraction: float, n_rates: int) -> float:
     """Return the fraction of the steps in which the learning rate rises.
 
-    OneCycleLR divides by the number of these steps less one. If that is a single step,
-    the fraction is returned a little larger, so that nothing is divided by zero.
+    If the rate rises for n steps, OneCycleLR divides by n - 1. If n is 1, the fraction
+    is made a little larger, so that it does not divide by zero.
+
+    Args:
+        fraction: the fraction.
+        n_rates: number of all steps of the schedule.
     """
-    is_single_step = math.isclose(fraction * n_rates, 1.0)
+    n_rising_steps = fraction * n_rates
+    is_single_step = math.isclose(n_rising_steps, 1.0)
     return fraction * 1.001 if is_single_step else fraction
 
 
@@ -290,8 +295,8 @@ class Rounds:
     """The rounds of a run.
 
     Attributes:
-        finished_rounds: the result of each round that has ended; the first is the original
-            model.
+        finished_rounds: the result of each round that has ended. Round 0 is the
+            original model.
     """
 
     def __init__(self, run: RunDirectory, trainer: Trainer) -> None:
@@ -341,9 +346,7 @@ class Rounds:
 
         Afterwards the student has the best weights.
         """
-        n_trained_rounds = (
-            len(self.finished_rounds) - 1
-        )  # round 0 is the original model
+        n_trained_rounds = len(self.finished_rounds) - 1  # without round 0
         is_done = n_trained_rounds >= self.config.rounds
         if not is_done:
             self._run_rounds()
@@ -370,9 +373,11 @@ class Rounds:
             original_score = trainer.evaluate_student(held_back)
             self.store_round(0, [], original_score, n_trained=0, interpolation=0.0)
         pool = list(trainer.custom_items)
-        n_used = 0  # items of the pool that an earlier round of this session has used
+        # Items at the start of the pool that a round of this session has trained on.
+        n_used = 0
         # Round 0 is the original model, so the first round of training is 1.
         for number in range(1, self.config.rounds + 1):
+            # A round starts with the weights of the round before.
             trainer.student.network.load_state_dict(self.read_weights(number - 1))
             new_items = trainer.sample_items(
                 f"round {number}: drawing scenes",
@@ -395,8 +400,9 @@ class Rounds:
         Args:
             number: number of the round.
             pool: items that it is trained on.
-            n_used: number of items at the start of the pool that earlier rounds have
-                used. Their search for worst images has begun already.
+            n_used: number of items at the start of the pool that earlier rounds of this
+                session have used. The search for their worst images goes on; for all
+                other items it begins.
             held_back: items of the validation, which are not trained on.
 
         Returns:

@@ -114,14 +114,14 @@ class SceneJobs:
             hint: text about how to shorten the stage.
         """
         self.progress.stage(title, len(jobs), hint=hint)
-        # Results come in any order. A result has the job object itself, which is found
-        # by its `id`.
+        # Batches end in any order. Each has its job object, whose `id` gives the index.
         index_of_job = {id(job): index for index, job in enumerate(jobs)}
         executor = self.executor or workbench.InProcess(self)
         # each job is a batch by itself
         for batch in executor.compute([job] for job in jobs):
             (job,) = batch.items
-            (value,) = batch.require_value(f"harden, scene {job.keywords['number']}")
+            job_name = f"harden, scene {job.keywords['number']}"
+            (value,) = batch.require_value(job_name)
             worker_counts: dict[str, float | str] = {}
             if executor.stats is not None:
                 worker_counts = executor.stats.progress_counts
@@ -153,8 +153,8 @@ class SceneJobs:
         problem, seed = self.make_problem(
             self.splits[split], number, controls, varying_controls
         )
-        # Validation compares models on the same images, so it renders many random
-        # configurations once. Training renders two images of a view instead.
+        # For the validation, many random configurations of a view are rendered, and the
+        # worst counts. For the training there are two images of a view (None).
         n_tries = N_VALIDATION_TRIES if split == VALIDATION else None
         return make_lessons(
             problem,
@@ -181,8 +181,8 @@ class SceneJobs:
         Args:
             control: control that is searched.
             number: number of the scene.
-            steps_factor: multiple of the usual steps; with more than 1 the stronger
-                search is used.
+            steps_factor: multiple of the usual steps. A factor above 1 also selects the
+                policy of the stronger search.
             weights: the model's weights as bytes of a safetensors file; None for the
                 original ones.
         """
@@ -261,7 +261,7 @@ class SceneJobs:
     def random_controls(self) -> tuple[str, ...]:
         """The rendered controls that can vary at random in scenes with a matrix.
 
-        Each of the controls with a matrix has one even if this control varies.
+        A control is among them if all `matrix_controls` have a matrix while it varies.
         """
         return tuple(
             name
@@ -355,7 +355,7 @@ class SceneJobs:
         changed = {
             **self._select_run_settings(searched),
             "object": name,
-            # The scene is loaded already, and these settings would change it again.
+            # The scene is already loaded with these settings, which would change it again.
             "environment": None,
             "set_": {},
             "exposure": 0.0,
@@ -377,7 +377,7 @@ class SceneJobs:
     ) -> dict[str, Any]:
         """Return the settings of the run that belong to the searched controls.
 
-        Settings that belong to other controls of the run only are None.
+        Settings that only other controls of the run take are None.
 
         Args:
             searched: settings of the searched controls by their names.
@@ -391,10 +391,12 @@ class SceneJobs:
             used_settings = {
                 name: value for name, value in run_settings.items() if value is not None
             }
-            # A setting that an earlier control takes stays. If both take one that is a
-            # mapping by control, such as `epsilon`, their entries are merged.
-            all_unset = dict.fromkeys(run_settings)
-            selected = settings.merge_mappings({**all_unset, **selected}, used_settings)
+            # Settings that no control takes get the value None. Entries of a setting that
+            # is a mapping by control, such as `epsilon`, are merged.
+            none_by_name = dict.fromkeys(run_settings)
+            selected = settings.merge_mappings(
+                {**none_by_name, **selected}, used_settings
+            )
         return selected
 
 
@@ -412,11 +414,12 @@ def _evaluate_start(
     # a batch of one image (1, H, W, 3)
     image = problem.picture(start, seed, CLEAN_SPP)[None]
     truth = problem.find_truth(problem.make_full_configuration(start, seed))
+    evaluations = dict[str, Any]()
     with torch.no_grad():
-        return {
-            name: problem.task.judge(model(image), truth)[0]
-            for name, model in models.items()
-        }
+        for name, model in models.items():
+            evaluations_of_batch = problem.task.judge(model(image), truth)
+            evaluations[name] = evaluations_of_batch[0]
+    return evaluations
 
 
 def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
@@ -429,8 +432,8 @@ def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
     (model, *_), _ = workbench.load_models(
         [config.model], workbench.make_task(config.task), config
     )
-    # Garbage is collected after each scene. Frozen objects are not visited then, which
-    # saves a sixth of the time.
+    # Garbage is collected after each scene. Objects that are frozen here are skipped
+    # then, which saves a sixth of the time.
     gc.freeze()
     return SceneJobs(config, model, make_splits(config, model))
 
@@ -438,10 +441,12 @@ def load_scene_work(config_fields: Mapping[str, Any]) -> SceneJobs:
 def attack_scene(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
     """Attack a scene, and return the status of the model in it.
 
-    It is "found" if the attack found an adversarial scene, and "already wrong" if the
-    model is wrong about the clean scene. Otherwise it is `ROBUST`, or "unsteady" if the
-    model is right in too few trials of the clean scene. It has to be right in as many
-    trials as an adversarial scene has to be wrong in.
+    - "found": the attack found an adversarial scene.
+    - "already wrong": the model is wrong about the clean scene.
+    - "unsteady": neither, but the model is right in too few trials of the clean scene.
+      It has to be right in as many as those in which it would have to be wrong about an
+      adversarial scene.
+    - `ROBUST`: none of these.
     """
     summary = workbench.attack_on(config, scene, model).summary
     if summary.ending == results.INTERRUPTED:
@@ -538,6 +543,7 @@ class SceneSplit:
         """
         for number in range(count):
             name = self._get_object_name(number)
+            # Objects take turns, so the first scene of each has its index.
             is_first_time = number == self.objects.index(name)
             if name in OBJECTS:
                 yield OBJECTS[name].generate(self.make_generator(number))
@@ -569,6 +575,7 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
 
     The held-out scenes have other environments than the rest, and other objects or
     other instances of the same objects, so that what is measured was not trained on.
+    Their environments are not varied at random.
 
     Raises:
         InputError: the model has no class for any of the objects, or an object comes
@@ -588,7 +595,7 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
             name,
             objects,
             training_environments,
-            seeds.derive_seed(config.seed, name),
+            seed=seeds.derive_seed(config.seed, name),
             varied=True,
         )
         for name in (TRAINING, FURTHER, VALIDATION)
@@ -601,7 +608,7 @@ def make_splits(config: HardenConfig, model: Model) -> dict[str, SceneSplit]:
         HELD_OUT,
         held_out_objects,
         _environments(config.held_out_environment, "heldout"),
-        seeds.derive_seed(config.seed, HELD_OUT),
+        seed=seeds.derive_seed(config.seed, HELD_OUT),
     )
     return splits
 
@@ -673,7 +680,7 @@ def check_disjoint(held_out: SceneSplit, training_splits: Sequence[SceneSplit]) 
             f"held_out_environment: {', '.join(common)} is an environment "
             "of the training, too; name other environments"
         )
-    # the first instance of each object, as objects take turns
+    # Objects take turns, so that the first scenes have one instance of each.
     held_out_fingerprints = {
         compute_fingerprint(asset)
         for asset in held_out.generate_objects(len(held_out.objects))

@@ -80,7 +80,8 @@ class ClassifierTrainer(Trainer):
     Attributes:
         n_views: number of views of a training scene, and of a validation scene, for
             controls with a matrix of light transport.
-        user_examples: batches of the user's own images and class indices; None without any.
+        user_examples: batches of the user's own images and class indices; None without
+            any.
     """
 
     batch_size = 24
@@ -102,12 +103,13 @@ class ClassifierTrainer(Trainer):
             student: the copy of the network that is trained.
             optimiser: function from a list of parameters to an optimizer; None for
                 AdamW.
-            user_examples: batches of the user's own images and class indices. Each step also
+            beside: batches of the user's own images and class indices. Each step also
                 trains with one of them. When they end, they are repeated.
         """
         super().__init__(work, student, optimiser)
         # The validation only compares weights, for which two views suffice.
-        self.n_views = (self.config.views, 2)
+        n_validation_views = 2
+        self.n_views = (self.config.views, n_validation_views)
         self.user_examples = beside
         self._example_batches: Iterator[tuple[Tensor, Tensor]] = iter(())
 
@@ -144,8 +146,8 @@ class ClassifierTrainer(Trainer):
     def _matrix_jobs(self, split: str, scene_numbers: range) -> list[Job]:
         """Return the jobs that make lessons with a matrix of light transport.
 
-        There is a job for each scene and each control that has such a matrix. Only in
-        scenes of the training split may views share a texture, or other controls vary.
+        There is a job for each scene and each control that has such a matrix. In scenes
+        of the training split, views may share a texture, and other controls may vary.
 
         Args:
             split: name of the split.
@@ -183,10 +185,10 @@ class ClassifierTrainer(Trainer):
     def _rendered_jobs(self, split: str, scene_numbers: range) -> list[Job]:
         """Return the jobs that make lessons by rendering, one for each scene.
 
-        All controls without a matrix of light transport change together. In the
-        training split a scene has one such view, and one plain view, on which the
-        student should predict as the original model does. In the validation split it
-        has only such views.
+        In a view with worst images, all controls without a matrix of light transport
+        change together. A training scene has one such view, and one plain view, on which
+        the student should predict as the original model does. A validation scene has
+        only views with worst images.
         """
         controls = self.scene_jobs.rendered_controls
         if not controls:
@@ -210,8 +212,8 @@ class ClassifierTrainer(Trainer):
         Args:
             scene_numbers: numbers of the scenes of the round, which follow each other.
         """
-        # Each scene of the round has `n_further_scenes` further scenes. Their numbers
-        # count the scenes of the split `FURTHER`.
+        # Each scene of the round has `n_further_scenes` scenes in the split `FURTHER`,
+        # which are numbered from 0 over all rounds.
         first = self.n_further_scenes * scene_numbers[0]
         end = self.n_further_scenes * (scene_numbers[-1] + 1)
         if self.scene_jobs.rendered_controls:
@@ -219,7 +221,7 @@ class ClassifierTrainer(Trainer):
             n_views = 1
             n_plain = 0
         else:
-            # A scene needs a control, which a plain view does not change.
+            # A job needs a control. A plain view does not change it, so it may be any.
             controls = self.scene_jobs.matrix_controls[:1]
             n_views = 0
             n_plain = 1
@@ -229,11 +231,10 @@ class ClassifierTrainer(Trainer):
         ]
 
     def sample_scene_options(self, control: str, number: int) -> tuple[bool, bool]:
-        """Decide at random whether the views of a scene share a texture.
+        """Decide at random how a training scene differs from the usual.
 
-        It is also decided whether other controls vary in it. If it were every fourth
-        scene, for example, it would always be the scenes of the same objects, because
-        objects take turns.
+        At random, and not in every fourth scene, for example: objects take turns, so
+        these scenes would always have the same objects.
 
         Args:
             control: control whose images a matrix of light transport predicts.
@@ -261,8 +262,7 @@ class ClassifierTrainer(Trainer):
         Args:
             new: lessons that no earlier round has used.
         """
-        # The images are to be hard for the student. The original model
-        # (`self.work.model`) is only compared with.
+        # Worse images are searched for the student, and not for the original model.
         lessons.search_worse_images(new, self.student.model, N_FIRST_STEPS)
         with open_single_threaded_pool() as pool:
             gradients = GradientComputer(
@@ -301,12 +301,13 @@ class ClassifierTrainer(Trainer):
         Textures are searched against the student. Plain lessons count only for the
         clean accuracy.
         """
-        # copies, since a search changes the lessons
+        # A search sets attributes of lessons, and changes their textures in place. Both
+        # are copied.
         searched = [copy.copy(lesson) for lesson in validation_items]
-        model = self.student.model
         for lesson in searched:
             if isinstance(lesson, TextureLesson):
                 lesson.texture = lesson.texture.clone()
+        model = self.student.model
         lessons.search_worse_images(searched, model, N_VALIDATION_STEPS)
         hard_lessons = select_hard_lessons(searched)
         clean = _accuracy(model, searched, lambda lesson: lesson.plain_image)
@@ -329,7 +330,7 @@ def _make_job(
 ) -> Job:
     """Return the job that makes lessons of a scene.
 
-    A job is called by a worker, which has the scenes.
+    A job is an unbound method: the worker that runs it passes its own `SceneJobs`.
 
     Args:
         split: name of the split of scenes.
@@ -413,9 +414,11 @@ class GradientComputer:
                 None.
             seed: seed of the augmentation.
         """
-        # Textures come first, so that the parts of the search below and those of the
-        # loss begin with the same lessons.
-        batch = sorted(batch, key=lambda lesson: not isinstance(lesson, TextureLesson))
+        # Textures come first. So the parts of the search below, which has textures only,
+        # and those of the loss have the same textures, and augment them equally.
+        textures = [lesson for lesson in batch if isinstance(lesson, TextureLesson)]
+        others = [lesson for lesson in batch if not isinstance(lesson, TextureLesson)]
+        batch = [*textures, *others]
         self._ascend_textures(batch, seed)
 
         # The loss is a mean over plain images plus a mean over worst images. A part has
@@ -425,10 +428,10 @@ class GradientComputer:
         worst_weight = 1.0 / max(1, len(select_hard_lessons(batch)))
 
         def compute_part_gradient(
-            part: Sequence[Lesson], twin: Trainable, seed: int
+            part: Sequence[Lesson], twin: Trainable, part_seed: int
         ) -> Sequence[Tensor | None]:
             """Return the gradient of the loss of a part by each parameter."""
-            loss = self._loss(twin, part, plain_weight, worst_weight, seed)
+            loss = self._loss(twin, part, plain_weight, worst_weight, part_seed)
             return torch.autograd.grad(loss, twin.parameters(), allow_unused=True)
 
         gradients = self._map_parts(compute_part_gradient, batch, seed)
@@ -449,11 +452,11 @@ class GradientComputer:
         """
 
         def compute_part_gradients(
-            part: Sequence[TextureLesson], twin: Trainable, seed: int
+            part: Sequence[TextureLesson], twin: Trainable, part_seed: int
         ) -> Sequence[Tensor]:
             """Return the gradient (d,) of the loss by the texture of each lesson."""
             return lessons.compute_texture_gradients(
-                part, twin.evaluation_logits, lambda images: _augment(images, seed)
+                part, twin.evaluation_logits, lambda images: _augment(images, part_seed)
             )
 
         def compute_gradients(
@@ -499,10 +502,11 @@ class GradientComputer:
         ]
         # Threads cannot share a network whose gradients are computed, so each part has
         # a copy.
-        n_missing = len(parts) - len(self._twins)
-        self._twins += [self._student.copy_for_thread() for _ in range(n_missing)]
-        part_seeds = itertools.count(seed)
-        return list(self._pool.map(function, parts, self._twins, part_seeds))
+        while len(self._twins) < len(parts):
+            self._twins.append(self._student.copy_for_thread())
+        twins = self._twins[: len(parts)]
+        part_seeds = range(seed, seed + len(parts))
+        return list(self._pool.map(function, parts, twins, part_seeds))
 
     def _loss(
         self,
@@ -545,8 +549,9 @@ class GradientComputer:
         )
         # The student stays near the original model's predictions on plain images. A
         # `RenderedLesson` is left out: a control has changed even in its plain image,
-        # about which the original model may be right but unsure. Plain images come
-        # first, so that the index of a lesson is that of its plain image.
+        # and the original model, even if it is right, may be unsure about it. (These
+        # images are also the mixed ones.) The index of a lesson is that of its plain
+        # image, as plain images come first.
         unrendered = _find_unrendered(part)
         if unrendered:
             divergence = self._divergence_from_original(
@@ -560,9 +565,9 @@ class GradientComputer:
     def _divergence_from_original(
         self, images: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]
     ) -> Tensor:
-        """Return the Kullback-Leibler divergence from the original model's predictions.
+        """Return the Kullback-Leibler divergence KL(original || student) of predictions.
 
-        It is summed over the images (N, H, W, 3) that the original model gets right.
+        It is summed over the images that the original model gets right.
 
         Args:
             images: images (N, H, W, 3).
@@ -595,8 +600,9 @@ def _mix_images(
             weight.
 
     Returns:
-        The indices of the images that are mixed, none in half of the cases; the index
-        of the partner of each; and the weight of the partner, at most 1/2.
+        The indices of the images that are mixed, which are none unless the part is mixed
+        (`MIXUP_PROBABILITY`); the index of the partner of each; and the weight of the
+        partner, at most 1/2.
     """
     rng = np.random.default_rng(seed)
     mixed = list[int]()
@@ -611,6 +617,7 @@ def _mix_images(
     # At most 1/2, so that the image itself always has the larger weight.
     partner_weight = min(sampled_weight, 1.0 - sampled_weight)
     if mixed:
+        # Both operands are copies, so that every partner is an image before the mixing.
         images[mixed] = torch.lerp(images[mixed], images[partners], partner_weight)
     return mixed, partners, partner_weight
 
@@ -627,9 +634,9 @@ def _find_unrendered(part: Sequence[Lesson]) -> list[int]:
 def _augment_images(part: Sequence[Lesson], seed: int) -> Tensor:
     """Return the plain images of lessons, then the worst ones, augmented (N, H, W, 3).
 
-    Plain images, worst textures and worst renders are augmented separately, each with
-    the same seed. So a worst texture gets the same crop and colors as in the search
-    that found it. Under another augmentation it might no longer be the worst.
+    Plain images, worst textures and worst renders are augmented as separate groups with
+    the same seed. So the group of textures is augmented as in the search that found
+    them. Under another augmentation they might no longer be the worst.
 
     Args:
         part: the lessons, textures first.

@@ -81,10 +81,10 @@ def grow_box(
     when no face can move any more. Growing ends after `MAX_PROBED` images for each
     parameter at the latest.
 
-    Then the box is sampled. An exception is a sample with another prediction than the
-    center. For each exception a face moves inwards, so that the exception is outside of
-    the box: of all faces, the one that cuts off the smallest part. Then the box is
-    sampled again with other seeds, at most `ATTEMPTS` times. The last check is reported
+    Then the box is checked by samples. An exception is a sample with another prediction
+    than the center. For each exception that is still inside, one face moves inwards to
+    exclude it: the face that cuts off the smallest part of the box. Then the box is
+    checked again with new samples. After `ATTEMPTS` checks, the last one is reported
     even if it has exceptions. The samples of a check are independent of the box, so
     that a confidence interval from them is valid.
 
@@ -184,8 +184,8 @@ class GrowingBox:
         if not is_inside:
             return
         width = (self.high - self.low).clamp_min(1e-12)  # not divided by 0
-        # the fraction of the box that is cut off if a face of each axis moves to the
-        # point (d,)
+        # For each axis (d,), the fraction of the box that is cut off if the face on the
+        # point's side of the center moves to the point.
         lost_fraction = torch.where(
             point > self._center,
             (self.high - point) / width,
@@ -196,10 +196,13 @@ class GrowingBox:
         lost_fraction = torch.where(point == self._center, torch.inf, lost_fraction)
         axis = int(lost_fraction.argmin())
         is_upper = point[axis] > self._center[axis]
-        corner = self.high if is_upper else self.low
-        # The face moves a little beyond the point, towards the center (`PULLED_IN` <
-        # 1).
-        corner[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
+        # From the center, the fraction `PULLED_IN` (below 1) of the way to the point: so
+        # the point is a little outside.
+        new_bound = torch.lerp(self._center[axis], point[axis], PULLED_IN)
+        if is_upper:
+            self.high[axis] = new_bound
+        else:
+            self.low[axis] = new_bound
 
     def _push(self, face: int, fraction: float) -> bool:
         """Move a face outwards if the slab that this adds has the center's prediction.
@@ -237,8 +240,11 @@ class GrowingBox:
         if not all(self._evaluate(point) for point in probes):
             return False
         # Rounding may lead a little outside of [0, 1].
-        corner = self.high if is_upper else self.low
-        corner[axis] = outer.clamp(0.0, 1.0)
+        new_bound = outer.clamp(0.0, 1.0)
+        if is_upper:
+            self.high[axis] = new_bound
+        else:
+            self.low[axis] = new_bound
         return True
 
     def _evaluate(self, u: Tensor) -> bool:
@@ -266,8 +272,8 @@ def _choose_step(distance: float, fraction: float) -> float | None:
     """
     if distance <= 0.0:
         return None
-    # Close to the bound, a fraction of the distance would be less than `MIN_STEP`, and
-    # the face would never reach the bound.
+    # Close to the bound the face moves there at once. By a fraction of the distance it
+    # would never reach the bound.
     is_close = distance < 4.0 * MIN_STEP
     if is_close:
         return distance

@@ -71,8 +71,8 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     config = context.config
     stages = context.stages
     stages.begin("setup", workbench.LOADING)
-    # Budgets limit the ranges of controls. With that of the run in `around`, its
-    # adversarial configuration lies within the ranges.
+    # A budget limits the ranges of controls. With the budget of the run in `around`, the
+    # ranges contain its adversarial configuration, which is the center.
     attack_config = AttackConfig.from_config(config, **_read_budget(config))
     problem, warnings = workbench.problem_from_config(attack_config)
     for text in warnings:
@@ -148,8 +148,8 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
 
     Raises:
         UnknownNameError: `vary` names a parameter that the controls do not search.
-        InputError: there are too few or too many parameters, or the run in `around` is
-            over other controls.
+        InputError: there are too few or too many parameters, a map has not two, or the
+            run in `around` is over other controls.
     """
     coordinate_by_name = _list_coordinates(problem)
     names = tuple(coordinate_by_name)
@@ -206,6 +206,7 @@ def read_center(problem: Problem, config: RegionConfig) -> Tensor:
     values = torch.from_numpy(
         workbench.read_configuration(directory.find_run(config.around))
     )
+    # Other controls usually have another number of coordinates.
     if values.shape != start.shape:
         raise InputError(
             f"`around` {config.around}: expected a run over the same controls, whose "
@@ -253,8 +254,10 @@ class RegionSearch:
         self._is_wrong_at_center = find_verdict(verifier, varied.center)
         if config.specialise:
             # Images may be predicted if the light on surfaces is prepared, which pays
-            # only for enough images: those of growing, and those of the map.
-            n_images = boxes.USUAL_PROBED * len(varied.names) + config.map**2
+            # only for enough images.
+            n_growing_images = boxes.USUAL_PROBED * len(varied.names)
+            n_map_images = config.map**2  # `map` is its size; 0 for no map
+            n_images = n_growing_images + n_map_images
             workbench.prepare_surface_light(
                 verifier, varied.center, varied.coordinate_indices, n_images
             )
@@ -326,12 +329,12 @@ class RegionSearch:
         # the check are rendered, as its result is reported.
         predictor = None if self._is_checking else self._verifier.run_state.predictor
         u = self._varied.make_configuration(values)
-        # The stored rows have no success, since no prediction is sought.
+        # A trial has a success, which is a wrong prediction. With `has_success=False` it
+        # is not stored, since no wrong prediction is sought here.
         (trial,) = self._verifier.try_configurations(
             "region", {number: u}, has_success=False, predictor=predictor
         )
         has_verdict = not trial.prediction.is_out_of_view and not trial.is_non_finite
-        # without a target, a success is a wrong prediction
         is_wrong = trial.success
         return has_verdict and is_wrong == self._is_wrong_at_center
 
@@ -396,9 +399,11 @@ def describe_box(
     for index, name in enumerate(varied.names):
         described_name = name
         component = ""
-        if name not in low_values:  # perhaps a component of a vector
+        if name not in low_values:
+            # It may be a component, such as "camera.target.0" of "camera.target".
             described_name, _, component = name.rpartition(".")
-        if described_name in low_values:
+        is_described = described_name in low_values
+        if is_described:
             side = BoxSide(
                 name=name,
                 unit=str(low_values[described_name].get("unit", "")),
@@ -532,6 +537,7 @@ def draw_margins(
     y_title = figures.format_axis_title(y_range.name, y_range.unit)
     figures.draw_heat_map(axes, rows, extent, figures.MARGIN, x_title, y_title)
     margins = [margin for row in rows for margin in row]
+    # the model is right where the margin is above 0
     has_both_verdicts = min(margins) < 0.0 < max(margins)
     if has_both_verdicts:
         axes.contour(rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0)

@@ -39,8 +39,7 @@ WHEEL_SIDE = 0.852  # distance of a wheel's outer side from the middle of the ca
 CABIN_X = -0.5  # x of the middle of the cabin
 COLUMNS = 92  # faces around the body
 OUTSIDE = -1.0
-"""Value of `_compute_depths_inside...` functions for points at another end or side of the car: they
-are not inside the opening.
+"""Depth inside an opening of points at another end or side of the car: they are outside.
 """
 FAR = 9.0
 """Distance in metres that stands for "not on this side of the car"."""
@@ -99,23 +98,26 @@ def _shell(
     angle = _outline_angles(levels, power, center_x)
     points = _shell_points(levels, power, center_x, height, angle)
     normals = _shell_normals(points)
-    front = COLUMNS // 2  # column 0 is the middle of the rear, this that of the front
+    # The columns go around the shell, from the middle of the rear to the same again.
+    front = COLUMNS // 2  # the middle of the front
     cut = int(COLUMNS * corner)
-    # the rear's left half, a side, the front, the other side, the rear's right half
+    # one half of the rear, a side, the front, the other side, the other half of the rear
     chart_bounds = (0, cut, front - cut, front + cut, COLUMNS - cut, COLUMNS)
     patches = []
     for first, last in pairwise(chart_bounds):
         columns = np.s_[:, first : last + 1]
-        u = shapes.mean_lengths(points[columns], axis=1)
-        v = shapes.mean_lengths(points[columns], axis=0)
+        length_to_column = shapes.mean_lengths(points[columns], axis=1)
+        length_to_row = shapes.mean_lengths(points[columns], axis=0)
+        width = float(length_to_column[-1])
+        height_of_chart = float(length_to_row[-1])
         patches.append(
             shapes.make_grid_patch(
                 "paint",
                 points[columns],
                 normals[columns],
-                size=(float(u[-1]), float(v[-1])),
-                down=v / v[-1],
-                across=u / u[-1],
+                size=(width, height_of_chart),
+                down=length_to_row / height_of_chart,
+                across=length_to_column / width,
             )
         )
     return patches
@@ -134,8 +136,8 @@ def _outline_angles(levels: Array, power: float, center_x: float) -> Array:
     """
     widest = levels[np.argmax(levels[:, 1])]
     _, half_width, front, rear = widest
-    # In `_outline`, -pi and pi are the rear. The center is moved to x = 0, which does
-    # not change lengths along the outline.
+    # -pi and pi are the middle of the rear. The outline is moved so that its center is at
+    # x = 0, which does not change lengths along it.
     fine_angle = np.linspace(-np.pi, np.pi, 8001)
     x, y = _outline(
         fine_angle,
@@ -178,11 +180,16 @@ def _shell_points(
 def _shell_normals(points: Array) -> Array:
     """Return the unit normals (R, C, 3) of a closed shell with points (R, C, 3).
 
-    The first and the last column are the same points, so differences go on across them.
+    The first and the last column are the same points. So each gets a neighbor from the
+    other end of the columns, and both have the same normals.
     """
-    wrapped_points = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
-    column_tangent = np.gradient(wrapped_points, axis=1)[:, 1:-1]
-    return shapes.normalize(np.cross(column_tangent, np.gradient(points, axis=0)))
+    before_first = points[:, -2:-1]
+    after_last = points[:, 1:2]
+    wrapped_points = np.concatenate([before_first, points, after_last], axis=1)
+    wrapped_tangent = np.gradient(wrapped_points, axis=1)
+    around = wrapped_tangent[:, 1:-1]  # without the two added columns
+    upwards = np.gradient(points, axis=0)
+    return shapes.normalize(np.cross(around, upwards))
 
 
 def _make_height_curve(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
@@ -194,13 +201,13 @@ def _make_height_curve(knots: list[tuple[float, float]]) -> Callable[[Array], Ar
 def _soft_minimum(*fields: Array) -> Array:
     """Return the minimum of several distances (N,), with corners rounded by about 3 cm.
 
-    It is the smooth minimum -log(sum(exp(-30 d))) / 30, of distances clipped to 1 m. If
-    each distance is that to one edge of an opening, positive inside, the minimum is
-    positive inside of all edges.
+    If each distance is that to one edge of an opening, positive inside, the minimum is
+    positive inside of all edges. It is the smooth minimum -log(sum(exp(-30 d))) / 30,
+    and distances are clipped to 1 m.
     """
-    sharpness = -30.0
+    sharpness = 30.0  # per metre
     distances = np.clip(np.stack(fields), -1.0, 1.0)
-    return np.asarray(logsumexp(sharpness * distances, axis=0) / sharpness)
+    return np.asarray(logsumexp(-sharpness * distances, axis=0) / -sharpness)
 
 
 # Functions from x to the height of the body's lower edge, of the lower edge of the
@@ -288,7 +295,7 @@ def _compute_depths_inside(points: Array) -> dict[str, Array]:
     abs_y = np.abs(y)
     headlight = _inside_headlight(abs_y, x, z)
     taillight = _soft_minimum(abs_y - 0.40, -1.80 - x, z - 0.785, 0.955 - z)
-    # the height of the dark lower edge, which is larger at the back
+    # the height of the dark lower edge (the valance), which is larger at the rear
     valance_height = np.where(x < -1.6, 0.13, 0.075)
     return {
         "cabin": 0.72 * (1.0 - _cabin_radius(x, y)),
@@ -303,13 +310,15 @@ def _compute_depths_inside(points: Array) -> dict[str, Array]:
 
 
 def _inside_grilles(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
-    """Return how far points lie inside the two grilles, whose edges are slanted.
+    """Return how far points lie inside the two grilles, below 0 outside.
+
+    Their lower and upper edges are slanted.
 
     Args:
         abs_y, x, z: coordinates of the points (N,); y without its sign, as a car is
             symmetric.
     """
-    # distances to the side, to the lower edge and to the upper edge
+    # The smallest of the distances to the side, to the lower and to the upper edge.
     low_grille = _soft_minimum(
         0.62 - abs_y, z - 0.24 + 0.02 * abs_y, 0.37 - 0.02 * abs_y - z
     )
@@ -333,15 +342,16 @@ def _inside_windows(abs_y: Array, x: Array, z: Array) -> dict[str, Array]:
     # approximately half the cabin's width at each height
     half_width = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
 
-    # Each distance is that to one edge of a window, positive inside.
+    # Each argument of `_soft_minimum` is the distance to one edge, positive inside.
     windscreen = _soft_minimum(0.85 * half_width - abs_y, 1.36 - z)
     rear_window = _soft_minimum(0.86 * half_width - abs_y, z - 1.045, 1.325 - z)
 
-    # The side windows lie between two heights and two slanted pillars. A pillar is a
-    # line in the x-z plane: the distance of a point is (point - point of the line) .
-    # normal.
+    # The side windows lie between two heights and two slanted pillars.
     lower_edge = _waist_z(x) + 0.04
     upper_edge = lower_edge + 0.83 * (_roof_z(x) - lower_edge)
+    # The pillars are lines in the x-z plane, through (0.6, 0.93) and (-1.62, 0.98). The
+    # distance of a point is its product with the normal, which points to the windows:
+    # (-0.58, -0.81) and (0.72, -0.69).
     behind_front_pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81
     before_rear_pillar = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
     side_windows = _soft_minimum(
@@ -409,7 +419,7 @@ An opening without a tag (None) is removed.
 """
 
 
-def _opening(name: str) -> shapes.Field:
+def _make_opening_field(name: str) -> shapes.Field:
     """Return the field of an opening, positive inside it."""
     return lambda points: _compute_depths_inside(points)[name]
 
@@ -417,15 +427,17 @@ def _opening(name: str) -> shapes.Field:
 def _body_and_cabin() -> list[Patch]:
     """Create the body and the cabin with their openings.
 
-    A row of levels is (fraction of the height, half the width, x of the front end, x of
-    the rear end), in metres.
+    A level is (fraction of the height, half the width, x of the front end, x of the rear
+    end), in metres.
     """
-    # levels of smaller and smaller outlines at the full height: they close body and
-    # cabin at the top, but for a hole in the body under the cabin
+    # The top of body and cabin: the last outline, scaled about the center, at the full
+    # height. The body keeps a hole, which is under the cabin.
+    _, body_half_width, body_front, body_rear = _BODY[-1]
     deck = [
-        (1.0, scale * 0.78, scale * 1.79, scale * -1.965)
+        (1.0, scale * body_half_width, scale * body_front, scale * body_rear)
         for scale in (0.92, 0.81, 0.69, 0.56, 0.43)
     ]
+    # The last outline of the cabin reaches from 0.28 m before its middle to 0.8 m behind.
     roof = [
         (1.0, scale * 0.5, CABIN_X + scale * 0.28, CABIN_X - scale * 0.8)
         for scale in (0.75, 0.45, 0.15, 0.002)
@@ -444,10 +456,10 @@ def _body_and_cabin() -> list[Patch]:
             corner=0.1,
         ),
     }
-    for shell_name, openings in OPENINGS.items():
-        for opening, tag in openings.items():
+    for shell_name, tag_of_opening in OPENINGS.items():
+        for opening, tag in tag_of_opening.items():
             shells[shell_name] = shapes.carve_patches(
-                shells[shell_name], _opening(opening), tag
+                shells[shell_name], _make_opening_field(opening), tag
             )
     return shells["body"] + shells["cabin"]
 
@@ -457,28 +469,30 @@ def _wheels() -> list[Patch]:
     wheel = _wheel()
     patches = []
     for axle_x, side in WHEEL_POSITIONS:
-        # The wheel's axis is laid along y, outwards. Then the wheel rolls a little:
-        # front and rear wheels by different angles, so that their spokes differ.
-        outwards = shapes.make_rotation_matrix("x", -90.0 * side)
-        rolled = shapes.make_rotation_matrix("y", 17.0 * axle_x)
+        # First the wheel's outer side is turned from +z to the side of the car. Then the
+        # wheel rolls about its axis, by different angles at both axles, so that spokes
+        # differ.
+        turn_outwards = shapes.make_rotation_matrix("x", -90.0 * side)
+        roll_degrees = 17.0 * axle_x
+        roll = shapes.make_rotation_matrix("y", roll_degrees)
         center = (axle_x, side * (WHEEL_SIDE - TYRE / 2), WHEEL)
-        patches += shapes.transform_patches(wheel, rolled @ outwards, center)
+        patches += shapes.transform_patches(wheel, roll @ turn_outwards, center)
     return patches
 
 
 def _wheel() -> list[Patch]:
     """Create a wheel around the z axis, its outer side up: tyre, rim, spokes and hub."""
     outer_z = TYRE / 2  # z of the outer side; 0 is the middle of the tyre
-    ground_z = outer_z - 0.06  # z of the dark disc behind the spokes
+    disc_z = outer_z - 0.06  # z of the dark disc behind the spokes
     # profiles of points (r, z)
     rim_edge = [
         (RIM, outer_z - 0.008),
         (RIM - 0.014, outer_z - 0.012),
-        (RIM - 0.02, ground_z),
+        (RIM - 0.02, disc_z),
     ]
-    ground = [(RIM - 0.02, ground_z), (0.0, ground_z)]
+    dark_disc = [(RIM - 0.02, disc_z), (0.0, disc_z)]
     hub = [
-        (0.052, ground_z),
+        (0.052, disc_z),
         (0.05, outer_z - 0.02),
         (0.03, outer_z - 0.01),
         (0.0, outer_z - 0.008),
@@ -487,7 +501,7 @@ def _wheel() -> list[Patch]:
     return [
         *shapes.revolve_profile([("rubber", _tyre_profile(RIM, outer_z))], columns=28),
         *shapes.revolve_profile([("rim", rim_edge)], columns=28),
-        *shapes.revolve_profile([("well", ground)], columns=24),
+        *shapes.revolve_profile([("well", dark_disc)], columns=24),
         *_spokes(outer_z),
         *shapes.revolve_profile([("rim", round_hub)], columns=20),
     ]
@@ -499,19 +513,18 @@ def _spokes(outer_z: float) -> list[Patch]:
     Args:
         outer_z: z of the outer side of the wheel.
     """
-    bar = np.array(
-        [
-            (0.03, 0.0, outer_z - 0.035),
-            (0.11, 0.0, outer_z - 0.022),
-            (RIM - 0.012, 0.0, outer_z - 0.018),
-        ]
-    )
     section = shapes.rectangle(0.03, 0.03, bevel=0.008, steps=1)
     patches = []
     for number, side in product(range(5), (-1.0, 1.0)):
-        bar[:, 1] = side * np.array([0.012, 0.018, 0.04])
+        # the path of a bar from the hub along +x to the rim
+        bar = [
+            (0.03, side * 0.012, outer_z - 0.035),
+            (0.11, side * 0.018, outer_z - 0.022),
+            (RIM - 0.012, side * 0.04, outer_z - 0.018),
+        ]
+        scale = (1.0, 1.0, 1.15)  # a little thicker at the rim
         patches += shapes.transform_patches(
-            shapes.sweep_section("rim", bar, section, (1.0, 1.0, 1.15)),
+            shapes.sweep_section("rim", bar, section, scale),
             shapes.make_rotation_matrix("z", 72.0 * number),
         )
     return patches
@@ -540,8 +553,10 @@ def _wells() -> list[Patch]:
     patches = []
     for axle_x, side in WHEEL_POSITIONS:
         patches += _well(axle_x, side)
+    # clockwise seen from above, as the floor looks down; -pi is the same point as pi
+    angle = np.linspace(np.pi, -np.pi, 41)[:-1]
     x, y = _outline(
-        np.linspace(np.pi, -np.pi, 41)[:-1],
+        angle,
         front=1.97,
         rear=-1.99,
         half_width=0.79,
@@ -634,14 +649,16 @@ def _plates_and_badges() -> list[Patch]:
         columns=24,
     )
     patches = []
-    for fitting, tilt, position in (
+    # Each is tilted about the y axis. A badge is made facing +z: +78 degrees turn it
+    # towards the front, and -80 towards the rear.
+    for fitting, degrees, position in (
         (plate, -4.0, (2.146, 0.0, 0.428)),
         (plate, 3.0, (-2.138, 0.0, 0.705)),
         (badge, 78.0, (2.118, 0.0, 0.575)),
         (badge, -80.0, (-2.075, 0.0, 0.86)),
     ):
         patches += shapes.transform_patches(
-            fitting, shapes.make_rotation_matrix("y", tilt), position
+            fitting, shapes.make_rotation_matrix("y", degrees), position
         )
     return patches
 
@@ -681,9 +698,10 @@ def _lacquer(t: Texels, color: Array) -> Array:
     fold_distance = shapes.distance_to_polylines(x, np.abs(y), fold_line)
     fold = np.clip(1.0 - fold_distance / 0.05, 0.0, 1.0)
     is_hood = (x > 0.8) & (z > 0.7)
-    shaded = blend_colors(color, 0.75 * color, 0.4 * np.where(is_hood, fold, 0.0))
-    gap = compute_soft_step(0.005 - _gap_distance(t), 0.0, soft=0.011)
-    return blend_colors(shaded, 0.12 * color, 0.9 * gap)
+    hood_fold = np.where(is_hood, fold, 0.0)
+    shaded = blend_colors(color, 0.75 * color, 0.4 * hood_fold)
+    is_gap = compute_soft_step(0.005 - _gap_distance(t), 0.0, soft=0.011)
+    return blend_colors(shaded, 0.12 * color, 0.9 * is_gap)
 
 
 def _gap_distance(t: Texels) -> Array:
@@ -722,7 +740,9 @@ def _panes(t: Texels) -> Array:
     headrest = np.hypot((abs_y - 0.36) / 0.11, (z - 1.23) / 0.055)
     seat = compute_soft_step(1.0 - np.minimum(backrest, headrest), 0.0, soft=0.15)
     pillar = compute_soft_step(0.035 - np.abs(x + 0.25), 0.0, soft=0.01)
-    dark = np.maximum(np.where(abs_y > 0.55, pillar, 0.0), np.where(x > 0.0, seat, 0.0))
+    side_pillar = np.where(abs_y > 0.55, pillar, 0.0)
+    front_seat = np.where(x > 0.0, seat, 0.0)
+    dark = np.maximum(side_pillar, front_seat)
     return blend_colors(glass, parse_hex_color("0b0c0d"), dark)
 
 
@@ -826,7 +846,7 @@ def car(sampler: ParameterSampler) -> Instance:
     return Instance(
         shapes.stretch_patches(patches, stretch),
         paints,
-        material=FINISHES["paint"],  # the main one; `finishes` has one for each tag
+        material=FINISHES["paint"],  # the main one of `materials_by_tag`
         # texels per length, relative to the paint: fewer for parts that are hardly
         # visible, more for the signs on the plate
         texel_density={

@@ -124,12 +124,12 @@ def pack_charts(
     Raises:
         ValueError: there are too many charts for their gutters alone.
     """
-    # rounded, so that machines that differ in the last bits pack alike
+    # Rounded, as machines differ in the last bits: all of them get the same packing.
     exact_sizes = [
         (round(width, DECIMALS), round(height, DECIMALS)) for width, height in sizes
     ]
     lying_sizes = [(max(size), min(size)) for size in exact_sizes]
-    lower_scale = 0.0  # nothing but gutters
+    lower_scale = 0.0  # at this scale, charts are only their gutters
     # At this scale the widest chart is as wide as the square: no larger one can fit.
     upper_scale = side / max(width for width, _ in lying_sizes)
     best = _shelves(lying_sizes, lower_scale, side)
@@ -185,9 +185,10 @@ def paint_atlas(
     # last bits.
     image[~is_used] = np.round(image[is_used].mean(axis=0), 2)
     top_down = image[::-1]
-    # rounded to 4 decimals first, so that all machines round halves to the same level
+    # Rounded to 4 decimals first: else a level near a half might be rounded up on one
+    # machine and down on another.
     stable_levels = np.round(top_down * 255.0, 4)
-    # The conversion to integers truncates: with 1/2 added it rounds.
+    # The conversion to integers truncates. With 1/2 added it rounds.
     levels = np.clip(stable_levels + 0.5, 0.5, 255.5).astype(np.uint8)
     return np.asarray(levels.astype(np.float32) / np.float32(255.0))
 
@@ -225,7 +226,9 @@ def join_patches(
         rectangles: where the chart of each patch is in the atlas.
         side: side of the atlas, in texels.
     """
-    first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
+    vertex_counts = [len(patch.vertices) for patch in patches]
+    # index of the first vertex of each patch in the mesh
+    first_vertex = np.cumsum([0, *vertex_counts[:-1]])
     all_faces = [
         patch.faces + first for patch, first in zip(patches, first_vertex, strict=True)
     ]
@@ -240,8 +243,8 @@ def join_patches(
     # the point below the center, at the lowest height, and the largest extent
     origin, extent = assets.find_footing(vertices)
     vertices = (vertices - origin) / extent
-    # Some vertices at poles belong to no triangle. They are removed, and the others are
-    # numbered without gaps.
+    # Some vertices at poles belong to no triangle. They are removed: the new index of a
+    # vertex is its position in the ascending array `used`.
     used = np.unique(faces)
     renumbered_faces = np.searchsorted(used, faces).astype(np.uint32)
     return assets.Mesh(
@@ -255,7 +258,7 @@ def join_patches(
 def _atlas_coordinates(patch: Patch, rectangle: AtlasRectangle, side: int) -> Array:
     """Return the texture coordinates (V, 2) of a patch's vertices in the atlas."""
     chart_uvs = patch.uvs
-    if rectangle.is_rotated:
+    if rectangle.is_rotated:  # by 90 degrees; the rectangle has the rotated size
         chart_uvs = np.stack([1.0 - patch.uvs[:, 1], patch.uvs[:, 0]], axis=1)
     inner_size = np.array([rectangle.width - 2 * GUTTER, rectangle.height - 2 * GUTTER])
     corner = np.array([rectangle.x, rectangle.y])
@@ -282,8 +285,8 @@ class Instance:
         material: parameters of the surface other than its color.
         texel_density: texels per length by tag, relative to the rest of the object:
             lower for parts that are hardly visible.
-        materials_by_tag: materials by tag, if the object has several; then its tags are the
-            names of materials.
+        materials_by_tag: materials by tag, if the object has several; then its tags are
+            the names of materials.
         rig: moves the vertices of all patches, in the order of the patches; None if the
             object has no pose.
         drives: whether it moves as a vehicle does, see `ObjectAsset.drives`.
@@ -372,9 +375,9 @@ def _scale_charts(instance: Instance) -> list[tuple[float, float]]:
 
 
 def _sort_by_material(instance: Instance) -> Instance:
-    """Return an instance with `finishes` with its patches sorted by material.
+    """Return an instance that has `materials_by_tag` with its patches sorted by material.
 
-    Tags of patches are then names of materials. Materials come in the order in which
+    The tag of a patch is the name of its material. Materials come in the order in which
     they are used first.
     """
     tags = list(dict.fromkeys(patch.tag for patch in instance.patches))
@@ -383,14 +386,14 @@ def _sort_by_material(instance: Instance) -> Instance:
 
 
 def _faces_by_material(patches: Sequence[Patch]) -> dict[str, assets.IntArray]:
-    """Return the indices of the faces of each material, a tag, in the joined mesh."""
-    tag_of_face = np.repeat(
-        [patch.tag for patch in patches], [len(patch.faces) for patch in patches]
-    )
-    return {
-        str(tag): np.nonzero(tag_of_face == tag)[0]
-        for tag in dict.fromkeys(tag_of_face)
-    }
+    """Return the indices of each material's faces in the joined mesh, by its name.
+
+    The tag of a patch is the name of its material.
+    """
+    tags = [patch.tag for patch in patches]
+    face_counts = [len(patch.faces) for patch in patches]
+    tag_of_face = np.repeat(tags, face_counts)
+    return {tag: np.nonzero(tag_of_face == tag)[0] for tag in dict.fromkeys(tags)}
 
 
 def make_family(
@@ -413,7 +416,7 @@ def sample_material(
     clearcoat: float = 0.0,
     spread: float = 0.2,
 ) -> assets.Material:
-    """Sample a material: its roughness, seldom its clearcoat, and rarely a metal.
+    """Sample a material: its roughness, sometimes its clearcoat, and rarely a metal.
 
     Args:
         sampler: samples the values; the canonical instance has those that are passed.
@@ -432,7 +435,7 @@ def sample_material(
     if sampler.sample_bool(0.06):
         metallic = sampler(0.0, low=0.3, high=0.8)
     values = {
-        # no mirror, whose reflections would be noisy, and not completely dull
+        # at least 0.12, as the reflections of a mirror would be noisy
         "roughness": min(max(sampled_roughness, 0.12), 0.95),
         "metallic": metallic,
         "specular": sampler(0.5, low=0.3, high=0.7),

@@ -53,15 +53,16 @@ def _spout(sampler: ParameterSampler, radius: float, height: float) -> list[Patc
     tip_radius = sampler(0.72, low=0.55, high=0.95)
     t = np.linspace(0.0, 1.0, SPOUT_POINTS)  # from the body to the tip
     outer_radii = tip_radius + (root_radius - tip_radius) * (1.0 - t) ** 1.3
-    ring_index, radii, ahead = _spout_rings(outer_radii)
+    point_of_ring, radii, distance_ahead = _spout_rings(outer_radii)
     path_frame = shapes.compute_frames(path, (0.0, 1.0, 0.0))
-    tangent, first, second = (axis[ring_index] for axis in path_frame)
+    tangent, first_normal, second_normal = (axis[point_of_ring] for axis in path_frame)
+    ring_centers = path[point_of_ring] + distance_ahead[:, None] * tangent
     return shapes.sweep_section(
         "spout",
-        path[ring_index] + ahead[:, None] * tangent,
+        ring_centers,
         shapes.ellipse(1.0, 1.0, count=20),
         radii,
-        frame=(tangent, first, second),
+        frame=(tangent, first_normal, second_normal),
     )
 
 
@@ -77,23 +78,26 @@ def _spout_rings(outer_radii: Array) -> tuple[assets.IntArray, Array, Array]:
     """
     tip = SPOUT_POINTS - 1
     # Two rings make the round lip at the tip, four go back down inside of the wall, and
-    # the last one closes the hollow.
+    # the last one, with radius 0, closes the hollow.
+    outside = range(SPOUT_POINTS)
+    lip = [tip, tip]
     inside = [tip, tip - 1, tip - 2, tip - 3]
-    ring_index = np.array([*range(SPOUT_POINTS), tip, tip, *inside, tip - 4])
+    point_of_ring = np.array([*outside, *lip, *inside, tip - 4])
     lip_radii = [outer_radii[tip] - 0.06, outer_radii[tip] - 0.12]
     inner_radii = outer_radii[inside] - SPOUT_WALL
     radii = np.concatenate([outer_radii, lip_radii, inner_radii, [0.0]])
-    # The lip and the first ring inside lie a little ahead, so that the lip is round.
-    ahead = np.zeros(len(ring_index))
-    ahead[SPOUT_POINTS : SPOUT_POINTS + 3] = (0.1, 0.12, 0.06)
-    return ring_index, radii, ahead
+    # Both rings of the lip and the first one inside lie a little ahead of the tip, so
+    # that the lip is round.
+    distance_ahead = np.zeros(len(point_of_ring))
+    distance_ahead[SPOUT_POINTS : SPOUT_POINTS + 3] = (0.1, 0.12, 0.06)
+    return point_of_ring, radii, distance_ahead
 
 
 def _spout_path(sampler: ParameterSampler, radius: float, height: float) -> Array:
     """Sample the path of a spout in the x-z plane, from the body to the tip.
 
-    A curved spout has the shape of an S: it bulges out and downwards in its lower half,
-    and is bent back a little before the tip.
+    A curved spout has the shape of an S: it bulges out and downwards in the middle, and
+    is bent back a little before the tip.
 
     Args:
         sampler: samples the style of the spout and its ends.
@@ -124,9 +128,8 @@ def teapot(sampler: ParameterSampler) -> Instance:
     height = sampler(10.2, low=8.0, high=12.5)
     side, body = _teapot_body(sampler, radius, height)
     handle = _teapot_handle(sampler, side, radius, height)
-    opposite = shapes.make_rotation_matrix(
-        "z", 180.0
-    )  # both are made at +x; the handle turns
+    # Spout and handle are both made at +x, and the handle is turned.
+    opposite = shapes.make_rotation_matrix("z", 180.0)
     patches = [
         *body,
         *_spout(sampler, radius, height),

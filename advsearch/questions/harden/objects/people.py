@@ -100,18 +100,19 @@ def _reference_vertices(data: Any) -> Array:
     """Return the vertices (V, 3) of the reference body, in metres, standing on z = 0.
 
     It has a fixed phenotype, and stands as MakeHuman's body does. A body is the mean of
-    all bodies plus a sum over a basis, weighted by the shares of its phenotype.
+    all bodies plus a sum over a basis, whose weights ("shares") depend on the phenotype.
 
     Args:
         data: the arrays of the file of bodies.
     """
     point_of_vertex = data["index"].astype(np.int64)
     mean = data["mean"][point_of_vertex] * 1e-4  # stored in tenths of millimetres
-    # The table of shares has an axis for each property of the phenotype. This is the
-    # phenotype with index 1 along each.
-    shares = data["shares"][1, 1, 1, 1]
+    # The table of weights has an axis for each property of the phenotype. The reference
+    # has the index 1 of each.
+    basis_weights = data["shares"][1, 1, 1, 1]
+    basis = data["basis"][:, point_of_vertex]
     # r: index of the basis; p: vertex; c: coordinate
-    vertices = mean + np.einsum("r,rpc->pc", shares, data["basis"][:, point_of_vertex])
+    vertices = mean + np.einsum("r,rpc->pc", basis_weights, basis)
     vertices[:, 2] -= vertices[:, 2].min()
     return np.asarray(vertices)
 
@@ -126,9 +127,9 @@ def _smooth_normals(
     """Return normals (V, 3) that are smooth across the seams of charts.
 
     Vertices of several charts that are the same point of the body have the same normal:
-    the mean of the normals of all faces around it, weighted by area. The length of a
-    face's area vector is twice its area, so the sum of area vectors is already
-    weighted.
+    the mean of the normals of all faces around it, weighted by area. A face's area
+    vector is its normal times twice its area, so the sum of area vectors has the
+    direction of this mean.
 
     Args:
         vertices: (V, 3), chart after chart.
@@ -137,20 +138,20 @@ def _smooth_normals(
         first_vertex, first_face: where the vertices and faces of each chart begin, and
             where all end.
     """
+    # indices of vertices within all charts instead of one
+    n_charts = len(first_face) - 1
     faces_of_chart = [
-        faces[first:last] + offset
-        for first, last, offset in zip(
-            first_face, first_face[1:], first_vertex, strict=False
-        )
+        faces[first_face[chart] : first_face[chart + 1]] + first_vertex[chart]
+        for chart in range(n_charts)
     ]
     all_faces = np.concatenate(faces_of_chart)
-    # The area vector of a face is added to its three points.
+    # The area vector of a face is added to the sum of each of its three points.
     area_vectors = assets.compute_area_vectors(vertices[all_faces])
-    normal_sum = np.zeros((int(point_of_vertex.max()) + 1, 3))
+    points_of_faces = point_of_vertex[all_faces]  # (F, 3)
+    n_points = int(point_of_vertex.max()) + 1
+    normal_sum = np.zeros((n_points, 3))
     np.add.at(
-        normal_sum,
-        point_of_vertex[all_faces].reshape(-1),
-        np.repeat(area_vectors, 3, axis=0),
+        normal_sum, points_of_faces.reshape(-1), np.repeat(area_vectors, 3, axis=0)
     )
     normals = normal_sum[point_of_vertex]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -173,7 +174,7 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 def _jeans(t: Texels, color: Array) -> Array:
     """Paint woven cloth with seams down the legs and a hem at both ankles."""
     x, _, z = t.xyz.T
-    # On both legs, inside and outside, the seam is where x is 0.005.
+    # The seams, on the inner and outer side of both legs, are where x is 0.005.
     has_seam = (z < 0.88) & (z > 0.08)
     far = 9.0  # a distance in metres that stands for no seam
     seam_distance = np.where(has_seam, np.abs(x - 0.005), far)
@@ -203,24 +204,25 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
     mottling = 1.0 + 0.1 * (compute_value_noise(t.xyz * 14.0) - 0.5)
     skin = np.clip(color * mottling[:, None], 0.0, 1.0)
 
-    # how far inside an ellipse; -1 at the back of the head
-    in_lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
+    # how far inside an ellipse, as a fraction; -1 at the back of the head
+    lip_radius = np.hypot(y / 0.025, (z - 1.563) / 0.011)  # 1 at the edge
+    in_lips = np.where(is_front, 1.0 - lip_radius, -1.0)
     lip_color = color * np.array([0.86, 0.62, 0.6])
     skin = blend_colors(
         skin, lip_color, 0.75 * compute_soft_step(in_lips, 0.0, soft=0.25)
     )
 
-    in_cheeks = np.where(
-        is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
-    )
+    cheek_radius = np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02)
+    in_cheeks = np.where(is_front, 1.0 - cheek_radius, -1.0)
     cheek_color = color * np.array([1.0, 0.84, 0.8])
     skin = blend_colors(
         skin, cheek_color, 0.5 * compute_soft_step(in_cheeks, 0.0, soft=0.6)
     )
 
     brow_height = 1.659 - 14.0 * (abs_y - 0.034) ** 2  # an arch over each eye
-    has_brow = is_front & (np.abs(abs_y - 0.034) < 0.021)  # above an eye
-    in_brow = np.where(has_brow, 0.0038 - np.abs(z - brow_height), -1.0)
+    is_above_eye = is_front & (np.abs(abs_y - 0.034) < 0.021)
+    # how far inside a brow, in metres
+    in_brow = np.where(is_above_eye, 0.0038 - np.abs(z - brow_height), -1.0)
     return blend_colors(skin, hair, 0.8 * compute_soft_step(in_brow, 0.0, soft=0.0015))
 
 
@@ -267,7 +269,7 @@ def person(sampler: ParameterSampler) -> Instance:
         "weight": sampler(0.5, low=0.25, high=0.8),
         "age": sampler(35.0, low=16.0, high=75.0),
         "stride": sampler(0.0, low=0.0, high=1.2),
-        "walk": sampler(0.0, low=0.0, high=360.0),
+        "walk": sampler(0.0, low=0.0, high=360.0),  # phase of the stride, in degrees
     }
     body = workbench.library.make_person(phenotype)
     return Instance(

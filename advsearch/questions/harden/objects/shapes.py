@@ -170,8 +170,9 @@ def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
 
     Its circumradius is 1, and a flat side is at the bottom.
     """
-    # The first and last corner are not rounded. So the polygon is continued by two more
-    # corners, and these two are cut off.
+    # The first and last corner of a polyline are not rounded. So the polygon is
+    # continued by two corners, and the first and last point are cut off. -0.5 places a
+    # side, and not a corner, at the bottom, where the angle is -pi / 2.
     angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return round_corners(ring, radius=bevel, steps=steps)[1:-1]
@@ -187,8 +188,8 @@ def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Arra
         bevel: distance from a corner at which its rounding begins.
         steps: edges of a rounded corner.
     """
-    # The first two corners are repeated at the end: the outermost corners of the
-    # polyline are not rounded, and are cut off.
+    # The first and last corner of a polyline are not rounded. So the rectangle is
+    # continued by two corners, and the first and last point are cut off.
     half_width = width / 2
     half_height = height / 2
     corners = [
@@ -228,8 +229,8 @@ class Patch:
         faces: vertex indices (F, 3).
         size: width and height of the chart in object units, which decide its size in
             the atlas.
-        compute_rest_points: maps u (N,) and v (N,) to surface points (N, 3) before any transform. The
-            patch is painted at these points.
+        compute_rest_points: maps u (N,) and v (N,) to surface points (N, 3) before any
+            transform. The patch is painted at these points.
     """
 
     tag: str
@@ -248,7 +249,8 @@ def transform_patches(
 ) -> list[Patch]:
     """Return patches rotated and then translated.
 
-    Their paint moves with them, because it depends on `rest`, which stays.
+    Their paint moves with them, because it depends on `compute_rest_points`, which stays
+    the same.
 
     Args:
         patches: patches to move; they are not changed.
@@ -272,7 +274,8 @@ def stretch_patches(
 ) -> list[Patch]:
     """Return patches scaled along x, y and z.
 
-    Their paint is scaled with them, because it depends on `rest`, which stays.
+    Their paint is scaled with them, because it depends on `compute_rest_points`, which
+    stays the same.
     """
     scale = np.asarray(factors, dtype=np.float64)
     return [
@@ -295,9 +298,8 @@ def make_grid_patch(
 ) -> Patch:
     """Create the patch of a grid of points (R, C, 3) with unit normals.
 
-    The patch has a chart, which is the rectangle of its texture. Its function `rest`
-    returns the 3-D points at chart coordinates, by bilinear interpolation. The atlas
-    calls it to paint each texel.
+    The patch has a chart, which is the rectangle of its texture. The atlas paints each
+    texel at its 3-D point, which is interpolated bilinearly between the grid's points.
 
     Args:
         tag: tag of the paint.
@@ -305,8 +307,8 @@ def make_grid_patch(
             product of these directions points outwards.
         normals: (R, C, 3).
         size: width and height of the chart in object units.
-        down: v of the rows (R,), increasing from 0 to 1.
-        across: u of the columns (C,), increasing from 0 to 1.
+        down: chart coordinate v of the rows (R,), increasing from 0 to 1.
+        across: chart coordinate u of the columns (C,), increasing from 0 to 1.
     """
     rows, columns = points.shape[:2]
     u = np.broadcast_to(across, (rows, columns))
@@ -318,7 +320,7 @@ def make_grid_patch(
         (down, across), points, bounds_error=False, fill_value=None
     )
 
-    def rest(at_u: Array, at_v: Array) -> Array:
+    def compute_rest_points(at_u: Array, at_v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
         return np.asarray(interpolate(np.stack([at_v, at_u], axis=-1)))
 
@@ -329,7 +331,7 @@ def make_grid_patch(
         uvs=np.stack([u, v], axis=-1).reshape(-1, 2),
         faces=_grid_faces(vertices, rows, columns),
         size=size,
-        compute_rest_points=rest,
+        compute_rest_points=compute_rest_points,
     )
 
 
@@ -338,11 +340,12 @@ def _grid_faces(vertices: Array, rows: int, columns: int) -> assets.IntArray:
 
     Triangles without area are left out: they are where a row shrinks to a point.
     """
-    # index of the first vertex of each cell, and two triangles relative to it
-    first_vertex = np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)
-    two_triangles = [[0, 1, columns + 1, 0, columns + 1, columns]]
-    faces = (first_vertex.reshape(-1)[:, None] + two_triangles).reshape(-1, 3)
-    faces = faces.astype(np.int64)
+    # A cell has two triangles. Their vertices are relative to the first of the cell.
+    row = np.arange(rows - 1)[:, None]
+    column = np.arange(columns - 1)
+    first_vertices = (row * columns + column).reshape(-1, 1)
+    relative_vertices = [[0, 1, columns + 1, 0, columns + 1, columns]]
+    faces = (first_vertices + relative_vertices).reshape(-1, 3).astype(np.int64)
     area = np.linalg.norm(assets.compute_area_vectors(vertices[faces]), axis=1)
     typical_area = float(np.median(area[area > 0.0]))
     with_area: assets.IntArray = faces[area > 1e-6 * typical_area]
@@ -366,28 +369,30 @@ def _fan(count: int) -> assets.IntArray:
 def _profile_normals(polylines: Sequence[Array]) -> list[Array]:
     """Return the unit normals (K, 2) of consecutive polylines, as (r, z).
 
-    A polyline has points (r, z) and is walked with the material on its left. Its normal
-    is its direction (dr, dz) turned to the right, (dz, -dr), which points outwards.
-    Where it ends on the axis, the normal there is along the axis. Where two polylines
+    The points (r, z) of a polyline follow each other with the material on their left.
+    So a direction (dr, dz) that is turned to the right, (dz, -dr), points outwards.
+    Where a polyline ends on the axis, its normal is along the axis. Where two polylines
     meet at less than `HARD_ANGLE` degrees, they share the mean of their normals.
     """
     all_directions = [_profile_directions(polyline) for polyline in polylines]
+    min_smooth_cosine = np.cos(np.radians(HARD_ANGLE))
     for index in range(len(polylines) - 1):
-        before = all_directions[index]
-        after = all_directions[index + 1]
-        # A shared end is the same point up to rounding.
-        gap = polylines[index][-1] - polylines[index + 1][0]
-        is_joined = float(np.linalg.norm(gap)) < 1e-9
-        cosine = float(before[-1] @ after[0])
-        is_smooth = cosine > np.cos(np.radians(HARD_ANGLE))
+        end_point = polylines[index][-1]
+        next_point = polylines[index + 1][0]
+        is_joined = float(np.linalg.norm(end_point - next_point)) < 1e-9
+        end_direction = all_directions[index][-1]
+        next_direction = all_directions[index + 1][0]
+        is_smooth = float(end_direction @ next_direction) > min_smooth_cosine
         if is_joined and is_smooth:
-            mean_direction = normalize(before[-1] + after[0])
-            before[-1] = mean_direction
-            after[0] = mean_direction
-    return [
-        np.stack([directions[:, 1], -directions[:, 0]], axis=1)
-        for directions in all_directions
-    ]
+            mean_direction = normalize(end_direction + next_direction)
+            all_directions[index][-1] = mean_direction
+            all_directions[index + 1][0] = mean_direction
+    return [_turn_right(directions) for directions in all_directions]
+
+
+def _turn_right(directions: Array) -> Array:
+    """Return directions (K, 2) of a plane turned to the right by 90 degrees."""
+    return np.stack([directions[:, 1], -directions[:, 0]], axis=1)
 
 
 def _profile_directions(polyline: Array) -> Array:
@@ -431,22 +436,21 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         normals: (K, 2), as (r, z), at these points.
         columns: number of faces around the axis.
     """
-    # A profile that ends on the axis (r is 0) faces up; one that begins there faces
-    # down. Here both curve and normals begin on the axis.
+    # The material is on the left of a profile. So a profile that ends on the axis (r is
+    # 0) faces up, and one that begins there faces down.
     faces_up = profile[-1, 0] < 1e-9
-    curve = profile
-    curve_normals = normals
+    triangles = _disc_triangles(columns, profile)
     if faces_up:
+        # the same points, but from the pole outwards
         curve = profile[::-1]
         curve_normals = normals[::-1]
-
-    # A disc that faces down is seen from below. There x has the other direction: so its
-    # chart is mirrored, and its triangles have the reverse order.
-    triangles = _disc_triangles(columns, curve)
-    chart_x_sign = 1.0
-    if not faces_up:
-        triangles = triangles[:, ::-1]
+        chart_x_sign = 1.0
+    else:
+        curve = profile
+        curve_normals = normals
+        # Seen from below, the x axis has the other direction.
         chart_x_sign = -1.0
+        triangles = triangles[:, ::-1]
 
     radial_fraction, length = _compute_length_fractions(curve)
     theta = 2 * np.pi * np.arange(columns) / columns
@@ -458,7 +462,7 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
     pole_uv = [[0.5, 0.5]]
     uvs = np.concatenate([pole_uv, np.stack(ring_uvs, axis=-1).reshape(-1, 2)])
 
-    def rest(u: Array, v: Array) -> Array:
+    def compute_rest_points(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
         # from [0, 1] to [-1, 1], so that the disc has radius 1 around the pole
         x = (2 * u - 1) * chart_x_sign
@@ -476,8 +480,8 @@ def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
         normals=_revolve_from_pole(curve_normals, theta),
         uvs=uvs,
         faces=triangles,
-        size=(2 * length, 2 * length),
-        compute_rest_points=rest,
+        size=(2 * length, 2 * length),  # `length` is the radius of the unrolled disc
+        compute_rest_points=compute_rest_points,
     )
 
 
@@ -494,14 +498,15 @@ def _revolve_from_pole(curve: Array, theta: Array) -> Array:
 def _disc_triangles(columns: int, curve: Array) -> assets.IntArray:
     """Return the triangles (F, 3) of a disc with rings of vertices around a pole.
 
-    Vertex 0 is the pole; then come rings of `columns` vertices, one for each later
+    Vertex 0 is the pole; then come rings of `columns` vertices, one for each other
     point of the curve (K, 2). The triangles are counter-clockwise seen from above.
     """
     column = np.arange(columns)
     next_column = (column + 1) % columns
-    faces = [_fan(columns)]
-    for row in range(len(curve) - 2):
-        # indices of the first vertices of two rings
+    n_rings = len(curve) - 1
+    faces = [_fan(columns)]  # from the pole to the first ring
+    for row in range(n_rings - 1):
+        # indices of the first vertices of two neighboring rings
         inner = 1 + row * columns
         outer = 1 + (row + 1) * columns
         faces += [
@@ -526,12 +531,14 @@ def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]
         columns: faces around.
     """
     theta = 2 * np.pi * np.arange(columns + 1) / columns
-    theta[-1] = 0.0  # the seam's two columns are the same points, to the bit
+    # The seam has two columns at the same points. With 2 pi they would differ in the
+    # last bits.
+    theta[-1] = 0.0
     points = _revolve_curve(profile, theta)
     normal = _revolve_curve(normals, theta)
     down, length = _compute_length_fractions(profile)
-    # A typical circumference: at three quarters of the points the profile is narrower.
-    # A maximum would depend on single points, such as a lip.
+    # The circumference at the upper quartile of the radii. That at the largest radius
+    # would depend on single points, such as a lip.
     width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
     can_be_quartered = columns % 4 == 0
     n_pieces = 1
@@ -557,10 +564,10 @@ def revolve_profile(
     """Rotate a profile about the z axis.
 
     Args:
-        profile: consecutive pieces (tag, (K, 2) points (r, z)), in the order in which
-            the material is on the left: along the bottom away from the axis, up the
-            outside, over the lip, down the inside. A piece becomes a disc if it is
-            mostly flat and one of its ends is on the axis, otherwise a band.
+        profile: consecutive pieces (tag, (K, 2) points (r, z)). Their points follow each
+            other with the material on their left: along the bottom away from the axis,
+            up the outside, over the lip, down the inside. A piece becomes a disc if it
+            is mostly flat and one of its ends is on the axis, otherwise a band.
         columns: number of faces around the axis.
     """
     tags = [tag for tag, _ in profile]
@@ -569,11 +576,11 @@ def revolve_profile(
     for tag, curve, normals in zip(tags, curves, _profile_normals(curves), strict=True):
         starts_on_axis = curve[0, 0] < 1e-9  # a radius of 0, up to rounding
         ends_on_axis = curve[-1, 0] < 1e-9
-        touches_axis = starts_on_axis != ends_on_axis  # with one of its ends
+        has_single_pole = starts_on_axis != ends_on_axis
         radius_change = abs(curve[-1, 0] - curve[0, 0])
         _, length = _compute_length_fractions(curve)
-        is_flat = radius_change > 0.5 * length
-        if touches_axis and is_flat:
+        is_mostly_flat = radius_change > 0.5 * length
+        if has_single_pole and is_mostly_flat:
             patches.append(_disc(tag, curve, normals, columns))
         else:
             patches += _wall(tag, curve, normals, columns)
@@ -595,19 +602,22 @@ def make_vessel(
         columns: number of faces around the axis.
         step: longest edge along the profile.
     """
-    normal, inner = _inner_profile(outside, wall)
+    normal, inner = _inner_profile(outside, wall)  # `inner` is from the lip downwards
     lip = _round_lip(outside, wall, normal)
     max_radius = float(outside[:, 0].max())
     fillet = min(1.5 * wall, 0.3 * max_radius)  # radius between wall and floor
-    floor_radius = radius_at_height(inner[::-1], floor)
+    ascending_inner = inner[::-1]
+    floor_radius = radius_at_height(ascending_inner, floor)
+    floor_edge = np.array([floor_radius, floor])
+    # The fillet replaces the edge between wall and floor. It ends on the floor.
     fillet_end = np.array([max(floor_radius - fillet, 0.4 * floor_radius), floor])
-    # The wall is above the fillet, and not where the two sides of a narrow container
-    # meet.
-    is_wall = (inner[:, 1] > floor + fillet) & (inner[:, 0] > 0.05 * max_radius)
-    inner_wall = inner[is_wall]
-    rounding = _bezier(inner_wall[-1], np.array([floor_radius, floor]), fillet_end)
+    is_above_fillet = inner[:, 1] > floor + fillet
+    is_open = inner[:, 0] > 0.05 * max_radius  # not where a narrow inside closes
+    inner_wall = inner[is_above_fillet & is_open]
+    rounding = _bezier(inner_wall[-1], floor_edge, fillet_end)
     inside = np.concatenate([inner_wall, rounding])
-    outside_with_lip = np.concatenate([outside, lip, inner_wall[:1]])
+    inside_start = inner_wall[:1]
+    outside_with_lip = np.concatenate([outside, lip, inside_start])
     base = _hollow_base(outside[0], wall, floor)
     pieces = [
         ("base", subdivide(base, longest=3 * step)),
@@ -644,24 +654,26 @@ def _bezier(start: Array, control: Array, end: Array) -> Array:
 def _inner_profile(outside: Array, wall: float) -> tuple[Array, Array]:
     """Return the normals (K, 2) of a profile, and the profile of the inside of its wall.
 
-    The inside is the profile moved inwards by the thickness of the wall, from the lip
-    downwards. In tight bends it would run backwards. The points at which such a step
-    begins are removed, until no step runs backwards any more.
+    The inside is the profile moved inwards by the thickness of the wall. In tight bends
+    some of its steps have the opposite direction of the profile's. The points at which
+    these steps begin are removed, until none is left. The inside is returned from the
+    lip downwards.
     """
-    normal = _profile_normals([outside])[0]
+    (normal,) = _profile_normals([outside])
     inner = outside - wall * normal
-    remaining = np.arange(len(outside))
+    remaining = np.arange(len(outside))  # indices of the points that are not removed
     while len(remaining) > 2:
         inner_steps = np.diff(inner[remaining], axis=0)
         outer_steps = np.diff(outside[remaining], axis=0)
         is_backward = (inner_steps * outer_steps).sum(axis=1) <= 0.0
         if not is_backward.any():
             break
-        # Each step begins at a point; the last point, at the lip, begins none and stays.
-        forward_starts = remaining[:-1][~is_backward]
-        remaining = np.append(forward_starts, remaining[-1])
-    inner = inner[remaining][::-1]
-    return normal, inner
+        # The last point, at the lip, begins no step, and stays.
+        step_starts = remaining[:-1]
+        lip = remaining[-1]
+        remaining = np.append(step_starts[~is_backward], lip)
+    from_lip_downwards = inner[remaining][::-1]
+    return normal, from_lip_downwards
 
 
 def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
@@ -677,7 +689,7 @@ def _round_lip(outside: Array, wall: float, normal: Array) -> Array:
     angle = np.pi * np.arange(1, 6) / 6
     center = outside[-1] - wall / 2 * normal[-1]
     outwards = wall / 2 * normal[-1]
-    # turned by a quarter to the left: on along the profile
+    # `outwards` turned by 90 degrees to the left, which is the profile's direction
     upwards = np.array([-outwards[1], outwards[0]])
     lip: Array = (
         center + np.cos(angle)[:, None] * outwards + np.sin(angle)[:, None] * upwards
@@ -756,7 +768,8 @@ def sweep_section(
             both axes of the section; 0 closes the surface in a point.
         start_axis: direction (3,) of the section's first axis at the start of the path.
         has_caps: whether both ends are closed with flat faces and a hard edge.
-        frame: tangents and normals to use in place of `compute_frames(path, first)`.
+        frame: tangents and normals to use in place of `compute_frames(path,
+            start_axis)`.
     """
     centers = np.asarray(path, dtype=np.float64)
     if frame is None:
@@ -764,19 +777,20 @@ def sweep_section(
     tangent, first_normal, second_normal = frame
     scales = _to_axis_scales(scale, len(centers))
     points = _sweep_points(section, scales, centers, first_normal, second_normal)
-    ring_fraction, ring_length = _compute_length_fractions(
-        _repeat_first(section, axis=0)
-    )
-    # A typical circumference: the mean scale of both axes is smaller at three quarters
-    # of the centers. The ends, which may shrink to a point, hardly matter.
+    closed_section = _repeat_first(section, axis=0)
+    ring_fraction, ring_length = _compute_length_fractions(closed_section)
+    # The circumference at the upper quartile of the scales, so that the ends, which may
+    # shrink to a point, hardly matter.
     width = ring_length * float(np.quantile(scales.mean(axis=1), 0.75))
-    # distance along the path of each ring, for the chart's coordinate v
+    # distance along the path of each ring
     down = mean_lengths(points)
+    normals = _sweep_normals(points, tangent)
+    # The first column of the chart is repeated as the last one.
     patches = [
         make_grid_patch(
             tag,
             _repeat_first(points, axis=1),
-            _repeat_first(_sweep_normals(points, tangent), axis=1),
+            _repeat_first(normals, axis=1),
             size=(width, float(down[-1])),
             down=down / down[-1],
             across=ring_fraction,
@@ -837,11 +851,12 @@ def _sweep_normals(points: Array, tangent: Array) -> Array:
     normals = np.cross(ring_tangent, np.gradient(points, axis=0))
     normal_length = np.linalg.norm(normals, axis=-1)
     normals = normalize(normals)
-    negligible_length = 1e-7 * float(normal_length.max())  # the ring is a single point
-    # outwards is backwards at the first ring, and forwards at the last
+    # Where a ring is a single point, the cross product is 0, up to rounding.
+    negligible_length = 1e-7 * float(normal_length.max())
+    # Outwards is backwards at the first ring, and forwards at the last.
     for row, direction in ((0, -1.0), (-1, 1.0)):
         is_point = normal_length[row] < negligible_length
-        normals[row][is_point] = direction * tangent[row]
+        normals[row, is_point] = direction * tangent[row]
     return normals
 
 
@@ -876,7 +891,7 @@ def make_cap_face(tag: str, ring: Array, normal: Array) -> Patch:
     vertices = np.concatenate([center[None], ring])
     plane_vertices = np.concatenate([[[0.0, 0.0]], plane_points])
 
-    def rest(u: Array, v: Array) -> Array:
+    def compute_rest_points(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at chart coordinates (N,)."""
         return np.asarray(
             center
@@ -891,7 +906,7 @@ def make_cap_face(tag: str, ring: Array, normal: Array) -> Patch:
         uvs=(plane_vertices - lower) / extent,
         faces=_fan(len(ring)),
         size=(float(extent[0]), float(extent[1])),
-        compute_rest_points=rest,
+        compute_rest_points=compute_rest_points,
     )
 
 
@@ -934,8 +949,8 @@ def make_rounded_box(
         down = (coordinates[j] + half[j]) / (2 * half[j])
         across = (coordinates[i] + half[i]) / (2 * half[i])
         if side < 0:
-            # `_rounded_face` returns the columns of a lower face in reverse order.
-            # Their u has to increase all the same.
+            # `_rounded_face` returns the columns of a lower face in reverse order. Its u
+            # is counted from the other side, so that it increases, too.
             across = 1.0 - across[::-1]
         patches.append(
             make_grid_patch(
@@ -975,8 +990,9 @@ def _rounded_face(
 ) -> tuple[Array, Array]:
     """Return normals and points (V, U, 3) of a face of a box with rounded edges.
 
-    A point on the face of the sharp box is moved towards the nearest point of the core,
-    which is the box made smaller by the bevel on each side, until it is `bevel` away.
+    The core is the box made smaller by the bevel on each side. Each point is at the
+    distance `bevel` from the core, between a point on the face of the sharp box and the
+    nearest point of the core.
 
     Args:
         axis: axis that the face is perpendicular to: 0, 1 or 2.
@@ -994,8 +1010,8 @@ def _rounded_face(
     normals = normalize(sharp_points - core_points)
     points = core_points + bevel * normals
     if side < 0:
-        # The lower face is the upper one, rotated by 180 degrees about the axis of v:
-        # so it looks outwards, too.
+        # The upper face, rotated by 180 degrees about the axis of v, is the lower one.
+        # A rotation, unlike a mirroring, leaves its front outside.
         points = points[:, ::-1].copy()
         normals = normals[:, ::-1].copy()
         points[..., axis] *= -1.0
@@ -1032,13 +1048,13 @@ def carve_patches(
         patches: smooth patches that are not transformed yet.
         inside: function of points (V, 3) that returns values (V,), which are positive
             inside the region to cut out. For example, a window in a car.
-        tag: tag of the inside; None removes it.
+        tag: tag of the inside; None removes the inside.
     """
     carved_patches = []
     for patch in patches:
         value = _snap_to_vertices(patch, np.array(inside(patch.vertices)))
-        # no vertex is inside: the patch stays as it is
-        if value.max() <= 0.0:
+        has_inside = value.max() > 0.0
+        if not has_inside:
             carved_patches.append(patch)
             continue
         cut, is_inside = _split(patch, value)
@@ -1062,28 +1078,28 @@ def _snap_to_vertices(patch: Patch, value: Array) -> Array:
         patch: the patch that is cut.
         value: value of the field at its vertices (V,), which is changed and returned.
     """
-    edges = _edges(patch)  # (E, 2)
-    end_values = value[edges]
-    is_crossed = end_values[:, 0] * end_values[:, 1] < 0.0
-    # how far the cut is from each end, as a fraction of the edge
-    distance = np.abs(end_values[is_crossed])
+    edges = _edges(patch)
+    crossed_edges = edges[_are_crossed(edges, value)]  # (E, 2)
+    # how far the cut is from each end of an edge, as a fraction of the edge
+    distance = np.abs(value[crossed_edges])
     fraction = distance / distance.sum(axis=1, keepdims=True)
-    is_near = fraction < SNAP
-    value[edges[is_crossed][is_near]] = 0.0
+    near_vertices = crossed_edges[fraction < SNAP]
+    value[near_vertices] = 0.0
     return value
 
 
 def crop_chart(patch: Patch) -> Patch:
     """Return the patch with its chart cropped to the part that its faces use.
 
-    That part is stretched to [0, 1]^2 again, and the size is that of the part.
+    The coordinates of that part are stretched to [0, 1] again. The size of the chart
+    shrinks to that of the part.
     """
     used_uvs = patch.uvs[np.unique(patch.faces)]
     lower = used_uvs.min(axis=0)
     extent = np.ptp(used_uvs, axis=0)
     width, height = patch.size
 
-    def rest(u: Array, v: Array) -> Array:
+    def compute_rest_points(u: Array, v: Array) -> Array:
         """Return the points (N, 3) at coordinates (N,) of the cropped chart."""
         return patch.compute_rest_points(
             lower[0] + u * extent[0], lower[1] + v * extent[1]
@@ -1093,7 +1109,7 @@ def crop_chart(patch: Patch) -> Patch:
         patch,
         uvs=np.clip((patch.uvs - lower) / extent, 0.0, 1.0),
         size=(width * float(extent[0]), height * float(extent[1])),
-        compute_rest_points=rest,
+        compute_rest_points=compute_rest_points,
     )
 
 
@@ -1103,6 +1119,12 @@ def _edges(patch: Patch) -> assets.IntArray:
         [patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]]
     )
     return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64))
+
+
+def _are_crossed(edges: assets.IntArray, value: Array) -> assets.BoolArray:
+    """Return whether the values (V,) at both ends of each edge differ in sign (E,)."""
+    is_crossed: assets.BoolArray = value[edges[:, 0]] * value[edges[:, 1]] < 0.0
+    return is_crossed
 
 
 def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
@@ -1115,7 +1137,7 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
         that is where the values are positive.
     """
     edges = _edges(patch)
-    crossed_edges = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
+    crossed_edges = edges[_are_crossed(edges, value)]
     first, second = crossed_edges.T
     # The cut is where the value is 0, at a fraction of the edge from its first vertex:
     # value(first) + fraction * (value(second) - value(first)) = 0.
@@ -1127,7 +1149,7 @@ def _split(patch: Patch, value: Array) -> tuple[Patch, assets.BoolArray]:
         return np.concatenate([attribute, attribute[first] + fraction * difference])
 
     normals = add_cuts(patch.normals)
-    # An interpolated normal is shorter than 1.
+    # Interpolated normals are shorter than 1. They are normalized in place.
     cut_normals = normals[len(patch.normals) :]
     cut_normals /= np.linalg.norm(cut_normals, axis=1, keepdims=True)
     cut_of_edge = {
@@ -1166,17 +1188,21 @@ def _split_faces(
             faces.append((first, second, third))
             is_inside.append(bool(face_values.sum() > 0.0))
             continue
-        # The parts on both sides share the cuts, whose value is 0.
         outline = _outline_with_cuts(face, value, cut_of_edge)
-        for sign in (1.0, -1.0):
-            polygon = [
-                vertex for vertex, vertex_value in outline if vertex_value * sign >= 0.0
-            ]
-            # a triangle or a quadrangle, which is divided into triangles as a fan
-            for second, third in pairwise(polygon[1:]):
-                faces.append((polygon[0], second, third))
-                is_inside.append(sign > 0.0)
+        # Vertices with the value 0, such as the cuts, belong to both parts.
+        inside_part = [vertex for vertex, at_vertex in outline if at_vertex >= 0.0]
+        outside_part = [vertex for vertex, at_vertex in outline if at_vertex <= 0.0]
+        for part, part_is_inside in ((inside_part, True), (outside_part, False)):
+            triangles = _divide_polygon(part)
+            faces += triangles
+            is_inside += [part_is_inside] * len(triangles)
     return faces, is_inside
+
+
+def _divide_polygon(corners: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Divide a convex polygon into triangles that share its first corner."""
+    first_corner = corners[0]
+    return [(first_corner, second, third) for second, third in pairwise(corners[1:])]
 
 
 def _outline_with_cuts(

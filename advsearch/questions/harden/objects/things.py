@@ -335,18 +335,18 @@ def _banana_radius(
         stem_length: length of the stem.
         max_radius: the largest radius.
     """
-    # distance from the end of the stem
-    position = np.linspace(0.0, 1.0, BANANA_POINTS) * length
-    # From 0 to 1 over about a quarter of the length: from the stem, and from the tip.
-    # With powers below 1 the ends are plumper.
-    rise = np.clip((position - stem_length) / (0.26 * length), 0.0, 1.0) ** 0.75
-    fall = np.clip((length - position) / (0.24 * length), 0.0, 1.0) ** 0.62
+    stem_distance = np.linspace(0.0, 1.0, BANANA_POINTS) * length
+    tip_distance = length - stem_distance
+    # The radius of the body, as a fraction of the largest one, grows from 0 to 1 over
+    # about a quarter of the length at both ends. With powers below 1 they are plumper.
+    rise = np.clip((stem_distance - stem_length) / (0.26 * length), 0.0, 1.0) ** 0.75
+    rise_from_tip = np.clip(tip_distance / (0.24 * length), 0.0, 1.0) ** 0.62
     # the tip ends with 26 % of the largest radius, not in a point
-    blunt_tip = np.maximum(np.sin(0.5 * np.pi * fall), 0.26)
+    blunt_tip = np.maximum(np.sin(0.5 * np.pi * rise_from_tip), 0.26)
     body = np.sin(0.5 * np.pi * rise) * blunt_tip
-    # the stem is thicker where it was cut
+    # the radius of the stem, which is thicker where it was cut
     neck = sampler(0.3, low=0.24, high=0.4)
-    stem = neck * (1.0 + 0.25 * np.exp(-position / 0.5))
+    stem = neck * (1.0 + 0.25 * np.exp(-stem_distance / 0.5))
     radius = max_radius * np.maximum(stem, body)
     # Each radius is replaced by the mean of five neighbors, so that stem and body join
     # without an edge. The first and the last radius are repeated for that.
@@ -382,24 +382,26 @@ def _banana_paint(sampler: ParameterSampler, path: Array, stem_length: float) ->
         """Paint the skin, then green, flecks, the brown stem and both dark ends."""
         stem_distance = np.linalg.norm(t.xyz - path[0], axis=1)
         tip_distance = np.linalg.norm(t.xyz - path[-1], axis=1)
-        color = blend_colors(
-            skin,
-            scale_brightness(skin, 0.86),
-            compute_value_noise(t.xyz / 2.2 + offset),
-        )
+        clouds = compute_value_noise(t.xyz / 2.2 + offset)
+        color = blend_colors(skin, scale_brightness(skin, 0.86), clouds)
+
+        # Green fades over 2.6 cm from the stem, and over 2.2 cm from the tip.
         stem_green = np.clip(1.0 - (stem_distance - 0.9 * stem_length) / 2.6, 0.0, 1.0)
         tip_green = np.clip(1.0 - tip_distance / 2.2, 0.0, 1.0)
         color = blend_colors(color, green, stem_green * 0.75)
         color = blend_colors(color, green, tip_green * 0.5)
-        color = blend_colors(color, brown, _flecks(t.xyz, offset, fleck_amount) * 0.85)
+
+        flecks = _flecks(t.xyz, offset, fleck_amount)
+        color = blend_colors(color, brown, flecks * 0.85)
+
+        # Distances are negated, since `compute_soft_step` is 1 above its threshold: each
+        # mask covers what is nearer than that.
         stem_brown = compute_soft_step(-stem_distance, -0.5 * stem_length, soft=1.3)
+        stem_end = compute_soft_step(-stem_distance, -0.45, soft=0.5)
+        tip_end = compute_soft_step(-tip_distance, -0.75, soft=0.5)
         color = blend_colors(color, brown, stem_brown * 0.5)
-        color = blend_colors(
-            color, dark, compute_soft_step(-stem_distance, -0.45, soft=0.5)
-        )
-        return blend_colors(
-            color, dark, compute_soft_step(-tip_distance, -0.75, soft=0.5)
-        )
+        color = blend_colors(color, dark, stem_end)
+        return blend_colors(color, dark, tip_end)
 
     return paint
 
@@ -544,26 +546,26 @@ def _page_edges(t: Texels, paper: Array, offset: Array) -> Array:
 def _spine_paint(t: Texels, cloth: Paint, gold: Array, size: _BookSize) -> Array:
     """Paint two golden bands at each end of a spine, and words in its middle.
 
-    The words are bars without letters. Fractions are of the book's height, or of its
-    thickness.
+    The words are bars without letters.
     """
     _, y, z = t.xyz.T
-    end_fraction = np.abs(y) / size.height  # 0 in the middle, 1/2 at the ends
+    # distance from the middle along the spine, 1/2 at its ends
+    height_fraction = np.abs(y) / size.height
     bands = np.maximum(
-        compute_soft_step(0.008 - np.abs(end_fraction - 0.36), 0.0, soft=0.006),
-        compute_soft_step(0.008 - np.abs(end_fraction - 0.42), 0.0, soft=0.006),
+        compute_soft_step(0.008 - np.abs(height_fraction - 0.36), 0.0, soft=0.006),
+        compute_soft_step(0.008 - np.abs(height_fraction - 0.42), 0.0, soft=0.006),
     )
-    in_length = compute_soft_step(0.16 - end_fraction, 0.0, soft=0.01)
+    # The words fill the middle: 32 % of the height, and 44 % of the thickness.
+    in_height = compute_soft_step(0.16 - height_fraction, 0.0, soft=0.01)
     from_middle = np.abs(z - size.thickness / 2)
     in_thickness = compute_soft_step(
         0.22 * size.thickness - from_middle, 0.0, soft=0.05
     )
     # noise that changes mostly along the spine: it gives bars instead of letters
-    position = np.stack([y * 1.8, z * 0.2, 0 * end_fraction], axis=1)
-    words = compute_soft_step(compute_value_noise(position + 3.0), 0.36, soft=0.1)
-    return blend_colors(
-        cloth(t), gold, np.maximum(bands, in_length * in_thickness * words)
-    )
+    noise_position = np.stack([y * 1.8, z * 0.2, np.zeros_like(y)], axis=1) + 3.0
+    bars = compute_soft_step(compute_value_noise(noise_position), 0.36, soft=0.1)
+    words = in_height * in_thickness * bars
+    return blend_colors(cloth(t), gold, np.maximum(bands, words))
 
 
 def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:

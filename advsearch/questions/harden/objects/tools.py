@@ -296,17 +296,15 @@ def _hammer_handle(
     half_width = half_head * sampler(0.92, low=0.75, high=1.1)
     relative_scale = 1.0 + grip - waist
     rounding = _handle_rounding(t)
-    scale = np.stack(
-        [
-            half_width * relative_scale * rounding,
-            half_thickness * relative_scale * rounding,
-        ],
-        axis=1,
-    )
+    # half the extent along y, the first axis of the section, and along the second axis
+    scale_y = half_width * relative_scale * rounding
+    scale_z = half_thickness * relative_scale * rounding
+    scale = np.stack([scale_y, scale_z], axis=1)
     scale[0] *= 0.9  # a bevel at the head
-    top = half_head * 1.18  # x of the end that sticks out of the head
-    path = np.stack([top - (length + top) * t, 0 * t, 0 * t], axis=1)
-    # Sections reach from -1 to 1; `scale` makes them as wide as the handle.
+    top_x = half_head * 1.18  # the end that sticks out of the head
+    path_x = top_x - (length + top_x) * t  # from there to -`length`
+    path = np.stack([path_x, 0 * t, 0 * t], axis=1)
+    # Sections reach from -1 to 1, and are multiplied by `scale`.
     if sampler.sample_bool(0.6, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=24)
     else:

@@ -785,10 +785,13 @@ def _scroll(t: Texels, height: float) -> Array:
     """Return the mask of curling petals around the belly of a vase of a height."""
     angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0])
     z = t.xyz[:, 2] / height
-    curl = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
-    petal = curl * (0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle)))
-    on_belly = make_range_mask(0.24 * height, 0.74 * height, soft=0.1)(t)
-    return compute_soft_step(petal, 0.55, soft=0.16) * on_belly
+    # Six ridges around the vase sway to both sides with the height. Nearly level waves
+    # across them divide them into petals.
+    ridges = np.abs(np.sin(3.0 * angle + 9.0 * np.sin(5.0 * z)))
+    waves = 0.5 + 0.5 * np.sin(30.0 * z + 2.0 * np.sin(6.0 * angle))
+    petals = compute_soft_step(ridges * waves, 0.55, soft=0.16)
+    mask_belly = make_range_mask(0.24 * height, 0.74 * height, soft=0.1)
+    return petals * mask_belly(t)
 
 
 @painter
