@@ -665,13 +665,14 @@ class SceneConfigurations:
         self._lower = domain.lower_bounds.numpy()
         self._upper = domain.upper_bounds.numpy()
         self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
-        # `_assign_blocks` fills these lists. Small blocks, those of few numbers, share
-        # the sequence of the sampler. Large ones have random draws, since Sobol
-        # sequences are for few dimensions.
+        # A block is the coordinates of one parameter. Small blocks share the sequence
+        # of the sampler. Large ones have random draws, since Sobol sequences are for
+        # few dimensions.
         self._grid_coordinates: list[_GridCoordinate] = []
         self._small_blocks: list[_SampledBlock] = []
         self._large_blocks: list[_SampledBlock] = []
-        self.sampled_numbers = tuple(self._assign_blocks(domain))
+        self._assign_blocks(domain)  # fills the three lists
+        self.sampled_numbers = tuple(self._list_sampled_numbers())
         n_small = _count_columns(self._small_blocks)
         n_large = _count_columns(self._large_blocks)
         self._small_draws = SampleSequence(n_small, sampler, seed)
@@ -684,7 +685,8 @@ class SceneConfigurations:
             images_until_repeat=repeat_after_scenes * self.n_images,
             n_photographs=n_photographs,
         )
-        # of each sampled number: its column among the draws, and its number of bins
+        # Column of each sampled number among the draws, and number of equal bins of
+        # [0, 1]: a part of its range has one bin, an option with a weight several.
         self._columns = [number.draw_column for number in self.sampled_numbers]
         n_bins = [
             len(number.part_of_bin or number.range_parts)
@@ -844,7 +846,7 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the full sweep.
-            n_images: number of consecutive images of one scene.
+            count: number of consecutive images of one scene.
 
         Returns:
             (count, k) indices among `parts` of each of `sampled_numbers`.
@@ -879,15 +881,17 @@ class SceneConfigurations:
         Args:
             draws: draws of k numbers.
             first: number of the first image in the full sweep.
-            n_images: count of images.
+            count: number of images.
         """
-        if self.independent_units.frames is None:
-            return draws.points(self.independent_units.find_draw(first), count)
-        points = [
-            draws.points(self.independent_units.find_draw(number), 1)
-            for number in range(first, first + count)
-        ]
-        return np.concatenate(points) if points else draws.points(0, 0)
+        units = self.independent_units  # maps the number of an image to its draw
+        if count == 0:
+            return draws.points(0, 0)
+        if units.frames is None:
+            return draws.points(units.find_draw(first), count)
+        image_numbers = range(first, first + count)
+        return np.concatenate(
+            [draws.points(units.find_draw(number), 1) for number in image_numbers]
+        )
 
     def _axis_indices(self, first: int, count: int) -> tuple[NDArray[np.intp], ...]:
         """Return the indices (count,) of consecutive images on each axis.
@@ -906,23 +910,23 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the scene.
-            n_images: number of images.
-            before: number of images of the scenes before this one. They have used the
-                draws before `before`; the grid starts anew in every scene.
+            count: number of images.
+            before: number of images of the scenes before this one, which use the draws
+                before those of this scene. The grid starts anew in every scene.
         """
         u = np.repeat(self._start[None], count, axis=0)
         indices = self._axis_indices(first, count)
         for column, axis in self._grid_coordinates:
             # The coordinate of a choice is the center of its part of [0, 1].
             u[:, column] = (indices[axis] + 0.5) / self.grid.sizes[axis]
-        # Small blocks share the sampler's sequence; large ones have random draws.
+        first_in_sweep = before + first
         for draws, blocks in (
             (self._small_draws, self._small_blocks),
             (self._large_draws, self._large_blocks),
         ):
             if not blocks:
                 continue
-            samples = self._sample(draws, before + first, count)
+            samples = self._sample(draws, first_in_sweep, count)
             for sampled in blocks:
                 u[:, sampled.coordinates] = self._transform(
                     sampled, samples[:, sampled.columns]
