@@ -136,21 +136,21 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         InputError, UnknownNameError: the name or the values cannot be used.
     """
     where = f"`grid` {name}"
-    # An instance may follow the kind, as in KIND:INSTANCE.PARAMETER, or the parameter,
-    # as in KIND.PARAMETER:INSTANCE.
-    control_name, _, rest = name.partition(".")
-    kind, kind_colon, kind_instance = control_name.partition(":")
-    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
-    instance = control_name
-    if control_name not in instances:
-        instance = families.make_instance_name(
-            kind, parameter_instance or kind_instance
-        )
     # Names such as "model" are settings and no controls.
     if name in _LISTED_SETTINGS:
         raise InputError(
             f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
         )
+    # The instance may follow the kind, as in KIND:INSTANCE.PARAMETER, or the parameter,
+    # as in KIND.PARAMETER:INSTANCE.
+    control_name, _, rest = name.partition(".")
+    kind, kind_colon, kind_instance = control_name.partition(":")
+    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
+    has_colon = bool(parameter_colon or kind_colon)
+    colon_instance = parameter_instance or kind_instance
+    instance = control_name  # of INSTANCE.PARAMETER
+    if control_name not in instances:
+        instance = families.make_instance_name(kind, colon_instance)
     control = _find_control(instances, kind, instance, where)
     if kind == MITSUBA_CONTROL:
         # mitsuba:KEY, and a key may itself contain dots and colons
@@ -162,9 +162,8 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    # A colon without a name after it is rejected.
-    if parameter_colon or kind_colon:
-        families.check_instance_name(where, parameter_instance or kind_instance)
+    if has_colon:
+        families.check_instance_name(where, colon_instance)  # it may not be empty
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
@@ -175,10 +174,10 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     parameter = parameters[parameter_name]
     _check_scalar(where, control, parameter, instance)
     return Axis(
-        control.kind,
-        instance,
-        parameter,
-        parse_axis_values(where, parameter, values),
+        control_kind=control.kind,
+        control_name=instance,
+        parameter=parameter,
+        values=parse_axis_values(where, parameter, values),
     )
 
 
@@ -220,7 +219,7 @@ def _find_parameters(
     Args:
         values: values of the axis; some classes declare a parameter by its values.
         instances: the sampled controls by name.
-        control: the class of the control.
+        control: the class of the control, a subclass of `Control`.
         parameter_name: parameter name of the axis.
         instance: name of the control. If it is one of `instances`, it may have
             parameters in addition to those of its class; these are returned, too.
@@ -250,10 +249,10 @@ def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
         )
     (parameter,) = control.declare_parameters([key])
     return Axis(
-        MITSUBA_CONTROL,
-        MITSUBA_CONTROL,
-        parameter,
-        parse_axis_values(where, parameter, values),
+        control_kind=MITSUBA_CONTROL,
+        control_name=MITSUBA_CONTROL,  # there is only one
+        parameter=parameter,
+        values=parse_axis_values(where, parameter, values),
     )
 
 
@@ -264,20 +263,19 @@ def _check_scalar(
 
     Args:
         where: the axis, as messages name it.
-        control: class of the control. A control with an image among its parameters (a
-            texture) has no axes at all.
+        control: class of the control.
         parameter: the parameter of the axis.
         instance: name of the control, for the message.
 
     Raises:
-        InputError: the parameter has several numbers.
+        InputError: the parameter has several numbers, or the control has an image (a
+            texture) among its parameters.
     """
     has_images = any(len(declared.shape) > 1 for declared in control.parameters)
     if has_images or parameter.shape != ():
         raise InputError(
             f"{where}: expected a parameter that is one number or name, got one that "
-            "is many numbers; draw it "
-            f"by chance with `controls` {instance} `samples=100`"
+            f"is many numbers; draw it by chance with `controls` {instance} `samples=100`"
         )
 
 
@@ -496,8 +494,8 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
 
     If no parameter of a control has a stated range, all of them are sampled in their
     default ranges. If one has, only those with stated ranges are sampled. An axis of
-    the grid counts as a stated range. So the default ranges of the other parameters
-    are stated here; else they would no longer vary.
+    the grid will state a range of one parameter. The default ranges of the others are
+    stated here, so that these still vary.
     """
     # Kind and name are no parameters: the class and the instance state them.
     settings = {
@@ -547,12 +545,10 @@ class SampledNumber:
     @property
     def varied_value(self) -> VariedValue:
         """The range or the options that the value was sampled from."""
-        bounds = [
-            bound
-            for part in self.range_parts
-            if isinstance(part, list)
-            for bound in part
-        ]
+        bounds = list[float]()
+        for part in self.range_parts:
+            if isinstance(part, list):  # [lower, upper]; else it is an option
+                bounds += part
         if bounds:
             return VariedValue(unit=self.unit, low=min(bounds), high=max(bounds))
         return VariedValue(
@@ -589,12 +585,16 @@ class _SampledBlock(NamedTuple):
     """A block of coordinates that is sampled.
 
     Attributes:
+        control: name of the control.
+        parameter: name of its parameter whose coordinates these are.
         block: norm and budget of the coordinates.
         coordinates: their columns in a configuration.
         columns: their columns among the draws. A ball has one column more than
             coordinates, for the length.
     """
 
+    control: str
+    parameter: str
     block: Block
     coordinates: slice
     columns: slice
@@ -717,9 +717,9 @@ class SceneConfigurations:
             n_photographs: number of photographs in the folder of photographs; 1 without
                 one.
         """
-        # If nothing is sampled, the samples of a grid point are repeats of one draw,
-        # each with its own noise.
+        # If nothing is sampled, the images of a grid point differ only in noise.
         n_draws = self.samples_per_grid_point if self.is_sampled else 1
+        images_per_draw = self.samples_per_grid_point // n_draws
         time_axis = next(
             (index for index, axis in enumerate(axes) if axis.is_time), None
         )
@@ -730,28 +730,21 @@ class SceneConfigurations:
             frames=time_axis,
             samples=n_draws,
             again=images_until_repeat,
-            noise=self.samples_per_grid_point // n_draws,
+            noise=images_per_draw,
             photographs=n_photographs,
             scene=images_per_scene,
         )
 
-    def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
+    def _assign_blocks(self, domain: Domain) -> None:
         """Decide for each block of coordinates where its values come from.
 
-        A block is the coordinates of one parameter. If the parameter is an axis of the
-        grid, its values come from the axis. Otherwise they come from columns of the
-        draws: one for each coordinate, and for a ball (L2 norm) one more for the
-        length. As a side effect this fills `_grid_coordinates`, `_small_blocks` and
-        `_large_blocks`.
+        If the parameter of a block is an axis of the grid, its values come from the
+        axis. Otherwise they come from columns of the draws: one for each coordinate,
+        and for a ball (L2 norm) one more for the length.
 
         Args:
             domain: the blocks of all controls, with their norms and budgets.
-
-        Yields:
-            The sampled numbers that tables count by: those of parameters with few
-            components and a known range.
         """
-        controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
             self.space.groups, domain.list_block_slices(), strict=True
         ):
@@ -764,18 +757,33 @@ class SceneConfigurations:
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
             first_column = _count_columns(blocks)  # the first that is free
-            # A draw in a ball needs one number more than a draw in a box: its length.
-            is_ball = block.norm == "l2"
-            n_columns = block.size + 1 if is_ball else block.size
+            n_columns = block.size + 1 if block.norm == "l2" else block.size
             columns = slice(first_column, first_column + n_columns)
-            blocks.append(_SampledBlock(block, coordinates, columns))
-            control = controls[group.control]
-            # The range of a component is known unless it is in a ball, or the control
-            # declares no slots (parameters with a range).
+            blocks.append(
+                _SampledBlock(
+                    group.control, group.parameter, block, coordinates, columns
+                )
+            )
+
+    def _list_sampled_numbers(self) -> Iterator[SampledNumber]:
+        """Yield the sampled numbers that tables count by.
+
+        They are those of parameters with few components and a known range.
+        """
+        controls = {control.name: control for control in self.space.controls}
+        # A parameter with few components is a small block.
+        for sampled in self._small_blocks:
+            control = controls[sampled.control]
+            # A component of a ball has no range of its own. Without slots, a control
+            # declares no ranges.
+            is_ball = sampled.block.norm == "l2"
             has_ranges = bool(control.parameter_slots) and not is_ball
-            if has_ranges and block.size <= MAX_TABLE_COMPONENTS:
+            if has_ranges and sampled.block.size <= MAX_TABLE_COMPONENTS:
                 yield from self._describe_sampled(
-                    control, group.parameter, coordinates, first_column
+                    control,
+                    sampled.parameter,
+                    sampled.coordinates,
+                    sampled.columns.start,
                 )
 
     def _describe_sampled(
@@ -869,8 +877,8 @@ class SceneConfigurations:
         In a comparison, the images with the adversarial scene repeat the draws of those
         without it. They have the same noise, too, so that only the scene differs.
         """
-        images_until_repeat = self.independent_units.again  # 0 if draws never repeat
-        return number % images_until_repeat if images_until_repeat else number
+        n_clean_images = self.independent_units.again  # 0 without a comparison
+        return number % n_clean_images if n_clean_images else number
 
     def _sample(self, draws: SampleSequence, first: int, count: int) -> Float64Array:
         """Return the draws (count, k) of consecutive images.
@@ -972,9 +980,9 @@ class SceneConfigurations:
 
     @property
     def environment(self) -> str | None:
-        """The environment that lights all images instead of that of the scene.
+        """The environment that a control fixes for all images, such as "noon".
 
-        None if the scene's own does, or if the environment varies.
+        None if that of the scene lights them, or if the environment varies.
         """
         # A group is the coordinates of one parameter.
         varies = any(group.setting == ENVIRONMENT for group in self.space.groups)
@@ -1042,7 +1050,7 @@ class SceneConfigurations:
             control_u: (k,) the coordinates of the control in `u`.
             axis_points: the axes of the control, with the index of the value of each.
         """
-        # A description is stored below only if these indices determine it.
+        # Only descriptions that follow from these indices are cached.
         key = (control.name, *(index for _, index in axis_points))
         cached = self._description_cache.get(key)
         if cached is not None:
@@ -1053,9 +1061,9 @@ class SceneConfigurations:
             description = dict(control.describe(control_u))
         for axis, index in axis_points:
             description[axis.name] = {"value": axis.values[index], "unit": axis.unit}
-        # Only a description that follows from the axes alone holds for other images.
-        is_all_in_grid = len(axis_points) == len(control.groups)
-        follows_from_axes = is_all_in_grid and not control.refines
+        # A control has a group for each of its parameters.
+        are_all_on_axes = len(axis_points) == len(control.groups)
+        follows_from_axes = are_all_on_axes and not control.refines
         has_room = len(self._description_cache) < MAX_CACHED_DESCRIPTIONS
         if follows_from_axes and has_room:
             self._description_cache[key] = description
