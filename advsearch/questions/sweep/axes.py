@@ -622,7 +622,7 @@ class SceneConfigurations:
         space: the controls, bound to the scene; it starts from the scene as it is.
         domain: the budgets of the controls.
         axes: axes of the grid.
-        samples_per_grid_point: number of samples at each point of the grid.
+        samples: number of samples at each point of the grid.
         sampler: how the draws are made, "sobol" or "random".
         seed: seed of the draws.
         repeat_after_scenes: number of scenes after which the draws repeat, so that
@@ -633,7 +633,8 @@ class SceneConfigurations:
 
     Attributes:
         n_images: number of images of the scene.
-        parts_per_range: number of parts into which tables divide the range of a sampled number.
+        parts_per_range: number of parts into which tables divide the range of a sampled
+            number.
         sampled_numbers: the sampled numbers that tables count by.
         sampled_layout: describes which numbers are sampled: the number of draws of
             small blocks, and name, column and number of parts of each sampled number.

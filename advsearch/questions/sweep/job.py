@@ -60,8 +60,8 @@ class NamedScene:
         environment_name: name of the environment.
         scene: the loaded scene.
         fixed_controls: controls of an attack, which are fixed in the sweep.
-        adversarial_configuration: (d,) the adversarial configuration of these; None leaves them at their values
-            in the clean scene.
+        adversarial_configuration: (d,) the adversarial configuration of these; None
+            leaves them at their values in the clean scene.
         arm: name of the arm if clean and adversarial scenes are compared: "clean", or
             the name of the attack's run; empty if nothing is compared.
         photograph_name: name of the scene's photograph in a folder of photographs; empty

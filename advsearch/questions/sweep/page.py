@@ -513,8 +513,7 @@ def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
     thumbnails = find_thumbnails(run)
     numbers = thumbnails.numbers if thumbnails else ()
     for number in numbers:
-        # In a run it is in a subfolder of several hundred images. The bundle has these
-        # subfolders in its own folder of images.
+        # Only the numbered subfolder and the name are those of a run.
         file = thumbnail_path(folder / image_folder, number)
         target = folder / image_folder / file.parent.name / file.name
         write_bytes(target, read_thumbnail(run, number))

@@ -395,8 +395,8 @@ def make_map(
 def _order_for_map(axes: Sequence[TableAxis]) -> list[TableAxis]:
     """Return the axes in the order of preference for a map.
 
-    Axes of the grid come first. Then come those outside of the scene in reverse order:
-    the model, which is the last one, is preferred to the object. Sampled numbers (kind
+    Axes of the grid come first. Then come those outside of the scene in reverse order,
+    since the model comes after the object and is preferred. Sampled numbers (kind
     "drawn") are returned only if there are none of these.
     """
     grid = [axis for axis in axes if axis.kind == "grid"]
