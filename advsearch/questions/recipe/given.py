@@ -500,8 +500,8 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     by_margin = has_single_prediction and min(map(len, margins.values())) >= 2
     ranking = ranking[: options.most]
     if by_margin:
-        only_label, _ = ranking[0]
-        text, heads, table = _describe_margins(only_label, margins)
+        # The ranking has a single label, with its count.
+        text, heads, table = _describe_margins(ranking[0][0], margins)
     else:
         text, heads, table = _describe_ingredients(
             rows, ranking, names, main_ingredient

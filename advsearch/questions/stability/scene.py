@@ -244,12 +244,13 @@ def check_scene(
         other_arguments: dict[str, Any] = {"controls": controls, **other_scene}
         other_renderer = make_renderer(**other_arguments)
         checks.append(_compare_images(renderer, start, other_renderer, difference))
-    is_image_finite = bool(torch.isfinite(image).all())
-    is_gradient_finite = bool(torch.isfinite(loss_gradient).all())
-    has_replaced_values = renderer.n_non_finite > 0
+    is_finite = bool(
+        torch.isfinite(image).all() and torch.isfinite(loss_gradient).all()
+    )
     return CaseOutcome(
         checks,
-        finite=is_image_finite and is_gradient_finite and not has_replaced_values,
+        # The renderer replaces and counts values of images that are not finite.
+        finite=is_finite and renderer.n_non_finite == 0,
         relative_error=relative_error,
         ending=result.ending.value,
         measurements=measured,
@@ -553,8 +554,8 @@ def run_search(
         **options: options of `attacks.search`. By default no candidate is rendered
             again.
     """
-    evaluate_one = partial(evaluate, renderer, loss, spp)
-    evaluate_all = partial(map, evaluate_one)  # called with the queries
+    evaluate_query = partial(evaluate, renderer, loss, spp)
+    evaluate_all = partial(map, evaluate_query)  # called with the queries
     return workbench.search(
         evaluate_all,
         make_domain(renderer, start),

@@ -141,16 +141,10 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         raise InputError(
             f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
         )
-    # The instance may follow the kind, as in KIND:INSTANCE.PARAMETER, or the parameter,
-    # as in KIND.PARAMETER:INSTANCE.
-    control_name, _, rest = name.partition(".")
-    kind, kind_colon, kind_instance = control_name.partition(":")
-    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
-    has_colon = bool(parameter_colon or kind_colon)
-    colon_instance = parameter_instance or kind_instance
-    instance = control_name  # of INSTANCE.PARAMETER
-    if control_name not in instances:
-        instance = families.make_instance_name(kind, colon_instance)
+    kind, parameter_name, colon_instance = _split_axis_name(name)
+    instance = name.partition(".")[0]  # if the name is INSTANCE.PARAMETER
+    if instance not in instances:
+        instance = families.make_instance_name(kind, colon_instance or "")
     control = _find_control(instances, kind, instance, where)
     if kind == MITSUBA_CONTROL:
         # mitsuba:KEY, and a key may itself contain dots and colons
@@ -162,8 +156,8 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    if has_colon:
-        families.check_instance_name(where, colon_instance)  # it may not be empty
+    if colon_instance is not None:
+        families.check_instance_name(where, colon_instance)  # raises if it is empty
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
@@ -179,6 +173,20 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         parameter=parameter,
         values=parse_axis_values(where, parameter, values),
     )
+
+
+def _split_axis_name(name: str) -> tuple[str, str, str | None]:
+    """Return kind, parameter and instance in the name of an axis.
+
+    The instance follows a colon after the kind, as in KIND:INSTANCE.PARAMETER, or after
+    the parameter, as in KIND.PARAMETER:INSTANCE. It is None if there is no colon.
+    """
+    control_name, _, rest = name.partition(".")
+    kind, kind_colon, kind_instance = control_name.partition(":")
+    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
+    if not kind_colon and not parameter_colon:
+        return kind, parameter_name, None
+    return kind, parameter_name, parameter_instance or kind_instance
 
 
 def _find_control(

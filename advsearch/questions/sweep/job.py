@@ -730,9 +730,9 @@ class SweptScene:
             is_wrong: whether the prediction of any model is wrong.
         """
         job = self.job
-        # The other setting that stores images, "wrong", stores only these.
-        is_kept = job.config.keep_pictures == "all" or is_wrong
-        if query.includes_image and is_kept:
+        # `keep_pictures` is "all" or "wrong" if the query includes the image.
+        stores_thumbnail = job.config.keep_pictures == "all" or is_wrong
+        if query.includes_image and stores_thumbnail:
             thumbnail = thumbnails.make_thumbnail(image.image)
             evaluation = replace(evaluation, jpeg=thumbnail)
         if job.aovs:

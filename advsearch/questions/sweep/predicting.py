@@ -111,8 +111,8 @@ class Groups:
         is_within = []  # for each axis
         for axis, may_differ in enumerate(within):
             # Two images along any axis but that of the frames have different draws.
-            has_one_draw = axis == frame_axis
-            is_within.append(may_differ and (may_draws_differ or has_one_draw))
+            shares_draw = axis == frame_axis
+            is_within.append(may_differ and (may_draws_differ or shares_draw))
         is_within.append(may_draws_differ)  # the axis of the samples
         self._is_within = tuple(is_within)
         within_sizes = self._select(self._all_axes.sizes, is_within=True)

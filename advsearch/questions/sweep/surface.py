@@ -652,8 +652,8 @@ def permute_draws(
     """
     _, draw_sizes = np.unique(draws, return_counts=True)
     n_draws = len(draw_sizes)
-    has_own_draws = draw_sizes.max(initial=1) == 1
-    if has_own_draws:
+    is_independent = draw_sizes.max(initial=1) == 1
+    if is_independent:
         return None
     is_known = wrong != UNKNOWN
     is_wrong = wrong == 1
