@@ -1022,7 +1022,7 @@ def light_rotation_texel() -> CaseOutcome:
     """All three move, the condition number is printed, and the objective's unit does
     not matter.
 
-    The search is over the power of a light, a rotation and texels, whose units and
+    The three are the power of a light, a rotation and texels, whose units and
     curvatures differ. A search of the same objective times 1e6 has to take the same
     path. The condition number is that of the Hessian.
     """
@@ -1068,17 +1068,17 @@ def light_rotation_texel() -> CaseOutcome:
 def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
     """Estimate second derivatives (3, 3) by power, by rotation, and by all texels.
 
-    The configuration is power, rotation, and texels, in this order. The third direction
-    changes all texels equally.
+    A configuration has the power, the rotation, and the texels, in this order. The
+    third direction changes all texels equally.
     """
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     directions = torch.zeros(3, len(u))
     directions[0, 0] = 1.0
     directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
-    # Steps have to be large enough for the noise. The rotation moves the object, and
-    # has a step of its own.
-    _, rotation_group, *_ = renderer.plan.groups
+    # Steps of the differences by power, rotation and texels, large enough for the noise.
+    # The plan has a group for each parameter; that of the rotation is the second.
+    rotation_group = renderer.plan.groups[1]
     steps = [0.2, rotation_group.step * 2.0, 0.08]
 
     def objective(configuration: Tensor) -> float:

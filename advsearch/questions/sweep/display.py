@@ -263,7 +263,8 @@ def _difference_text(part: SurfacePart) -> str:
     """Return the difference of two rates in percent, with its interval if it has one."""
     low, high = part.interval
     difference = f"{part.difference:+.0%}"
-    has_interval = not math.isnan(low)  # there is none if images share draws
+    # The bounds are NaN if images share draws, and so are not independent.
+    has_interval = not math.isnan(low)
     if has_interval:
         difference += f" ({low:+.0%} to {high:+.0%})"
     return difference.replace("%", " %")
@@ -611,9 +612,11 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
     if distance:
         yield make_claim("measured", describe_detection_distance(distance), None)
     for rates in result.drives or ():
-        heads = "mean, with its interval over drives, then the worst drive"
+        contents = "mean, with its interval over drives, then the worst drive"
         values = "; ".join(_format_drive_clause(*row) for row in make_drive_rows(rates))
-        yield make_claim("measured", f"{drive_title(rates)} ({heads}): {values}.", None)
+        yield make_claim(
+            "measured", f"{drive_title(rates)} ({contents}): {values}.", None
+        )
     verified = result.worst.verified if result.worst else None
     if verified is not None:
         yield make_claim(
@@ -1122,7 +1125,8 @@ def _clause_beyond_dips(
     """Return how often the model is right beyond the last dip of its detections.
 
     A dip is a distance at which the object is detected less often than farther away.
-    The clause follows the sentence about dips (`_dips_sentences`).
+    The clause follows the sentence about dips (`_dips_sentences`), to which its words
+    "Beyond that" refer.
 
     Args:
         estimate: estimate of the detection distance.

@@ -437,21 +437,21 @@ class Drives:
         return np.asarray(is_change.sum(axis=1) / self.seconds)
 
     def _first_detection(
-        self, distance: npt.NDArray[np.float64], drive: npt.NDArray[np.int64]
+        self, distance: npt.NDArray[np.float64], draw_of_drive: npt.NDArray[np.int64]
     ) -> OverDrives | None:
-        """Return the mean distance at the first right frame.
+        """Return the mean distance at the first right frame, and that of the worst drive.
 
-        None if there is no such frame, or a distance is unknown.
+        None if no drive has a right frame, or a distance is unknown.
 
         Args:
-            distance: (n,) distance of each drive with a right frame.
-            drive: (n,) draw of each of these drives.
+            distance: (n,) distance at the first right frame of each drive that has one.
+            draw_of_drive: (n,) draw of each of these drives.
         """
         if not len(distance) or not np.isfinite(distance).all():
             return None
         # `min`: in the worst drive the object is nearest when it is first detected.
         return summarize_drives(
-            distance, min, bounds=self._distance_bounds, drive_of_value=drive
+            distance, min, bounds=self._distance_bounds, drive_of_value=draw_of_drive
         )
 
     def _compute_track_rates(
@@ -476,6 +476,7 @@ class Drives:
             return None
         if any(step not in self._frame_of_step for step in steps.flat):
             return None
+        # for each drive, its frames
         frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
         tracked_drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
@@ -490,6 +491,7 @@ class Drives:
         n_frames = len(self.times)
         seconds_bounds = (0.0, n_frames * self._frame_interval)
 
+        # In the worst drive each of these rates is largest: therefore `max`.
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=summarize_drives(lost, max, drive_of_value=drive),
@@ -519,7 +521,8 @@ class Drives:
         """
         all_scenes = [*range(len(self._job.scenes))]
         drives = self._select_complete(all_scenes, model=0)
-        if not len(drives.outcomes):
+        has_drives = len(drives.outcomes) > 0
+        if not has_drives:
             return
         worst = _right_fraction(drives.outcomes).argmin()
         # rows are numbered by image, then model

@@ -157,14 +157,14 @@ class Groups:
         return self._between.index(self._select(digits, is_within=False))
 
     def find_image_of_group(self, number: int, index: int) -> int:
-        """Return the number of an image of the same group, by its index in the group.
+        """Return the number of an image, by its index in the group of another image.
 
         Both images have the same index along every axis between groups. The index in
         the group counts along the axes within groups, the last one fastest.
 
         Args:
             number: number of any image of the group, in the scene.
-            index: index in the group of the image to find, in [0, group_size).
+            index: index of the image to find in the group, in [0, group_size).
         """
         # The digits of a number are the indices along the axes (mixed radix).
         member_digits = list(self._all_axes.digits(number))
