@@ -263,7 +263,7 @@ class PlannedRun:
         name: name of the run's directory.
         part_name: name of the part that it belongs to.
         config: settings of the run.
-        search_run_name: name of the directory of the search that it samples around; None if it
+        search_run_name: directory of the search that it samples around; None if it
             samples around none.
     """
 

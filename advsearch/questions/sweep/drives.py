@@ -165,8 +165,8 @@ class Drives:
     """The frames of every drive of a sweep.
 
     The private arrays `_outcomes` (WRONG, RIGHT, ...) and `_row_numbers` (numbers of
-    the rows) have the axes (scenes, axes of the grid without the time ..., samples, models,
-    frames), with the frames in the order of their times. `_distance` has no axis for
+    the rows) have the axes (scenes, axes of the grid without the time ..., samples,
+    models, frames), with the frames in the order of their times. `_distance` has no axis for
     models, since all get the same images. `_path_of_step` has the name of the path of a
     row, and `_frame_of_step` its detected boxes; the keys are numbers of rows.
 
@@ -439,7 +439,7 @@ class Drives:
     def _first_detection(
         self, distance: npt.NDArray[np.float64], draw_of_drive: npt.NDArray[np.int64]
     ) -> OverDrives | None:
-        """Return the mean distance at the first right frame, and that of the worst drive.
+        """Return mean and worst distance at the first right frame of a drive.
 
         None if no drive has a right frame, or a distance is unknown.
 

@@ -683,7 +683,7 @@ class Sweep:
         }
 
     def _summarize_predictions(self, predictions: Predictions) -> dict[str, Any]:
-        """Return the fields of a summary that count the predictions of all rows so far."""
+        """Return the fields of a summary that count the predictions of rows so far."""
         # Accuracies count rows. Their intervals count independent units: the frames of
         # a drive, for example, are not independent, and are one unit.
         rows = np.flatnonzero(predictions.is_counted)

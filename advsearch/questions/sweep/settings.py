@@ -331,7 +331,7 @@ class SweepConfig(SceneConfig):
         has_grid = bool(stated_settings.get("grid"))
         has_controls = bool(stated_settings.get("controls"))
         if not has_grid and not has_controls:
-            # What the attack searched is fixed; its random conditions vary in the sweep.
+            # What the attack searched is fixed; its random conditions vary here.
             settings["controls"] = attack_config.over
         return settings
 

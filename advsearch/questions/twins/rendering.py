@@ -214,8 +214,8 @@ class LayerRenderer:
         # The photograph already has the object's shadow, so no ground is rendered.
         settings = {"ground.size": 0.0}
         scene = workbench.load_scene(asset, light, unit=unit, settings=settings)
-        # The control "background" puts a backdrop in place of the environment. Here it is
-        # the photograph, which `_make_image_inputs` passes.
+        # The control "background" puts a backdrop in place of the environment. Here it
+        # is the photograph, which `_make_image_inputs` passes.
         self._renderer = scene.renderer({"background": {}}, resolution=film, seed=seed)
         # used to lay renders over photographs (`_make_image_inputs`)
         self._description = scene.description
@@ -279,8 +279,8 @@ class LayerRenderer:
         in_window = replace(photograph, crop=window, front=front)
         description = self._description.with_backdrop(in_window)
         size = (window.height, window.width)
-        # The renderer applies the gain of its scene. The exposure corrects it to the gain
-        # that `with_backdrop` computes for this photograph.
+        # The renderer applies the gain of its scene. The exposure corrects it to that
+        # which `with_backdrop` computes for this photograph.
         stops = math.log2(description.gain / self._renderer.formation.gain)
         return {
             **reading.backdrop.make_image_inputs(description, size),
@@ -463,8 +463,8 @@ def choose_film(windows: Sequence[PhotoWindow], pixel_aspect: float) -> tuple[in
         pixel_aspect: fx / fy of the camera.
     """
     largest = max(windows, key=lambda window: window.width * window.height)
-    # A pixel of the photograph is `pixel_aspect` times as high as wide. The unit of this
-    # height is the width of a pixel.
+    # A pixel of the photograph is `pixel_aspect` times as high as wide. The unit of
+    # this height is the width of a pixel.
     height = largest.height * pixel_aspect
     longer = max(largest.width, height)
     side = FILM_STEP * math.ceil(longer / FILM_STEP)  # rounded up
