@@ -18,7 +18,7 @@ def make_view(result: RenderResult) -> ShownResult:
     """Return the view of a result: the files, and the predictions in each view."""
     height, width = result.size
     headline = f"{result.out}: {width} x {height} pixels"
-    if result.answered:  # a second file
+    if result.answered:  # the name of a second file
         headline += f"\n{result.answered}: with the predictions drawn in"
     has_several_views = len(result.views) > 1
     if has_several_views:

@@ -53,7 +53,7 @@ def swept(**more: Any) -> Any:
 
 def test_all_frames_of_a_drive_are_a_group_and_draws_tell_drives_apart() -> None:
     """Of time x pose with three draws, where cameras do not share what is drawn."""
-    groups = Groups(ProductIndex((5, 2)), 3, (True, False), False, frames=0)
+    groups = Groups(ProductIndex((5, 2)), 3, (True, False), False, frame_axis=0)
     assert (groups.group_size, groups.n_groups, groups.n_groups_to_cache) == (5, 6, 6)
     found: dict[int, list[int]] = {}
     for number in range(30):

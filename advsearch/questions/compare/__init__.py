@@ -203,6 +203,8 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
 def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
     """Read the sides of stored sweeps, or of a new sweep of models.
 
+    A side is a set of predictions, such as those of one model.
+
     Returns:
         The sides, and the number of images that a new sweep rendered. There are no
         sides if the new sweep was interrupted.
@@ -214,10 +216,10 @@ def load_sides(context: RunContext[CompareConfig]) -> tuple[list[Side], int]:
         context.progress.stage("reading rows")
         names = settings.split_names(config.compared)
         return read_sides([directory.find_run(name) for name in names]), 0
-    # Models that exist only in Python are not in the settings, and passed along.
-    sweep = context.run_part(
-        "sweep", config.make_sweep_config().with_python_parts_of(config)
-    )
+    sweep_config = config.make_sweep_config()
+    # Models that exist only in Python are no settings, and are passed in addition.
+    sweep_config = sweep_config.with_python_parts_of(config)
+    sweep = context.run_part("sweep", sweep_config)
     # `run_part` returns the result of any command; that of a sweep has `renders`.
     n_renders = sum(getattr(sweep, "renders", {}).values())
     if sweep.is_unfinished:

@@ -58,12 +58,12 @@ class PairImages:
         run = self.context.run
         rows = select_examples(first, second, self.context.config.pictures)
         side_of_letter = {"a": first, "b": second}
-        is_same_sweep = first.sweep.folder == second.sweep.folder
-        has_same_images = is_same_sweep and first.rows["number"].equals(
-            second.rows["number"]
-        )
-        if has_same_images:  # two models of one sweep
-            side_of_letter = {"a": first}
+        # The column "number" has the number of each image in its sweep.
+        has_same_images = first.sweep.folder == second.sweep.folder and first.rows[
+            "number"
+        ].equals(second.rows["number"])
+        if has_same_images:  # two models of one sweep: store each image once
+            side_of_letter.pop("b")
         files = {
             row: [
                 f"images/pair-{pair_number}-{row}-{letter}.jpg"
@@ -107,7 +107,7 @@ class PairImages:
                     number = int(side.rows["number"][row])
                     stored = side.sweep.find_thumbnail(number)
                     if stored is not None:
-                        # Copying is cheap, so an existing file is written again.
+                        # A resumed run copies it again, which is cheap.
                         run.write_file(file, stored.read_bytes())
                     elif not (run.path / file).is_file():
                         missing.append(MissingImage(side, number, file))

@@ -28,9 +28,9 @@ def compare_sides(
     """Count the pairs of two sides, and test whether they differ.
 
     A side is a set of predictions, such as those of one model. In the result, `worse`
-    has the rules under which only the first side is right, and `better` those for the
-    second. Both are None if rules are not sought. `discordant_pictures` is empty: the
-    caller fills it.
+    has the rules under which only the first side is right (the second is worse), and
+    `better` those under which only the second is. Both are None if rules are not
+    sought. `discordant_pictures` is empty: the caller fills it.
 
     Args:
         first, second: sides with the same sampled scenes, in the same order.
@@ -48,11 +48,11 @@ def compare_sides(
         if name in second.rows.attrs["units"]
         and has_same_values(first.rows[name], second.rows[name])
     ]
-    # The unit of a pair is what it is independent by, such as the drive of a frame.
+    # Pairs of one unit, such as the frames of a drive, are not independent.
     unit_of_pair = first.rows["unit"].to_numpy()
     n_units = len(np.unique(unit_of_pair))
     has_single_pairs = n_units == len(unit_of_pair)
-    # only the p-value: `count_pairs` returns the difference and its interval
+    # The difference and its interval are also in `count_pairs` below.
     _, _, p_value = statistics.clustered.compare_paired(
         first.is_right, second.is_right, unit_of_pair
     )
@@ -94,8 +94,9 @@ def count_by_parameter(first: Side, second: Side, name: str) -> Iterator[PairPar
     unit_of_measure = ""
     if column.dtype != "category":
         unit_of_measure = first.rows.attrs["units"][name]
-    unit_of_pair = first.rows["unit"].to_numpy()  # see `count_pairs`
-    edges = first.rows.attrs["edges"].get(name)
+    # Pairs of one unit, such as the frames of a drive, are not independent.
+    unit_of_pair = first.rows["unit"].to_numpy()
+    edges = first.rows.attrs["edges"].get(name)  # of parts of a range; None for values
     for value, mask in split_by_value(column, edges):
         if mask.any():
             counts = count_pairs(
@@ -133,7 +134,7 @@ def count_pairs(
         "first_only": int((first_right & ~second_right).sum()),
         "second_only": int((~first_right & second_right).sum()),
         "neither": int((~first_right & ~second_right).sum()),
-        "shares": tuple(accuracies),
+        "shares": tuple(accuracies),  # of the first side and of the second
         "difference": difference,
         "interval": interval,
     }
@@ -185,19 +186,19 @@ def find_pair_rules(
         seed: seed that splits the pairs in halves: one finds the rules, the other
             counts them.
     """
-    # `rules.find_rules` searches where `correct` is rarely true. So `correct` is set to
-    # false in the pairs that the rules describe: those that only the one side gets
-    # right.
-    table = table.assign(correct=~is_only_right)
     parameters = table.attrs["units"]
     if len(table) < rules.MIN_ROWS or not parameters:
         return None
+    # `rules.find_rules` finds where `correct` is rarely true. Here it has to find the
+    # pairs that only the one side gets right, so these are not `correct`.
+    table = table.assign(correct=~is_only_right)
     choosing, counting = rules.split_in_halves(table, seed)
     found_rules = rules.find_rules(
         choosing, counting, seeds.derive_seed(seed, "compare")
     )
     pair_rules = []
     for rule in found_rules.accepted:
+        # `inside` and `elsewhere` are the pairs that meet the rule, and the others.
         inside = count_exceptions(rule.inside)
         pair_rules.append(
             PairRule(
@@ -210,7 +211,10 @@ def find_pair_rules(
 
 
 def count_exceptions(pairs: pd.DataFrame) -> CountOf:
-    """Count the pairs that are not `correct`, with their fraction and its interval."""
+    """Count the pairs that are not `correct`, with their fraction and its interval.
+
+    These are the exceptions: pairs that only one side gets right (`find_pair_rules`).
+    """
     lower, upper = rules.estimate_interval(pairs)  # of the correct ones
     fraction = None
     if not pairs.empty:

@@ -221,8 +221,8 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         "95 % interval": lambda side: wording.format_interval(side.interval),
         "time a prediction": lambda side: format_prediction_time(side.seconds),
     }
-    # Only detectors have outcomes of wrong predictions, such as "missed".
-
+    # Only detectors have outcomes of wrong predictions, such as "missed". "The others"
+    # are the predictions that are not right.
     if any(side.outcomes for side in result.sides):
         columns["the others"] = lambda side: wording.format_outcomes(
             side.outcomes, result.task
@@ -237,7 +237,7 @@ def make_compare_view(result: CompareResult) -> ShownResult:
         summary = summarize_difference(result.pairs[0])
     sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
     facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
-    # Without pairs, the summary already says that the run was interrupted.
+    # `says_interrupted`: the summary itself states that the run was interrupted.
     return ShownResult(summary, sections, facts, says_interrupted=not result.pairs)
 
 
@@ -385,7 +385,8 @@ def _make_part_cells(part: PairPart) -> list[str]:
 
 def _describe_rules(pair: ComparedPair) -> Iterator[str]:
     """Yield the rules under which either side is worse than the other."""
-    # `pair.worse` has the rules under which the second side is worse.
+    # `pair.worse` has the rules under which the second side is worse. They describe the
+    # pairs that only the first side gets right, `pair.first_only` of them.
     yield from _describe_where_worse(
         pair.worse, pair.first_only, better_side=pair.first, worse_side=pair.second
     )
@@ -474,7 +475,10 @@ def _make_picture_parts(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
 
 
 def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Picture]:
-    """Return the images of a pair with captions; values are with the first one."""
+    """Return the images of a pair with captions.
+
+    The caption of the first image also has the values of the pair's parameters.
+    """
     captions = _make_captions(example, pair)
     is_shared_image = len(example.pictures) == 1
     if is_shared_image:
@@ -489,6 +493,7 @@ def _group_pictures(example: PairPicture, pair: ComparedPair) -> list[views.Pict
 def make_compare_claims(result: CompareResult) -> Iterator[views.Claim]:
     """Yield a claim for each pair, about the accuracy of its second side."""
     for pair in result.pairs:
+        # Without units, pairs are independent.
         method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
         statement = (
             f"{summarize_difference(pair)} {describe_exclusive_pairs(pair)} The "

@@ -89,9 +89,9 @@ def read_sides(paths: Sequence[Path]) -> list[Side]:
     """Read the sides that sweeps compare, each with a different name.
 
     A sweep has a side for each of its models. The sweep of an adversarial scene has two
-    sides for each model: the clean scene and the adversarial one. But if several sweeps
-    are compared, only the adversarial one is a side. An image is left out if the object
-    is out of view in any side.
+    sides for each model: the clean scene and the adversarial one. If several sweeps are
+    compared, the clean ones are left out. So is an image if the object is out of view
+    in any side.
 
     Raises:
         FileFormatError: a folder has another run, or a sweep that has not ended.
@@ -141,7 +141,7 @@ def name_sides(sides: Sequence[Side]) -> list[str]:
         ]
         names.append(", ".join(labels))
     if len(set(names)) < len(names):
-        # A name is empty only if the sides differ in no column.
+        # All names are empty if the sides differ in no column.
         folders = [side.sweep.folder.name for side in sides]
         names = [
             f"{folder}, {name}" if name else folder
@@ -254,9 +254,10 @@ def check_same_draws(first: Side, second: Side) -> None:
             f"{where}; sweep as many objects and environments in both"
         )
     if first.name_by_column["object"] != second.name_by_column["object"]:
-        return  # default ranges may follow from the object
+        return  # the values may differ, as default ranges may follow from the object
     # The keys of "units" are the names of the parameters.
     for name in first.rows.attrs["units"]:
+        # names of what is compared, or of scenes, and no sampled values
         names_side_or_scene = name in (*SIDE_COLUMNS, "environment")
         is_shared = name in second.rows.attrs["units"]
         if names_side_or_scene or not is_shared:
@@ -289,7 +290,7 @@ def find_different_settings(sides: Sequence[Side]) -> list[str]:
     differing_settings = {
         name for other in others for name in other if other[name] != first[name]
     }
-    # `get_deciding_settings` does not return these.
+    # These settings are not among those that `get_deciding_settings` returns.
     differing_settings |= {
         name
         for name in SIDE_SETTINGS

@@ -106,7 +106,8 @@ def _read_photos(run: Path) -> pd.DataFrame:
     with workbench.hold_process_lock(), Store.open_to_read(run) as store:
         for row in store.rows(PHOTO):
             photo = _stored_photo(row)
-            if not photo.keys() >= set(STORED_FIELDS):
+            has_all_fields = photo.keys() >= set(STORED_FIELDS)
+            if not has_all_fields:
                 raise errors.FileFormatError(
                     f"row {row.id}: expected what was kept of a photograph, got "
                     "something else"
@@ -130,8 +131,8 @@ def _read_photos(run: Path) -> pd.DataFrame:
 def _stored_photo(row: workbench.Row) -> dict[str, Any]:
     """Return what is stored of a photograph; empty for rows of another kind.
 
-    It has the `STORED_FIELDS`, and "source", the name of the file that it came from,
-    which is empty if a browser sent it.
+    If the row is intact, it has the `STORED_FIELDS`, and "source": the name of the file
+    that the photograph came from, which is empty if a browser sent it.
     """
     photo = row.payload.get("photo") if isinstance(row.payload, dict) else None
     return photo if isinstance(photo, dict) else {}
@@ -188,8 +189,8 @@ def find_photographs(path: Path, task: workbench.AnyTask) -> list[Path]:
     They are found by their suffixes. The list is empty if there is no such directory.
 
     Raises:
-        InputError: the task needs the object's position, and a photograph was aligned
-            with no rendering.
+        InputError: the task needs the object's position, which is known only from a
+            rendering, and the name of a photograph names none.
     """
     files = sorted(path.iterdir()) if path.is_dir() else []
     photographs = [
@@ -252,7 +253,7 @@ class Photographs:
         self._thread.submit(self._add, run, rendering, data, source).result()
 
     def add_files(self, run: Path, files: Sequence[Path]) -> None:
-        """Evaluate and store the photographs that a sweep of one object does not have.
+        """Evaluate the photographs that are not stored yet, and store them in the run.
 
         A file ``rendering-12.jpg``, or a name that begins with ``rendering-12-``, was
         aligned with the rendering 12. All other files show the object in any position.
@@ -475,13 +476,14 @@ class _PhotoEvaluator:
             row = store.read_row("sweep", step)
             if row is not None:
                 return bool(row.correct), row.label or "", row.values
-        # A sweep stores its renderings as JPEG, an attack as PNG. So this is a
-        # rendering of a sweep without a row.
-        if file.suffix != ".png":
+        # An attack stores its renderings as PNG, a sweep as JPEG.
+        is_of_attack = file.suffix == ".png"
+        if not is_of_attack:  # a rendering of a sweep, which has no row
             raise InputError(
                 f"rendering: the results have no row for {file.stem}; it "
                 "belongs to another run"
             )
+        # None: an attack has one object, so that its name is not needed.
         judgement = self.evaluate(rendering, None, file.read_bytes())
         return judgement.right, judgement.prediction.label, {}
 
@@ -547,6 +549,7 @@ def _find_sweep_truth(
             (scene for scene in job.scenes if scene.object_name == object_name),
             job.scenes[0],
         )
+        # The ground truth needs no values of the configuration.
         return task.truth(job.make_ground_truth_facts(scene, {}))
     number = int(image_number)
     if number >= job.images_per_scene * len(job.scenes):
@@ -602,9 +605,9 @@ def _find_attack_truth(
     # If the truth does not depend on the configuration, the clean scene's is the same.
     if is_adversarial and _needs_position(task):
         u = workbench.read_stored_configuration(run, problem)
-    # A trial has the conditions that its seed draws. Other renderings have the
-    # conditions of the scene, for which the seed is None.
-    # A name without "verification-" stays as it is, and is no number.
+    # A trial has the conditions that its seed draws. Other renderings have those of the
+    # scene, for which the seed is None. Their names do not have "verification-": then
+    # `rpartition` returns the full name, which is no number.
     _, _, trial_number = (rendering or "").rpartition("verification-")
     seed = None
     if trial_number.isdecimal():

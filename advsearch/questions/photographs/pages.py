@@ -97,16 +97,17 @@ class PhotographPages:
     ) -> tuple[str, bytes]:
         """Store a photograph of a rendering, and return the table of agreement as JSON.
 
-        The table counts in how many photographs the model is right as it is in the
-        rendering. The request is checked first: another web page in the same browser
-        must not be able to send photographs to this server.
+        The table counts the photographs in which the model is right if it is right
+        about the rendering, and wrong if it is wrong. The request is checked first:
+        another web page in the same browser must not be able to send photographs to
+        this server.
 
         Args:
             run: the directory of the run.
             name: name of the rendering.
             headers: headers of the request.
-            key: key that this server's own page sends. A request of another program
-                may have no header "Origin", and one of another page lacks the key.
+            key: key that only this server's own page knows. A request without it, or
+                without the header "Origin" that a browser adds, is rejected.
             read_data: reads the photograph, once the rendering is known to exist.
 
         Raises:

@@ -161,11 +161,13 @@ def _make_result(
     warnings: Sequence[str],
     context: RunContext[RecipeConfig],
 ) -> RecipeResult:
-    """Make the result of a recipe, with the seconds of a resumed run before it stopped.
+    """Make the result of a recipe.
+
+    The total of its seconds includes those before the run was stopped and resumed.
 
     Args:
         recipe: the recipe.
-        done: the finished runs with their results.
+        done: the runs with their results; only the last may be unfinished.
         recipe_figures: content of the figures.
         warnings: warnings of all runs.
         context: context of the recipe's run.
@@ -198,12 +200,10 @@ def _make_result(
         figures=recipe_figures,
         warnings=list(dict.fromkeys(warnings)),
     )
+    resumed = context.resumed_directory
     # A run that was killed has no summary, and its seconds are unknown.
-    if (
-        context.resumed_directory is not None
-        and (context.resumed_directory / "summary.json").is_file()
-    ):
-        previous = read_result(context.resumed_directory)
+    if resumed is not None and (resumed / "summary.json").is_file():
+        previous = read_result(resumed)
         previous_seconds = getattr(previous, "seconds", {"total": 0.0})
         result.seconds["total"] += previous_seconds["total"]
     return result
@@ -301,17 +301,21 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
         config: the settings of the run.
         search: settings of the search that the run samples around; None without one.
     """
-    samples_around = search is not None
-    if not samples_around and isinstance(config, SweepConfig):
+    if search is not None:
+        return _list_control_columns(search)
+    if isinstance(config, SweepConfig):
         return workbench.row_parameters(config)
+    assert isinstance(config, AttackConfig)  # there is no other command
+    workbench.check_from_config(config)
+    # Rows of an attack are its trials.
+    return {TRIAL_COLUMN, *_list_control_columns(config)}
+
+
+def _list_control_columns(config: SceneConfig) -> set[str]:
+    """Return the columns of the parameters that controls of a run vary."""
     columns = set[str]()
-    if not samples_around:
-        columns.add(TRIAL_COLUMN)  # rows of an attack are its trials
-        assert isinstance(config, AttackConfig)  # sweeps have returned above
-        workbench.check_from_config(config)
-    source = search or config  # the settings with the controls
     # `over` are the controls of an attack that vary at random.
-    for name in (*source.controls, *getattr(source, "over", {})):
+    for name in (*config.controls, *getattr(config, "over", {})):
         kind = name.partition(":")[0]
         parameters = []
         if kind in workbench.CONTROLS:
@@ -407,10 +411,10 @@ def _check_column(
     Raises:
         InputError: if no part has it, or only some have.
     """
-    known = set(COMMON_COLUMNS)  # columns that all parts have
+    common = set(COMMON_COLUMNS)  # columns that all parts have
     if recipe.groups:
-        known.add(rates.GROUP_COLUMN)
-    if name in known:
+        common.add(rates.GROUP_COLUMN)
+    if name in common:
         return
     # "mitsuba.*" stands for any parameter of the control "mitsuba".
     control_name = name.partition(".")[0]
@@ -421,11 +425,9 @@ def _check_column(
         if matching.isdisjoint(columns)
     ]
     if len(lacking) == len(columns_of_part):
-        # the message lists the columns that any part has
-        for columns in columns_of_part.values():
-            known |= {
-                column for column in columns if not column.endswith(ANY_PARAMETER)
-            }
+        # the columns that any part has, for the message
+        known = common.union(*columns_of_part.values())
+        known = {column for column in known if not column.endswith(ANY_PARAMETER)}
         raise errors.UnknownNameError(
             "column", name, known, f"{location}, as `{option}`."
         )
@@ -468,8 +470,8 @@ def _run_parts(
         context: context of the recipe's run.
 
     Returns:
-        The runs with their results, without those after an interrupt; and a sentence
-        for each run that was left out.
+        The runs with their results, of which the last is unfinished if it was
+        interrupted; and a sentence for each run that was left out.
     """
     done = list[DoneRun]()
     left_out = list[str]()
@@ -510,10 +512,10 @@ def sample_around(
     Args:
         config: settings of the run that samples.
         distribution: mean of each parameter, and deviations as fractions of ranges.
-        search_ranges: the parameters of the search with their ranges; empty if it has
-            none.
+        search_ranges: the parameters of the search by name, with their ranges.
     """
     controls: dict[str, dict[str, object]] = {}
+    # Means are by parameter; deviations are in the same order.
     for (name, mean), deviation in zip(
         distribution.mean.items(), distribution.deviation, strict=True
     ):

@@ -210,7 +210,7 @@ def read_recipe(name: str) -> Recipe:
     """
     if is_file_name(name):
         return parse_recipe(settings.read_yaml(name), name)
-    read_recipe_text(name)  # an unknown name is an error
+    read_recipe_text(name)  # only a check: raises if no recipe has this name
     with resources.as_file(BUNDLED / f"{name}.yaml") as path:
         return parse_recipe(settings.read_yaml(path), name)
 
@@ -230,6 +230,7 @@ def parse_recipe(data: Mapping[str, object], where: str) -> Recipe:
     Raises:
         FileFormatError: if it describes no recipe.
     """
+    # These two entries are about the file, and no fields of a recipe.
     values = {
         name: value for name, value in data.items() if name not in ("schema", "command")
     }
@@ -262,7 +263,7 @@ class PlannedRun:
         name: name of the run's directory.
         part_name: name of the part that it belongs to.
         config: settings of the run.
-        search_run_name: name of the directory of the search that it samples around; None if it
+        search_run_name: directory of the search that it samples around; None if it
             samples around none.
     """
 
@@ -403,16 +404,16 @@ def _safe_name(text: str) -> str:
 
 
 def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
-    """Reject a part with power over more than its run, unless the recipe is bundled.
+    """Reject parts with effects outside of their run, unless the recipe is bundled.
 
     Such a part connects to other machines, or starts more processes than there are
-    cores. The recipe in a file may be anybody's.
+    cores. A recipe in a file may come from anybody.
 
     Raises:
         InputError: for the first such part.
     """
-    # A run stores its recipe, and the stored one may have been changed. So the content
-    # is compared, too.
+    # The recipe may be one that a run has stored under the bundled name. That may have
+    # been changed, so that the content is compared, too.
     is_bundled = not is_file_name(name) and recipe == read_recipe(name)
     if is_bundled:
         return

@@ -207,13 +207,10 @@ def make_cues_figure(rows: Rows, options: CuesOptions) -> FigureContent:
         rows: rows with object and texture.
         options: the columns of both, and the classes that name each texture.
     """
-    # All three are by the name of the texture.
-    # `names_texture`: whether each prediction (n,) names the texture
-    # `by_shape`: how often the prediction names the object, and so is right
-    # `by_texture`: how often the prediction names the texture
-    names_texture = dict[str, Any]()
-    by_shape = dict[str, ClusteredFraction]()
-    by_texture = dict[str, ClusteredFraction]()
+    # The keys are names of textures.
+    names_texture = dict[str, Any]()  # whether each prediction (n,) names the texture
+    by_shape = dict[str, ClusteredFraction]()  # predictions of the object: right ones
+    by_texture = dict[str, ClusteredFraction]()  # predictions of the texture
     for texture, texture_rows in rates.split_rows(rows, options.texture).items():
         classes = options.classes.get(texture, ())
         names_texture[texture] = _names_class(
@@ -269,7 +266,6 @@ def _describe_named(
             f"{total.describe('so')}."
         )
         if not total.fraction:
-            # why that may be
             text.append("A model that has no class for a texture cannot name it.")
     return text
 
@@ -313,7 +309,7 @@ def _draw_cues(
         label="the texture",
         **style,
     )
-    # The bar of the object begins at 0, so its interval is drawn where it is.
+    # The intervals are those of the bars of the object, which begin at 0.
     for position, name in enumerate(ordered):
         axes.plot(
             by_shape[name].interval(),
@@ -330,13 +326,13 @@ def _draw_cues(
 
 
 def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
-    """Count for each pair of shape and texture the predictions that each cue predicts.
+    """Count how often shape and texture foretell what the model predicts.
 
-    The shape predicts, for a pair of object and texture, the model's most frequent
-    label for the same object with other textures. The texture predicts the most
-    frequent label for the same texture on other objects. Both sets of labels are
-    sampled to the size of the smaller one, and neither has the pair's own labels: so a
-    model that uses neither cue is predicted equally well by both.
+    For a pair of object and texture, the shape foretells the model's most frequent
+    label for the same object with other textures. The texture foretells the most
+    frequent label for the same texture on other objects. Neither set of labels has
+    those of the pair itself, and the larger set is sampled to the size of the smaller
+    one. So if the model uses neither cue, both foretell it equally well.
 
     Args:
         rows: predictions with object and texture.
@@ -344,7 +340,7 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
 
     Returns:
         For each pair of object and texture: the number of predictions, those that the
-        shape predicts, and those that the texture predicts.
+        shape foretells, and those that the texture foretells.
     """
     generator = random.Random(SEED)
     groups = rows.groupby(
@@ -361,8 +357,8 @@ def count_predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, in
     for (shape, texture), labels in labels_of_pair.items():
         same_shape, same_texture = _collect_labels(labels_of_pair, shape, texture)
         n_samples = min(len(same_shape), len(same_texture))
-        # There are none without another texture of the shape, or another shape.
-        if n_samples:
+        # 0 if the shape has no other texture, or the texture no other shape
+        if n_samples > 0:
             by_shape = _sample_most_frequent(same_shape, n_samples, generator)
             by_texture = _sample_most_frequent(same_texture, n_samples, generator)
             counts.append(
@@ -403,14 +399,13 @@ def _sample_most_frequent(
 
 
 def _compare_cues(pairs: Sequence[tuple[int, int, int]]) -> str:
-    """Describe by how many percentage points the shape predicts better.
+    """Describe by how many percentage points the shape foretells predictions better.
 
     The predictions about one pair of object and texture are not independent. Therefore
     the interval is a percentile bootstrap over pairs.
 
     Args:
-        pairs: for each pair the number of predictions, those that the shape predicts,
-            and those that the texture predicts.
+        pairs: counts of each pair of object and texture, from `count_predicted`.
     """
     if len(pairs) < MIN_PAIRS:
         return (
@@ -487,6 +482,7 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     triangle, which is divided into small triangles. If all predictions are the same,
     and there are enough margins, the figure shows the margin of the right label
     instead.
+
     Args:
         rows: rows of one mixture each.
         options: the columns of the ingredients, and how the figure is drawn.
@@ -504,6 +500,7 @@ def make_ternary_figure(rows: Rows, options: TernaryOptions) -> FigureContent:
     by_margin = has_single_prediction and min(map(len, margins.values())) >= 2
     ranking = ranking[: options.most]
     if by_margin:
+        # The ranking has a single label, with its count.
         text, heads, table = _describe_margins(ranking[0][0], margins)
     else:
         text, heads, table = _describe_ingredients(
@@ -664,7 +661,7 @@ def _describe_ingredients(
     names: Sequence[str],
     main_ingredient: npt.NDArray[np.intp],
 ) -> tuple[list[str], list[str], list[list[rates.Cell]]]:
-    """Describe how often each prediction is given, by the main ingredient.
+    """Describe how often each label is predicted, by the main ingredient.
 
     Args:
         rows: rows of one mixture each.
@@ -678,7 +675,7 @@ def _describe_ingredients(
     text = list[str]()
     table = list[list[rates.Cell]]()
     heads = ["prediction", "where most is", "given in", *rates.FRACTION_HEADS]
-    for label, times in ranking:
+    for label, n_predictions in ranking:
         is_label = (rows[rates.PREDICTION_COLUMN] == label).to_numpy()
         # for each ingredient, how often the label is predicted if it is the largest
         tallies = []
@@ -687,7 +684,7 @@ def _describe_ingredients(
             tallies.append(
                 ClusteredFraction.from_rows(name, rows[is_main], is_label[is_main])
             )
-        share = wording.percent(times / len(rows))
+        share = wording.percent(n_predictions / len(rows))
         # A sentence begins: "mug, 12 % of all predictions, is rarest where ...".
         beginning = f"{label}, {share} of all predictions, is"
         known_fractions = {tally.fraction for tally in tallies if tally.total}
@@ -741,8 +738,8 @@ def _draw_panels(
                 triangles, ax=axes, shrink=0.7, location="bottom", label=prediction
             )
     if not options.normalised:
-        # Fractions have the same range in all diagrams, and margins have one diagram.
-        # So the colors of the last diagram are those of all.
+        # All diagrams have the colors of the last one: fractions have the range 0 to 1,
+        # and of margins there is only one diagram.
         figure.colorbar(
             triangles,
             ax=list(all_axes),
@@ -762,20 +759,17 @@ def find_triangle(mixture: Sequence[float], side: int) -> Triangle:
         mixture: three fractions, whose sum is 1.
         side: number of triangles along a side of the diagram.
     """
-    a, b, c = (int(fraction * side) for fraction in mixture)
-    # Inside of a triangle, `a + b + c` is `side - 1` or `side - 2`. At a corner of
-    # triangles nothing is rounded, and it is `side`. A point there belongs to several
-    # triangles; one is chosen by taking 1 from the largest number.
-    while a + b + c >= side:
-        if a >= max(b, c):
-            a -= 1
-        elif b >= c:
-            b -= 1
-        else:
-            c -= 1
-    # Before rounding down, the three numbers add up to `side`. Rounding takes 1 in
-    # total from the sum in a triangle that points up, and 2 in one that points down.
-    points_down = a + b + c < side - 1
+    # The three fractions times `side` add up to `side`. Rounding them down takes 1 from
+    # the sum in a triangle that points up, and 2 in one that points down. At a corner
+    # of triangles it takes nothing.
+    rounded = [int(fraction * side) for fraction in mixture]
+    is_at_corner = sum(rounded) >= side
+    if is_at_corner:
+        # The corner belongs to several triangles: take the one in which the largest
+        # fraction (the first of equal ones) is smaller.
+        rounded[rounded.index(max(rounded))] -= 1
+    points_down = sum(rounded) < side - 1
+    a, b, _ = rounded
     return a, b, points_down
 
 
@@ -826,7 +820,8 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     largest = max(margins, key=lambda name: margins[name].mean())
     descriptions = []
     for name in (smallest, largest):
-        lower, upper = _compute_mean_interval(margins[name])  # of this mean alone
+        # not widened: the interval of this mean alone
+        lower, upper = _compute_mean_interval(margins[name])
         descriptions.append(
             f"{name}: {margins[name].mean():.3g} "
             f"(95 % interval {lower:.3g} to {upper:.3g}, {len(margins[name])} pictures)"
@@ -838,7 +833,7 @@ def _compare_margins(margins: Mapping[str, Float64Array]) -> str:
     lower_of_largest, _ = _compute_mean_interval(margins[largest], n_compared)
     if upper_of_smallest < lower_of_largest:
         verdict = f"The difference is shown: {widened} do not overlap"
-    # "It" is the right label, which the sentence before names.
+    # "It" is the right label, which `_describe_margins` names in the sentence before.
     return (
         f"It leads least where most of the mixture is {descriptions[0]}; most where "
         f"most of it is {descriptions[1]}. {verdict}."

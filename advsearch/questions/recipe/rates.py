@@ -107,7 +107,7 @@ def read_rows(
             units_of_measure |= {
                 name: stored["unit"] for name, stored in row.values.items()
             }
-            # A sweep may also have rows of photographs, which share no draw.
+            # A sweep may also have rows of photographs, each of which is a unit.
             if summary.command == "attack":
                 independent_unit = f"{seed} {row.step}"
             elif row.kind == "sweep" and sweep_units is not None:
@@ -477,9 +477,10 @@ class RatesOptions(Options):
 
         The part `beside` is needed in addition to those in `of`.
         """
-        if self.beside and self.of:
-            return (*self.of, self.beside)
-        return self.of
+        needs_all = not self.of
+        if needs_all or not self.beside:
+            return self.of
+        return (*self.of, self.beside)
 
     @property
     def axis_label(self) -> str:
@@ -510,12 +511,13 @@ def make_rates_figure(rows: Rows, options: RatesOptions) -> FigureContent:
     series = [options.names.get(value, value) for value in series_values]
     cells, bin_centers = _count_cells(rows, series_values, options)
     totals = _count_series("all", rows, series_values, options)
-    bars = dict(cells)  # the cells, and before them the baseline if there is one
+    bars = dict(cells)
 
     text = _describe_cells(cells, series, bin_centers is not None, options)
     text += _describe_series(cells, totals, series, options)
     if options.beside and len(baseline_rows):
-        # The baseline is the part that all others are compared with.
+        # The baseline is the part that all others are compared with. It is the first
+        # bar.
         baseline_name = options.names.get(options.beside, options.beside)
         baseline = _count_series("", baseline_rows, series_values, options)
         text += _compare_with_baseline(baseline_name, baseline, totals, series, verb)
@@ -577,9 +579,11 @@ def _count_cells(
     for value, group_rows in groups.items():
         name = options.names.get(value, value)
         cells[name] = _count_series(name, group_rows, series_values, options)
-    is_binned = bin_centers is not None
-    is_numeric = is_numeric_dtype(get_column(rows, options.by))
-    if options.form == "bars" and not is_binned and not is_numeric:
+    # Numbers and bins stay in their order.
+    are_names = bin_centers is None and not is_numeric_dtype(
+        get_column(rows, options.by)
+    )
+    if options.form == "bars" and are_names:
         order = sorted(cells, key=lambda name: -(cells[name][0].fraction or 0.0))
         cells = {name: cells[name] for name in order}
     return cells, bin_centers
@@ -600,13 +604,13 @@ def _count_series(
         A fraction for each series, in the order of `series_values`. A series without
         rows has a fraction of no rows.
     """
-    rows_of_series = {"": rows}
+    rows_of_series = {"": rows}  # without the column, `series_values` is [""]
     if options.series and len(rows):
         rows_of_series = split_rows(rows, options.series)
     counts_right = not options.wrong
+    no_rows = rows[:0]
     tallies = []
     for value in series_values:
-        no_rows = rows[:0]
         series_rows = rows_of_series.get(value, no_rows)
         is_counted = series_rows["correct"] == counts_right
         tallies.append(ClusteredFraction.from_rows(name, series_rows, is_counted))
@@ -632,9 +636,9 @@ def _describe_cells(
     """Describe the lowest and the highest fraction: of a map, or else of each series.
 
     Args:
-        cells: for each row by its name, a fraction for each series.
+        cells: for each bar of the figure by its name, a fraction for each series.
         series: names of the series.
-        is_binned: whether the rows are bins of a number.
+        is_binned: whether the bars are bins of a number.
         options: options of the figure.
     """
     if options.form == "map":
@@ -644,9 +648,12 @@ def _describe_cells(
     where = f" where {options.axis_label}" if is_binned else ""
     has_several_series = len(series) > 1
     for index, name in enumerate(series):
-        tallies = [row[index].with_name(row_name) for row_name, row in cells.items()]
+        tallies = [
+            fractions[index].with_name(bar_name)
+            for bar_name, fractions in cells.items()
+        ]
         n_known = sum(tally.total > 0 for tally in tallies)
-        # There is nothing to compare. `_describe_series` describes the series.
+        # With a single bar there is nothing to compare within a series.
         if has_several_series and n_known < 2:
             continue
         lowest = f"For {name}, lowest" if has_several_series else "Lowest"
@@ -693,12 +700,12 @@ def _describe_series(
     """Compare the series over all rows.
 
     If the series are models and errors are counted, there is also a sentence for each
-    model but the first: the mean over rows of its error relative to that of the first
-    model, as the mCE (mean corruption error) of Hendrycks and Dietterich (2019).
+    model but the first: the mean over the bars of its error relative to that of the
+    first model, as the mCE (mean corruption error) of Hendrycks and Dietterich (2019).
 
     Args:
-        cells: for each row a fraction for each series.
-        totals: fraction of each series over all rows.
+        cells: for each bar of the figure a fraction for each series.
+        totals: fraction of each series over all bars.
         series: names of the series.
         options: options of the figure.
     """
@@ -716,8 +723,8 @@ def _describe_series(
         things=pluralize_column(options.series),
         verb=verb,
     )
-    # Figures of other columns have the same sentences. Joined to one text, they are
-    # printed once.
+    # Figures of other columns have the same sentences, and `omit_repeated_sentences`
+    # drops equal texts. So they are one text here.
     text = [" ".join(sentences)]
     if options.wrong and options.series == MODEL_COLUMN:
         text += _describe_mean_errors(cells, series)
@@ -727,18 +734,20 @@ def _describe_series(
 def _describe_mean_errors(cells: Cells, models: Sequence[str]) -> Iterator[str]:
     """Yield the mean corruption error (mCE) of each model but the first, as sentences.
 
-    That is the mean over rows of the model's error divided by the first model's. Rows
+    That is the mean, over the bars of the figure (the corruptions), of the model's
+    error divided by the first model's. In the paper, the first model is AlexNet. Bars
     in which the first model has no errors are left out.
 
     Args:
-        cells: for each row a fraction of errors for each model.
+        cells: for each bar a fraction of errors for each model.
         models: names of the models.
     """
     for index, name in enumerate(models[1:], start=1):
         ratios = []
         for tallies in cells.values():
-            if tallies[0].fraction:
-                ratios.append((tallies[index].fraction or 0.0) / tallies[0].fraction)
+            first_error = tallies[0].fraction
+            if first_error:
+                ratios.append((tallies[index].fraction or 0.0) / first_error)
         if ratios:
             mean = 100.0 * sum(ratios) / len(ratios)
             yield (
@@ -786,19 +795,19 @@ def _tabulate_rates(
     """Return the table of a rates figure; with series, their totals come last.
 
     Args:
-        cells: for each row by its name, a fraction for each series.
-        totals: fraction of each series over all rows.
-        series: names of the series.
+        cells: for each bar by its name, a fraction for each series.
+        totals: fraction of each series over all bars.
+        series: names of the series; a single one without a column of series.
         options: options of the figure.
     """
-    tallies_of_row = dict(cells)
+    tallies_of_bar = dict(cells)
     if options.series:
-        tallies_of_row["all"] = totals
+        tallies_of_bar["all"] = totals
     table = list[list[Cell]]()
-    for row_name, tallies in tallies_of_row.items():
+    for bar_name, tallies in tallies_of_bar.items():
         for series_name, tally in zip(series, tallies, strict=True):
             series_cell = [series_name] if options.series else []
-            table.append([row_name, *series_cell, *tally.table_cells])
+            table.append([bar_name, *series_cell, *tally.table_cells])
     return table
 
 
@@ -916,7 +925,7 @@ def _group_rows(
 
 
 def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
-    """Return the index of the bin of each value; NaN outside of the range.
+    """Return the index of the bin of each value as a float; NaN outside of the range.
 
     Both ends belong to the range.
 
@@ -928,8 +937,11 @@ def _find_bins(values: Any, lower: float, upper: float, n_bins: int) -> Any:
     """
     position = (values - lower) / (upper - lower) * n_bins
     is_in_range = values.between(lower, upper)
-    position = position.clip(upper=n_bins - 1)  # the upper end is in the last bin
-    return position.where(is_in_range) // 1  # rounded down; NaN stays NaN
+    index = position // 1  # rounded down
+    index = index.clip(
+        upper=n_bins - 1
+    )  # the upper end of the range is in the last bin
+    return index.where(is_in_range)
 
 
 def _read_binned_values(rows: Rows, options: RatesOptions) -> Any:
@@ -1080,7 +1092,7 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
         InputError: if a part has no rows or other configurations.
     """
     rendered_part = options.of[0]
-    # `dropna` removes the columns that only rows of other parts have.
+    # A column that only rows of other parts have is empty here, and is removed.
     renderings = _select_part(rows, rendered_part).dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(
@@ -1121,7 +1133,8 @@ def make_agreement_figure(rows: Rows, options: AgreementOptions) -> FigureConten
         columns=AGREEMENT_HEADS,
         rows=table,
         draw=lambda figure: _draw_agreement(figure, bars, series),
-        # a row of bars for each object, and a line of the legend for each series
+        # inches; a line of the legend for each series, and a row of bars for each
+        # object, as `bars` has one entry more
         size=(FIGURE_WIDTH, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)),
     )
 
@@ -1143,11 +1156,11 @@ def _add_agreement(
     Two images agree if the model is right about both, or wrong about both.
 
     Args:
-        bars: for each object, and for `ALL_OBJECTS`, the fractions of the series; these
-            pairs are added as one more series.
+        bars: fractions of each object, and of `ALL_OBJECTS`. Each list gets the
+            fraction of these pairs.
         pairs: pairs of renderings and other images.
         table: rows of the table; a row is added for each entry of the bars.
-        series_name: name of the other images.
+        series_name: name of the series, which is that of the other images.
     """
     for name, tallies in bars.items():
         object_pairs = pairs
@@ -1175,11 +1188,11 @@ def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
     """Join the rows of a part with the renderings of the same configuration.
 
     Two rows have the same configuration if they agree in all columns of the renderings
-    except for the results, such as the prediction. Rows of the part may have further
-    parameters. A pair has the results of both rows: the columns of the rendering's
-    results end in `` rendered``.
+    except for those that belong to a row, such as the prediction and the time. Rows of
+    the part may have further parameters. A pair has these columns of both rows; the
+    names of those of the rendering end in `` rendered``.
     """
-    columns_of_row = {
+    result_columns = {
         PREDICTION_COLUMN,
         PART_COLUMN,
         "correct",
@@ -1187,8 +1200,8 @@ def _pair_rows(part_rows: Rows, renderings: Rows) -> Rows:
         "time",
         "unit",
     }
-    configuration = [name for name in renderings if name not in columns_of_row]
-    return part_rows.merge(renderings, on=configuration, suffixes=("", " rendered"))
+    shared_columns = [name for name in renderings if name not in result_columns]
+    return part_rows.merge(renderings, on=shared_columns, suffixes=("", " rendered"))
 
 
 def _count_agreement(name: str, pairs: Rows) -> tuple[ClusteredFraction, list[Cell]]:
@@ -1286,8 +1299,8 @@ def make_scaling_figure(rows: Rows, options: Options) -> FigureContent:
         raise InputError(
             "figures: scaling: expected sweeps with `workers` among the parts, got none"
         )
-    # Grouping leaves out the rows of sweeps that do not set the workers. A run is one
-    # object with one number of workers.
+    # Each run has one object and one number of workers. Grouping leaves out the rows of
+    # runs that do not set the workers.
     rate_of_run = rows.groupby([WORKERS_COLUMN, "object"], sort=False)["time"].agg(
         _compute_throughput
     )

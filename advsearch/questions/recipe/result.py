@@ -250,6 +250,7 @@ def make_view(result: RecipeResult) -> ShownResult:
 def _list_figures(result: RecipeResult) -> list[ResultPart]:
     """Return a section for each figure, and one for its numbers."""
     sections = list[ResultPart]()
+    # the sentences of each figure, without those of earlier figures
     sentences = omit_repeated_sentences(result.figures)
     for number, (figure, text) in enumerate(
         zip(result.figures, sentences, strict=True), start=1

@@ -210,15 +210,18 @@ def find_selected_axes(result: results.Result) -> list[str]:
     """Return the axes of a sweep that have several selected values.
 
     Selected values are not sampled, so that a fraction over them depends on the
-    selection. Models and adversarial scenes are no conditions, and are left out.
+    selection. Models and adversarial scenes (axis "answer") are no conditions, and are
+    left out.
     """
-    n_values = Counter[str]()
-    if is_sweep(result):
-        n_values.update(row.axis for row in result.axes if row.axis not in result.drawn)
+    if not is_sweep(result):
+        return []
+    # `drawn` are the sampled parameters.
+    no_conditions = {"model", "answer", *result.drawn}
+    n_values = Counter(row.axis for row in result.axes)
     return [
         axis
         for axis, count in n_values.items()
-        if count > 1 and axis not in ("model", "answer")
+        if count > 1 and axis not in no_conditions
     ]
 
 
@@ -231,9 +234,9 @@ def describe_criterion(
     """Describe whether a criterion is met: a minimum fraction of right predictions.
 
     If the user selected the values of an axis, each condition is evaluated separately,
-    since a fraction over all conditions would depend on the selection. Else, or without
-    conditions, each claimed fraction of right predictions is evaluated. Conditions in
-    which the criterion is not met are listed in either case.
+    since a fraction over all conditions would depend on the selection. Otherwise, or if
+    there are no conditions, each claimed fraction of right predictions is evaluated. In
+    either case, the conditions in which the criterion is not met are listed.
 
     Args:
         claims: claims of the run.
@@ -245,9 +248,9 @@ def describe_criterion(
     verdict_of_condition = {
         row.condition: evaluate_criterion(criterion, row.interval) for row in conditions
     }
-    # "open" is a verdict, too: the interval contains the criterion.
     listed_verdicts = ["not met"]
     if selected_axes:
+        # Each condition is evaluated, also those whose interval contains the criterion.
         listed_verdicts.append("open")
     if selected_axes and conditions:
         lines = [_count_verdicts(verdict_of_condition, criterion, selected_axes)]
@@ -305,7 +308,8 @@ def _describe_criterion_of_claims(
     lines = []
     for claim in claims:
         extent = claim.extent
-        # A criterion is about right predictions, not about failures.
+        # `extent` has the counted numbers of a claim; None if it counts nothing. A
+        # criterion is about right predictions, not about failures.
         if extent is not None and extent.counts_right:
             verdict = evaluate_criterion(criterion, extent.interval)
             lines.append(
@@ -565,7 +569,7 @@ def find_domain_part(name: str) -> str:
     """Return the part of a domain that an axis, a control or a parameter belongs to.
 
     The first word decides, for example "camera" in ``camera.azimuth``. So a sentence
-    that begins with a name belongs to a part, too.
+    that begins with such a name may be passed, too. `OTHER` if no part has it.
     """
     first_word = re.match(r"\w+", name)
     if first_word is not None:
@@ -923,6 +927,7 @@ def _describe_measurement(
     trials_heading = (
         "Trials of the worst configuration" if is_sweep(result) else "Trials"
     )
+    # by the heading under which a report lists them
     values = {
         "Policy": getattr(result, "policy", None),
         "Objective": getattr(result, "objective", None),
@@ -949,18 +954,16 @@ def _describe_verification(result: workbench.AttackSummary) -> str:
     """Describe how many fresh renders verify what an attack found.
 
     If conditions are sampled anew for each render, a render counts only if the model is
-    right about the clean scene under the same conditions. The control has the renders
-    of the clean scene under all conditions.
+    right about the clean scene under the same conditions. The control (the clean scene)
+    is rendered once for each of them, so that it has the number of all renders.
     """
     verified = result.verified
     assert verified is not None
-    control = result.clean.control
     counts = f"{verified.trials} renders with fresh seeds"
-    has_uncounted = control is not None and control.trials > verified.trials
-    if result.over and control is not None and has_uncounted:
-        counts += (
-            f" that count, those of {control.trials} in which the clean scene is right"
-        )
+    control = result.clean.control
+    n_renders = control.trials if control is not None else verified.trials
+    if result.over and n_renders > verified.trials:
+        counts += f" that count, those of {n_renders} in which the clean scene is right"
     return f"{counts}, {verified.spp} samples a pixel"
 
 
@@ -1001,8 +1004,8 @@ def _describe_excluded_by_attack(result: workbench.AttackSummary) -> list[str]:
             f"{non_finite.gradient_elements} numbers of gradients."
         )
     for adjusted in result.clean.moved:
-        # The clean scene has the value `used`, since the control does not allow the
-        # scene's own value `scene`.
+        # The scene's own value, `scene`, is outside of the range of the control. So the
+        # clean scene has the value `used`.
         used = f"{wording.format_number(adjusted.used)} {adjusted.unit}"
         lines.append(
             f"The clean scene has {adjusted.parameter} {used} in place of "
@@ -1115,7 +1118,8 @@ def _compare_models(runs: Sequence[EvidenceRun]) -> list[str]:
         model = run.about.get("Model")
         if not model:
             continue
-        digest_names = (model, model.rpartition("@")[2])
+        file_name = model.rpartition("@")[2]  # the full name without "@"
+        digest_names = (model, file_name)
         # `made_with` has versions and digests by name.
         digest_texts = [
             text for name, text in run.made_with.items() if name in digest_names
@@ -1142,15 +1146,19 @@ def _make_evidence_run(
     result = read_result(folder)
     claims_of_photographs, photo_rows = _read_photographs(folder)
     claims = [*collect_claims(result), *claims_of_photographs]
-    recorded, run = _describe_stored_run(folder, result, claims)
+    recorded_settings, run = _describe_stored_run(folder, result, claims)
 
     sweeps = _read_sweeps(result)
     searched = _list_searched(folder, result, sweeps) or run.searched
     # A result that was made from sweeps is about their domain, which is the same for
     # all of them: so the first is described.
-    domain = describe_domain(sweeps[0].result if sweeps else result, recorded, searched)
+    domain = describe_domain(
+        result=sweeps[0].result if sweeps else result,
+        recorded=recorded_settings,
+        searched=searched,
+    )
     conditions = count_conditions(result)
-    weighted = describe_exposure(result, conditions, exposure)
+    exposure_lines = describe_exposure(result, conditions, exposure)
     criterion_lines = []
     if criterion is not None:
         criterion_lines = describe_criterion(
@@ -1162,13 +1170,13 @@ def _make_evidence_run(
             "excluded": [*_list_quick_remarks(folder), *run.excluded],
             "criterion": criterion_lines,
             "triggering": list_triggering_conditions(result),
-            "exposure": weighted,
+            "exposure": exposure_lines,
             "conditions": conditions,
             "photographs": count_conditions(result, photo_rows),
             "twins": _find_twins(folder, result, twins),
             "domain": {name: part.text for name, part in domain.items()},
             "limitations": _describe_limits(
-                claims_of_photographs, domain, is_weighted=bool(weighted)
+                claims_of_photographs, domain, is_weighted=bool(exposure_lines)
             ),
         }
     )
@@ -1232,7 +1240,10 @@ def _describe_stored_run(
 def _collect_versions(
     folder: Path, result: results.Result, read_paths: Sequence[Path]
 ) -> dict[str, str]:
-    """Return versions and digests of files, without an environment that is not used."""
+    """Return versions and digests of files, without an environment that is not used.
+
+    The default environment may be noted although the scene has none.
+    """
     versions = collect_versions(folder, read_paths)
     if getattr(result, "environment", "") == NO_ENVIRONMENT_MAP:
         from advsearch.extend import workbench  # it brings torch, which takes a second
@@ -1314,7 +1325,7 @@ def _list_searched(
     folder: Path, result: results.Result, sweeps: Sequence[_ReadSweep]
 ) -> list[str]:
     """Describe what varied in the claims that a suite tested, or in the sweeps that a
-    result was made from.
+    result was made from; empty for any other run.
     """
     noted = read_noted_settings(folder, result)
     if noted is not None:  # the run is one of a suite

@@ -277,7 +277,7 @@ def _list_condition_tables(run: EvidenceRun) -> list[markup.Html]:
 
 
 def _make_section_table(run: EvidenceRun) -> markup.Html:
-    """Return the sections of a run as an unfolded table, with a row for each."""
+    """Return the sections of a run as a table that can be folded, a row for each."""
     rows = [
         markup.make_element(
             "tr",
@@ -292,6 +292,7 @@ def _make_section_table(run: EvidenceRun) -> markup.Html:
         "table", markup.make_element("tbody", *rows), class_="facts"
     )
     summary = markup.make_element("summary", "On what, how, and what is left out")
+    # With the attribute `open` it is not folded at first.
     return markup.make_element("details", summary, table, open="")
 
 

@@ -301,16 +301,15 @@ class Case:
         except Exception as error:
             failure = make_failure(f"raised {type(error).__name__}: {error}")
             outcome = CaseOutcome([failure], finite=False, ending="raised")
-        status, decisive = outcome.evaluate()
-        fields = {
+        status, decisive_check = outcome.evaluate()
+        row_fields = {
             "case": self.name,
             "status": status,
-            "decides": decisive,
+            "decides": decisive_check,
             "seconds": time.perf_counter() - start,
         }
-        # Fields of the case, of the outcome, and of the row itself. `CaseRow` ignores
-        # the others, such as `measure`.
-        return CaseRow.from_values({**vars(self), **vars(outcome), **fields})
+        # `CaseRow` takes its fields from these, and ignores others, such as `measure`.
+        return CaseRow.from_values({**vars(self), **vars(outcome), **row_fields})
 
 
 # every case, in the order in which they run

@@ -84,7 +84,7 @@ def make_renderer(
     renderer = replace(scene, description=description).renderer(
         controls, resolution=IMAGE_SIZE, denoise=denoise
     )
-    # finite differences for each pixel
+    # What is differentiated by finite differences gets them for each pixel.
     renderer.plan = renderer.plan.with_pixel_steps()
     return renderer
 
@@ -107,7 +107,12 @@ def make_plain_environment() -> assets.EnvironmentAsset:
 def make_gray_environment(
     value: float, texel: float | None = None
 ) -> assets.EnvironmentAsset:
-    """Return a gray environment map, with one texel of another value."""
+    """Return a gray environment map, with one texel of another value.
+
+    Args:
+        value: radiance of the map.
+        texel: radiance of the texel, which is in the upper half; None for `value`.
+    """
     radiance: assets.Float32Array = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
@@ -197,8 +202,9 @@ def check_scene(
             passed are those of the start.
         spp: samples per pixel.
         compare: whether to compare the gradient with finite differences.
-        seeds: minimum and maximum number of seeds of the finite differences.
-        repeats: number of gradients that are compared.
+        seeds: minimum and maximum number of seeds of the finite differences, which are
+            the reference.
+        repeats: number of gradients, each with other noise, that are compared with it.
         evaluations: number of evaluations of the search.
         mean: bounds of the image's mean.
         gradient: bounds of the largest absolute entry of the gradient.
@@ -213,7 +219,7 @@ def check_scene(
     start = _replace_start_values(u, renderer)
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     image = render_image(renderer, start, seed=0, spp=spp)
-    _, slope = renderer.gradient(loss, start, 0, spp)  # 0 is the seed
+    _, loss_gradient = renderer.gradient(loss, start, 0, spp)  # 0 is the seed
     relative_error = None
     gradient_checks: list[Check] = []
     if compare:
@@ -223,7 +229,7 @@ def check_scene(
     result = search_scene(renderer, loss, start, spp, evaluations)
     measured = {
         "mean": float(image.mean()),
-        "largest gradient": float(slope.abs().max()),
+        "largest gradient": float(loss_gradient.abs().max()),
     }
     checks = [
         *_check_finite(renderer, image, result),
@@ -238,9 +244,12 @@ def check_scene(
         other_arguments: dict[str, Any] = {"controls": controls, **other_scene}
         other_renderer = make_renderer(**other_arguments)
         checks.append(_compare_images(renderer, start, other_renderer, difference))
-    is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all())
+    is_finite = bool(
+        torch.isfinite(image).all() and torch.isfinite(loss_gradient).all()
+    )
     return CaseOutcome(
         checks,
+        # The renderer replaces and counts values of images that are not finite.
         finite=is_finite and renderer.n_non_finite == 0,
         relative_error=relative_error,
         ending=result.ending.value,
@@ -381,7 +390,7 @@ def search_scene(
         return LOGIT_SCALE * (loss(image) - loss_at_start) - 1.0
 
     # Steps count renders: each evaluation takes the image and those of its gradient.
-    # One more is left for an image without a gradient.
+    # One step is left for an image without a gradient.
     steps = evaluations * (1 + gradient_cost) + 1
     # The smallest search that also verifies its result: one candidate is rendered again
     # once.
@@ -427,8 +436,8 @@ def compare_gradient(
     formation = renderer.formation
     loss = gradients.make_smooth_loss(formation.resolution)
     bench = gradients.Bench(renderer, loss, u, seed=1, spp=spp)
-    # The formation of this renderer is replaced, and not that of a copy, since it
-    # counts the values that are not finite.
+    # This renderer is changed for a while, instead of a copy, since the caller reads its
+    # count of values that are not finite.
     renderer.formation = replace(formation, transfer="linear")
     try:
         rows = gradients.measure_derivatives(
@@ -452,13 +461,13 @@ def measure_inward_slope(
     """Return the derivative of the smooth linear loss along a direction inwards.
 
     All values of the start have to be at a bound of their range, 0 or 1, so that they
-    can move inwards only. The direction moves the values that increase the loss when
-    they move inwards, by `factor`; all other values stay.
+    can move inwards only. The direction has the values whose move inwards increases the
+    loss; all other values stay.
 
     Args:
         renderer: renderer of the scene.
         gradient: (d,) gradient of the loss at the start.
-        factor: how far the values move for a step of 1.
+        factor: factor of the direction, for all values or for each, (d,).
         seeds: number of seeds over which the finite differences are averaged.
         spp: samples per pixel.
 
@@ -491,8 +500,8 @@ def evaluate(
 ) -> policies.Evaluation:
     """Evaluate a configuration by a loss of the image; a loss above 0 is a success.
 
-    The index of the query is the seed of the noise. The cost is the number of renders
-    with `spp` samples.
+    The `row_index` of the query is the seed of the noise. The cost is the number of
+    renders with `spp` samples.
 
     Args:
         renderer: renderer of the scene.
@@ -518,7 +527,7 @@ def evaluate(
         gradient=gradient,
         success=objective > 0.0,
         n_non_finite=renderer.n_non_finite - non_finite_before,
-        # `samples` renders with `spp` samples each
+        # Each render has `query.samples` times `spp` samples.
         cost=(renderer.n_renders - renders_before) * query.samples,
     )
 
@@ -545,7 +554,8 @@ def run_search(
         **options: options of `attacks.search`. By default no candidate is rendered
             again.
     """
-    evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
+    evaluate_query = partial(evaluate, renderer, loss, spp)
+    evaluate_all = partial(map, evaluate_query)  # called with the queries
     return workbench.search(
         evaluate_all,
         make_domain(renderer, start),

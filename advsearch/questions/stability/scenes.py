@@ -78,7 +78,7 @@ def make_exposure_arguments(control: str, low: float, high: float) -> dict[str, 
     is_upper_end = high > 0.0
     return {
         "controls": {control: {"exposure": [low, high]}, "texture": {"resolution": 8}},
-        "u": {0: 1.0 if is_upper_end else 0.0},
+        "u": {0: 1.0 if is_upper_end else 0.0},  # by the index of the value
         "slow": control == "environment",
     }
 
@@ -196,7 +196,7 @@ def _load_environment(radiance: assets.Float32Array, as_file: bool) -> None:
         renderer = make_renderer(
             TEXTURE, environment=assets.EnvironmentAsset("made", radiance)
         )
-        render_image(renderer, renderer.start, 0, 1)
+        render_image(renderer, renderer.start, seed=0, spp=1)
 
 
 REFUSED = "The map is refused before anything is rendered."
@@ -229,7 +229,7 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
             renderer, _darkness, PLATEAU_STEPS, spp=2, start=start, policy=policy
         )
         n_flat += sum(record.gradient_norm == 0.0 for record in result.history)
-        # An objective above 0 is an image that is not white; see `_darkness`.
+        # `_darkness` is above 0 if the image is not white.
         is_darker = result.best_objective > 0.0
         checks.append(
             check_condition(
@@ -237,10 +237,13 @@ def leave_plateau(low: float, high: float) -> CaseOutcome:
             )
         )
         endings.append(f"{policy.name}: {result.ending.value}")
-    slope = evaluate(renderer, _darkness, 2, start_query).gradient
-    assert slope is not None
+    start_gradient = evaluate(renderer, _darkness, 2, start_query).gradient
+    assert start_gradient is not None
     start_check = check_range(
-        "gradient at the start", float(slope.abs().max()), 0.0, 0.0
+        "gradient at the start",
+        float(start_gradient.abs().max()),
+        min_value=0.0,
+        max_value=0.0,
     )
     return CaseOutcome(
         [start_check, *checks],
@@ -342,9 +345,9 @@ def look_through_glass() -> CaseOutcome:
         "texture": {"resolution": 8},
         "environment": {"exposure": [-1.0, 1.0]},
     }
-    # `check_scene` compares the gradient by all texels with finite differences. An
-    # empty `other_scene` is the same scene without the glass, from which the image has
-    # to differ.
+    # `check_scene` compares the gradient with finite differences. An empty `other_scene`
+    # is the scene with the same controls and no plugin, thus without the glass. The
+    # image has to differ from it.
     return check_scene(
         controls, plugins=make_glass_ball(), other_scene={}, difference=(0.01, None)
     )
@@ -359,8 +362,7 @@ def texels_at_the_ends() -> CaseOutcome:
     """
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = make_renderer(controls, make_checkered_mug)
-    # The first value is the derivative from the gradient, the second that from finite
-    # differences.
+    # the derivatives from the gradient and from finite differences
     slope, expected_slope = measure_inward_slope(
         renderer,
         _compute_mean_gradient(renderer),
@@ -544,8 +546,8 @@ def make_mesh_arguments(
 
     Args:
         thing: the object.
-        other_object: an object that looks the same from the front; None compares with
-            none.
+        other_object: an object that looks the same from the front. Its image is
+            compared with that of the first; None compares nothing.
     """
     other_scene: dict[str, object] = {}
     if other_object:
@@ -778,8 +780,8 @@ def gimbal() -> CaseOutcome:
             "on_ground": "no",
         }
     }
-    # At this pitch, a yaw of 36 degrees gives the same pose as a roll of -36. In u,
-    # whose values are fractions of the ranges, these are 0.7 and 0.3.
+    # At this pitch, a yaw of 36 degrees gives the same pose as a roll of -36. In u these
+    # are the fractions 0.7 and 0.3 of the range from -90 to 90.
     yawed_u = [0.7, 0.5, 0.5]
     rolled_u = [0.5, 0.5, 0.3]
     by_angles = make_renderer(angles, make_dark_mug, settings=NO_GROUND)
@@ -827,7 +829,8 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
     difference = compute_mean_difference(
         render_image(renderer, zero), render_image(renderer, full)
     )
-    # 1 in u is 360 degrees, which is the same as 0. So a step past it goes on from 0.
+    # 1 in u is 360 degrees, the same as 0. So a step of 0.01 past it has to lead to
+    # 0.01.
     past_end = make_domain(renderer).project(full + 0.01)
     return check_scene(controls, u=[0.0], compare=False).with_checks(
         check_range(
@@ -844,8 +847,8 @@ def full_turn(controls: ControlSettings) -> CaseOutcome:
         check_range(
             "where a step of 0.01 past the end goes",
             float(past_end.max()),
-            0.0099,
-            0.0101,
+            min_value=0.0099,
+            max_value=0.0101,
         ),
     )
 
@@ -1009,7 +1012,8 @@ def _measure_shift_slope(half_width: float) -> float:
     for seed in range(6):
         _, gradient = renderer.gradient(loss, renderer.start, seed, 32)
         derivatives.append(float(gradient[0]))
-    # The derivatives are by u, which goes from 0 to 1 over the range.
+    # The derivatives are by u, which goes from 0 to 1 over the range. Divided by the
+    # width of the range, they are by the shift.
     return statistics.fmean(derivatives) / (2.0 * half_width)
 
 
@@ -1018,7 +1022,7 @@ def light_rotation_texel() -> CaseOutcome:
     """All three move, the condition number is printed, and the objective's unit does
     not matter.
 
-    The search is over the power of a light, a rotation and texels, whose units and
+    The three are the power of a light, a rotation and texels, whose units and
     curvatures differ. A search of the same objective times 1e6 has to take the same
     path. The condition number is that of the Hessian.
     """
@@ -1031,9 +1035,10 @@ def light_rotation_texel() -> CaseOutcome:
     u = renderer.start.clone()
     u[:2] = torch.tensor([0.5, 0.1])  # power and rotation; texels follow
     hessian = _estimate_three_curvatures(renderer, u)
-    # Derivatives by u become derivatives by watts, degrees and sRGB: one watt is 1/12
-    # of the range of the power, and so on.
-    from_unit_box = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
+    # One watt is 1/12 in u, as the range of the power is 12 W; one degree is 1/360; and
+    # sRGB values of texels are those in u.
+    unit_in_u = torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double()
+    hessian_in_units = torch.diag(unit_in_u) @ hessian @ torch.diag(unit_in_u)
     path, _ = _record_path(renderer, u, scale=1.0)
     scaled_path, ending = _record_path(renderer, u, scale=RATIO)
     distances = (path - path[0]).abs().amax(dim=0)
@@ -1054,7 +1059,7 @@ def light_rotation_texel() -> CaseOutcome:
         measurements={
             "condition number in u": condition_number(hessian),
             "condition number in watts, degrees and sRGB": condition_number(
-                from_unit_box @ hessian @ from_unit_box
+                hessian_in_units
             ),
         },
     )
@@ -1063,17 +1068,17 @@ def light_rotation_texel() -> CaseOutcome:
 def _estimate_three_curvatures(renderer: gradients.Renderer, u: Tensor) -> Tensor:
     """Estimate second derivatives (3, 3) by power, by rotation, and by all texels.
 
-    The configuration is power, rotation, and texels, in this order. The third direction
-    changes all texels equally.
+    A configuration has the power, the rotation, and the texels, in this order. The
+    third direction changes all texels equally.
     """
     loss = gradients.make_smooth_loss(renderer.formation.resolution)
     directions = torch.zeros(3, len(u))
     directions[0, 0] = 1.0
     directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
-    # Steps have to be large enough for the noise. The rotation moves the object, and
-    # has a step of its own.
-    _, rotation_group, *_ = renderer.plan.groups
+    # Steps of the differences by power, rotation and texels, large enough for the noise.
+    # The plan has a group for each parameter; that of the rotation is the second.
+    rotation_group = renderer.plan.groups[1]
     steps = [0.2, rotation_group.step * 2.0, 0.08]
 
     def objective(configuration: Tensor) -> float:
@@ -1152,7 +1157,7 @@ def heavy_render(count: int = 24) -> CaseOutcome:
         _, gradient = renderer.gradient(loss, renderer.start, seed, 4)
         gradient_samples.append(gradient)
     slopes = torch.stack(gradient_samples).double()
-    # `median` is over all samples and entries.
+    # There is one entry, the derivative by the shift.
     distance = (slopes - slopes.median()).abs()
     return check_scene(controls, compare=False, spp=4).with_checks(
         check_range(

@@ -136,21 +136,15 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         InputError, UnknownNameError: the name or the values cannot be used.
     """
     where = f"`grid` {name}"
-    # An instance may follow the kind, as in KIND:INSTANCE.PARAMETER, or the parameter,
-    # as in KIND.PARAMETER:INSTANCE.
-    control_name, _, rest = name.partition(".")
-    kind, kind_colon, kind_instance = control_name.partition(":")
-    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
-    instance = control_name
-    if control_name not in instances:
-        instance = families.make_instance_name(
-            kind, parameter_instance or kind_instance
-        )
     # Names such as "model" are settings and no controls.
     if name in _LISTED_SETTINGS:
         raise InputError(
             f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
         )
+    kind, parameter_name, colon_instance = _split_axis_name(name)
+    instance = name.partition(".")[0]  # if the name is INSTANCE.PARAMETER
+    if instance not in instances:
+        instance = families.make_instance_name(kind, colon_instance or "")
     control = _find_control(instances, kind, instance, where)
     if kind == MITSUBA_CONTROL:
         # mitsuba:KEY, and a key may itself contain dots and colons
@@ -162,9 +156,8 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
-    # A colon without a name after it is rejected.
-    if parameter_colon or kind_colon:
-        families.check_instance_name(where, parameter_instance or kind_instance)
+    if colon_instance is not None:
+        families.check_instance_name(where, colon_instance)  # raises if it is empty
     if parameter_name not in parameters:
         raise UnknownNameError(
             f"parameter of control {control.kind}",
@@ -175,11 +168,25 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     parameter = parameters[parameter_name]
     _check_scalar(where, control, parameter, instance)
     return Axis(
-        control.kind,
-        instance,
-        parameter,
-        parse_axis_values(where, parameter, values),
+        control_kind=control.kind,
+        control_name=instance,
+        parameter=parameter,
+        values=parse_axis_values(where, parameter, values),
     )
+
+
+def _split_axis_name(name: str) -> tuple[str, str, str | None]:
+    """Return kind, parameter and instance in the name of an axis.
+
+    The instance follows a colon after the kind, as in KIND:INSTANCE.PARAMETER, or after
+    the parameter, as in KIND.PARAMETER:INSTANCE. It is None if there is no colon.
+    """
+    control_name, _, rest = name.partition(".")
+    kind, kind_colon, kind_instance = control_name.partition(":")
+    parameter_name, parameter_colon, parameter_instance = rest.partition(":")
+    if not kind_colon and not parameter_colon:
+        return kind, parameter_name, None
+    return kind, parameter_name, parameter_instance or kind_instance
 
 
 def _find_control(
@@ -220,7 +227,7 @@ def _find_parameters(
     Args:
         values: values of the axis; some classes declare a parameter by its values.
         instances: the sampled controls by name.
-        control: the class of the control.
+        control: the class of the control, a subclass of `Control`.
         parameter_name: parameter name of the axis.
         instance: name of the control. If it is one of `instances`, it may have
             parameters in addition to those of its class; these are returned, too.
@@ -250,10 +257,10 @@ def _parse_key_axis(name: str, values: Any, control: Any) -> Axis:
         )
     (parameter,) = control.declare_parameters([key])
     return Axis(
-        MITSUBA_CONTROL,
-        MITSUBA_CONTROL,
-        parameter,
-        parse_axis_values(where, parameter, values),
+        control_kind=MITSUBA_CONTROL,
+        control_name=MITSUBA_CONTROL,  # there is only one
+        parameter=parameter,
+        values=parse_axis_values(where, parameter, values),
     )
 
 
@@ -264,20 +271,19 @@ def _check_scalar(
 
     Args:
         where: the axis, as messages name it.
-        control: class of the control. A control with an image among its parameters (a
-            texture) has no axes at all.
+        control: class of the control.
         parameter: the parameter of the axis.
         instance: name of the control, for the message.
 
     Raises:
-        InputError: the parameter has several numbers.
+        InputError: the parameter has several numbers, or the control has an image (a
+            texture) among its parameters.
     """
     has_images = any(len(declared.shape) > 1 for declared in control.parameters)
     if has_images or parameter.shape != ():
         raise InputError(
             f"{where}: expected a parameter that is one number or name, got one that "
-            "is many numbers; draw it "
-            f"by chance with `controls` {instance} `samples=100`"
+            f"is many numbers; draw it by chance with `controls` {instance} `samples=100`"
         )
 
 
@@ -496,8 +502,8 @@ def _sampled_settings(control: Control, scene: SceneDescription) -> dict[str, ob
 
     If no parameter of a control has a stated range, all of them are sampled in their
     default ranges. If one has, only those with stated ranges are sampled. An axis of
-    the grid counts as a stated range. So the default ranges of the other parameters
-    are stated here; else they would no longer vary.
+    the grid will state a range of one parameter. The default ranges of the others are
+    stated here, so that these still vary.
     """
     # Kind and name are no parameters: the class and the instance state them.
     settings = {
@@ -547,12 +553,10 @@ class SampledNumber:
     @property
     def varied_value(self) -> VariedValue:
         """The range or the options that the value was sampled from."""
-        bounds = [
-            bound
-            for part in self.range_parts
-            if isinstance(part, list)
-            for bound in part
-        ]
+        bounds = list[float]()
+        for part in self.range_parts:
+            if isinstance(part, list):  # [lower, upper]; else it is an option
+                bounds += part
         if bounds:
             return VariedValue(unit=self.unit, low=min(bounds), high=max(bounds))
         return VariedValue(
@@ -589,12 +593,16 @@ class _SampledBlock(NamedTuple):
     """A block of coordinates that is sampled.
 
     Attributes:
+        control: name of the control.
+        parameter: name of its parameter whose coordinates these are.
         block: norm and budget of the coordinates.
         coordinates: their columns in a configuration.
         columns: their columns among the draws. A ball has one column more than
             coordinates, for the length.
     """
 
+    control: str
+    parameter: str
     block: Block
     coordinates: slice
     columns: slice
@@ -622,7 +630,7 @@ class SceneConfigurations:
         space: the controls, bound to the scene; it starts from the scene as it is.
         domain: the budgets of the controls.
         axes: axes of the grid.
-        samples_per_grid_point: number of samples at each point of the grid.
+        samples: number of samples at each point of the grid.
         sampler: how the draws are made, "sobol" or "random".
         seed: seed of the draws.
         repeat_after_scenes: number of scenes after which the draws repeat, so that
@@ -633,7 +641,8 @@ class SceneConfigurations:
 
     Attributes:
         n_images: number of images of the scene.
-        parts_per_range: number of parts into which tables divide the range of a sampled number.
+        parts_per_range: number of parts into which tables divide the range of a sampled
+            number.
         sampled_numbers: the sampled numbers that tables count by.
         sampled_layout: describes which numbers are sampled: the number of draws of
             small blocks, and name, column and number of parts of each sampled number.
@@ -665,13 +674,14 @@ class SceneConfigurations:
         self._lower = domain.lower_bounds.numpy()
         self._upper = domain.upper_bounds.numpy()
         self._axes = {axis.name: (index, axis) for index, axis in enumerate(axes)}
-        # `_assign_blocks` fills these lists. Small blocks, those of few numbers, share
-        # the sequence of the sampler. Large ones have random draws, since Sobol
-        # sequences are for few dimensions.
+        # A block is the coordinates of one parameter. Small blocks share the sequence
+        # of the sampler. Large ones have random draws, since Sobol sequences are for
+        # few dimensions.
         self._grid_coordinates: list[_GridCoordinate] = []
         self._small_blocks: list[_SampledBlock] = []
         self._large_blocks: list[_SampledBlock] = []
-        self.sampled_numbers = tuple(self._assign_blocks(domain))
+        self._assign_blocks(domain)  # fills the three lists
+        self.sampled_numbers = tuple(self._list_sampled_numbers())
         n_small = _count_columns(self._small_blocks)
         n_large = _count_columns(self._large_blocks)
         self._small_draws = SampleSequence(n_small, sampler, seed)
@@ -684,7 +694,8 @@ class SceneConfigurations:
             images_until_repeat=repeat_after_scenes * self.n_images,
             n_photographs=n_photographs,
         )
-        # of each sampled number: its column among the draws, and its number of bins
+        # Column of each sampled number among the draws, and number of equal bins of
+        # [0, 1]: a part of its range has one bin, an option with a weight several.
         self._columns = [number.draw_column for number in self.sampled_numbers]
         n_bins = [
             len(number.part_of_bin or number.range_parts)
@@ -715,9 +726,9 @@ class SceneConfigurations:
             n_photographs: number of photographs in the folder of photographs; 1 without
                 one.
         """
-        # If nothing is sampled, the samples of a grid point are repeats of one draw,
-        # each with its own noise.
+        # If nothing is sampled, the images of a grid point differ only in noise.
         n_draws = self.samples_per_grid_point if self.is_sampled else 1
+        images_per_draw = self.samples_per_grid_point // n_draws
         time_axis = next(
             (index for index, axis in enumerate(axes) if axis.is_time), None
         )
@@ -728,28 +739,21 @@ class SceneConfigurations:
             frames=time_axis,
             samples=n_draws,
             again=images_until_repeat,
-            noise=self.samples_per_grid_point // n_draws,
+            noise=images_per_draw,
             photographs=n_photographs,
             scene=images_per_scene,
         )
 
-    def _assign_blocks(self, domain: Domain) -> Iterator[SampledNumber]:
+    def _assign_blocks(self, domain: Domain) -> None:
         """Decide for each block of coordinates where its values come from.
 
-        A block is the coordinates of one parameter. If the parameter is an axis of the
-        grid, its values come from the axis. Otherwise they come from columns of the
-        draws: one for each coordinate, and for a ball (L2 norm) one more for the
-        length. As a side effect this fills `_grid_coordinates`, `_small_blocks` and
-        `_large_blocks`.
+        If the parameter of a block is an axis of the grid, its values come from the
+        axis. Otherwise they come from columns of the draws: one for each coordinate,
+        and for a ball (L2 norm) one more for the length.
 
         Args:
             domain: the blocks of all controls, with their norms and budgets.
-
-        Yields:
-            The sampled numbers that tables count by: those of parameters with few
-            components and a known range.
         """
-        controls = {control.name: control for control in self.space.controls}
         for group, (block, coordinates) in zip(
             self.space.groups, domain.list_block_slices(), strict=True
         ):
@@ -762,18 +766,33 @@ class SceneConfigurations:
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
             first_column = _count_columns(blocks)  # the first that is free
-            # A draw in a ball needs one number more than a draw in a box: its length.
-            is_ball = block.norm == "l2"
-            n_columns = block.size + 1 if is_ball else block.size
+            n_columns = block.size + 1 if block.norm == "l2" else block.size
             columns = slice(first_column, first_column + n_columns)
-            blocks.append(_SampledBlock(block, coordinates, columns))
-            control = controls[group.control]
-            # The range of a component is known unless it is in a ball, or the control
-            # declares no slots (parameters with a range).
+            blocks.append(
+                _SampledBlock(
+                    group.control, group.parameter, block, coordinates, columns
+                )
+            )
+
+    def _list_sampled_numbers(self) -> Iterator[SampledNumber]:
+        """Yield the sampled numbers that tables count by.
+
+        They are those of parameters with few components and a known range.
+        """
+        controls = {control.name: control for control in self.space.controls}
+        # A parameter with few components is a small block.
+        for sampled in self._small_blocks:
+            control = controls[sampled.control]
+            # A component of a ball has no range of its own. Without slots, a control
+            # declares no ranges.
+            is_ball = sampled.block.norm == "l2"
             has_ranges = bool(control.parameter_slots) and not is_ball
-            if has_ranges and block.size <= MAX_TABLE_COMPONENTS:
+            if has_ranges and sampled.block.size <= MAX_TABLE_COMPONENTS:
                 yield from self._describe_sampled(
-                    control, group.parameter, coordinates, first_column
+                    control,
+                    sampled.parameter,
+                    sampled.coordinates,
+                    sampled.columns.start,
                 )
 
     def _describe_sampled(
@@ -844,7 +863,7 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the full sweep.
-            n_images: number of consecutive images of one scene.
+            count: number of consecutive images of one scene.
 
         Returns:
             (count, k) indices among `parts` of each of `sampled_numbers`.
@@ -867,8 +886,8 @@ class SceneConfigurations:
         In a comparison, the images with the adversarial scene repeat the draws of those
         without it. They have the same noise, too, so that only the scene differs.
         """
-        images_until_repeat = self.independent_units.again  # 0 if draws never repeat
-        return number % images_until_repeat if images_until_repeat else number
+        n_clean_images = self.independent_units.again  # 0 without a comparison
+        return number % n_clean_images if n_clean_images else number
 
     def _sample(self, draws: SampleSequence, first: int, count: int) -> Float64Array:
         """Return the draws (count, k) of consecutive images.
@@ -879,15 +898,17 @@ class SceneConfigurations:
         Args:
             draws: draws of k numbers.
             first: number of the first image in the full sweep.
-            n_images: count of images.
+            count: number of images.
         """
-        if self.independent_units.frames is None:
-            return draws.points(self.independent_units.find_draw(first), count)
-        points = [
-            draws.points(self.independent_units.find_draw(number), 1)
-            for number in range(first, first + count)
-        ]
-        return np.concatenate(points) if points else draws.points(0, 0)
+        units = self.independent_units  # maps the number of an image to its draw
+        if count == 0:
+            return draws.points(0, 0)
+        if units.frames is None:
+            return draws.points(units.find_draw(first), count)
+        image_numbers = range(first, first + count)
+        return np.concatenate(
+            [draws.points(units.find_draw(number), 1) for number in image_numbers]
+        )
 
     def _axis_indices(self, first: int, count: int) -> tuple[NDArray[np.intp], ...]:
         """Return the indices (count,) of consecutive images on each axis.
@@ -906,23 +927,23 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the scene.
-            n_images: number of images.
-            before: number of images of the scenes before this one. They have used the
-                draws before `before`; the grid starts anew in every scene.
+            count: number of images.
+            before: number of images of the scenes before this one, which use the draws
+                before those of this scene. The grid starts anew in every scene.
         """
         u = np.repeat(self._start[None], count, axis=0)
         indices = self._axis_indices(first, count)
         for column, axis in self._grid_coordinates:
             # The coordinate of a choice is the center of its part of [0, 1].
             u[:, column] = (indices[axis] + 0.5) / self.grid.sizes[axis]
-        # Small blocks share the sampler's sequence; large ones have random draws.
+        first_in_sweep = before + first
         for draws, blocks in (
             (self._small_draws, self._small_blocks),
             (self._large_draws, self._large_blocks),
         ):
             if not blocks:
                 continue
-            samples = self._sample(draws, before + first, count)
+            samples = self._sample(draws, first_in_sweep, count)
             for sampled in blocks:
                 u[:, sampled.coordinates] = self._transform(
                     sampled, samples[:, sampled.columns]
@@ -968,9 +989,9 @@ class SceneConfigurations:
 
     @property
     def environment(self) -> str | None:
-        """The environment that lights all images instead of that of the scene.
+        """The environment that a control fixes for all images, such as "noon".
 
-        None if the scene's own does, or if the environment varies.
+        None if that of the scene lights them, or if the environment varies.
         """
         # A group is the coordinates of one parameter.
         varies = any(group.setting == ENVIRONMENT for group in self.space.groups)
@@ -1038,7 +1059,7 @@ class SceneConfigurations:
             control_u: (k,) the coordinates of the control in `u`.
             axis_points: the axes of the control, with the index of the value of each.
         """
-        # A description is stored below only if these indices determine it.
+        # Only descriptions that follow from these indices are cached.
         key = (control.name, *(index for _, index in axis_points))
         cached = self._description_cache.get(key)
         if cached is not None:
@@ -1049,9 +1070,9 @@ class SceneConfigurations:
             description = dict(control.describe(control_u))
         for axis, index in axis_points:
             description[axis.name] = {"value": axis.values[index], "unit": axis.unit}
-        # Only a description that follows from the axes alone holds for other images.
-        is_all_in_grid = len(axis_points) == len(control.groups)
-        follows_from_axes = is_all_in_grid and not control.refines
+        # A control has a group for each of its parameters.
+        are_all_on_axes = len(axis_points) == len(control.groups)
+        follows_from_axes = are_all_on_axes and not control.refines
         has_room = len(self._description_cache) < MAX_CACHED_DESCRIPTIONS
         if follows_from_axes and has_room:
             self._description_cache[key] = description

@@ -187,7 +187,7 @@ def sweep(
         naming.check_no_scene_settings(set_options)
     described |= _describe_scenes(scenes, loaded)
     run_setting = {"run": None if run is None else str(run)}
-    # A later mapping overrides the values of earlier ones.
+    # A later mapping overrides earlier ones: what is passed overrides the attack.
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
     config = config.with_python_only_parts(
         _find_python_only(config, networks, loaded, task, tracker, controls)
@@ -214,8 +214,8 @@ def _resolve_task(task: AnyTask, defaults: Mapping[str, Any]) -> AnyTask:
         task: task as the caller passed it.
         defaults: settings of the attack; empty without one.
     """
-    # A task that is passed as "classification" cannot be distinguished from the
-    # default: it is replaced by that of the attack, too.
+    # "classification" is the default of the argument. So a caller who passes it gets
+    # the task of the attack, too.
     if task == "classification":
         task = defaults.get("task", task)
     return make_task(task) if callable(task) else task
@@ -342,7 +342,8 @@ def _describe_scenes(
         loaded: the loaded ones: all of them or none.
     """
     if not loaded:
-        # `scene` may list several names, as "mug,bowl"; spaces and empty names go.
+        # `scene` may list several names, as "mug, bowl": spaces and empty names are
+        # removed.
         names = [
             ",".join(split_names(scene)) if isinstance(scene, str) else str(scene)
             for scene in scenes
@@ -387,7 +388,7 @@ def _find_python_only(
     ]
     if any(scene.scene.is_session_only for scene in scenes):
         parts.append(PythonOnly("scene"))
-    # `is_describable_by_setting` compares the task with the one that is made from its setting.
+    # A task is describable if its setting makes an equal one.
     if isinstance(task, Task) and not is_describable_by_setting(task, make_task):
         parts.append(PythonOnly("task", task.name))
     parts += [
@@ -453,7 +454,7 @@ def _run_config(
     resumed = _find_resumable(config)
     # The directory of a new run is created before the work starts. A sweep without
     # `run` has no directory: `directory` is None below.
-    context: Any = nullcontext(resumed)
+    context: Any = nullcontext(resumed)  # of the directory, as `with` returns it
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
         context = create_before_work(config)
@@ -487,7 +488,7 @@ def _find_resumable(config: SweepConfig) -> Path | None:
     has_run = is_run(path) and config_file.is_file()
     if config.overwrite or not has_run:
         return None
-    # The stored settings are in the form that `make_repeatable` returns.
+    # `make_repeatable` returns the settings as a run stores them.
     stored = SweepConfig.from_yaml(config_file, config.session_settings)
     has_same_settings = stored.to_json() == config.make_repeatable().to_json()
     can_continue = has_same_settings and not is_finished(path)
@@ -657,11 +658,13 @@ def _make_job(
     Raises:
         InputError: something in the settings does not fit together.
     """
-    # These settings need a control that travels along the path. With a `path`, they are
-    # set to None for the check, since `add_frame_axis` adds such a control if there is
-    # none.
-    unchecked = ("path", "shutter", "rolling") if config.path is not None else ()
-    naming.check_run_settings(config.model_copy(update=dict.fromkeys(unchecked)))
+    checked_config = config
+    if config.path is not None:
+        # These settings need a control that travels along the path. They are left out
+        # of the check, since `add_frame_axis` adds such a control if there is none.
+        no_path = {"path": None, "shutter": None, "rolling": None}
+        checked_config = config.model_copy(update=no_path)
+    naming.check_run_settings(checked_config)
     sampled = make_configured_controls(config, controls)
     grid = config.grid
     if config.path is not None:
@@ -730,6 +733,7 @@ def _set_camera_units(
     axes: Sequence[Axis], named_scenes: Sequence[NamedScene]
 ) -> tuple[Axis, ...]:
     """Return the axes, with those of cameras in meters if all objects have a size."""
+    # Without a size in meters, distances are in sizes of the object.
     are_sized = all(
         named_scene.scene.description.object.size_in_metres is not None
         for named_scene in named_scenes
@@ -779,7 +783,8 @@ def _load_models_and_tasks(
         )
         for network in networks
     )
-    # A task of each thing has no remarks itself, so they are collected before.
+    # Remarks are collected before `make_each_thing_task` wraps the tasks below: the
+    # wrappers have none.
     warnings += [
         remark for network_task in tasks for remark in network_task.output_remarks
     ]
@@ -810,9 +815,11 @@ def _find_scene_notes(
     notes = list[str]()
     for named_scene in named_scenes:
         description = named_scene.scene.description
+        # the sampled controls, and those of the axes
         for control in add_grid_axes(controls, axes, description):
             if control.kind == ENVIRONMENT:
-                # `prepare` loads the environments and adds the notes on their files.
+                # `prepare` loads the environments. It returns a description that also
+                # has the notes on their files.
                 description = control.prepare(description)
         notes += description.notes
     return notes
@@ -844,7 +851,7 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
         return [NamedScene(config.object, name, session_scene)]
     objects = naming.check_distinct(config.objects, "object")
     environments = naming.check_distinct(config.environments, "environment")
-    # Without the setting, `environments` has a default that does not apply here.
+    # Without the setting, `config.environments` is a default that is not used here.
     first_environment = environments[0] if config.environment else None
     scenes = {
         name: naming.load_configured_scene(config, name, first_environment)
@@ -890,7 +897,8 @@ def expand_photographs(
         getattr(config.find_control_type(name), "kind", "")
         for name in control_names
     ]
-    if BACKDROP in kinds:
+    chooses_photograph = BACKDROP in kinds
+    if chooses_photograph:
         return tuple(scenes)
     expanded = list[NamedScene]()
     for named_scene in scenes:

@@ -134,14 +134,16 @@ def draw_sweep_on(summary: SweepSummary, axes: Any) -> None:
 def _list_single_axis(summary: SweepSummary) -> Sequence[AxisRow]:
     """Return the rows of the axis of a sweep that has a single axis.
 
-    The list is empty if there are more axes, or too many values. If the sweep has axes
-    with listed values and axes with parts of a range, the latter are ignored.
+    The list is empty if there are more axes, or too many values. Ranges count as axes
+    only if no axis has single values.
     """
     # The value of a part of a range is its two bounds.
-    rows = [row for row in summary.axes if not isinstance(row.value, (list, tuple))]
-    rows = rows or summary.axes
-    names = {row.axis for row in rows}
-    return rows if len(names) == 1 and len(rows) <= MAX_POINTS else ()
+    rows_of_values = [
+        row for row in summary.axes if not isinstance(row.value, (list, tuple))
+    ]
+    rows = rows_of_values or summary.axes
+    is_single_axis = len({row.axis for row in rows}) == 1
+    return rows if is_single_axis and len(rows) <= MAX_POINTS else ()
 
 
 def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
@@ -261,7 +263,8 @@ def _difference_text(part: SurfacePart) -> str:
     """Return the difference of two rates in percent, with its interval if it has one."""
     low, high = part.interval
     difference = f"{part.difference:+.0%}"
-    has_interval = not math.isnan(low)  # there is none if images share draws
+    # The bounds are NaN if images share draws, and so are not independent.
+    has_interval = not math.isnan(low)
     if has_interval:
         difference += f" ({low:+.0%} to {high:+.0%})"
     return difference.replace("%", " %")
@@ -381,15 +384,15 @@ def _make_text_sections(
         yield ResultPart(title, [sentences])
 
 
-def _make_arms_table(answer: str, pair: PairedRates, task: str) -> ResultPart:
+def _make_arms_table(adversarial_run: str, pair: PairedRates, task: str) -> ResultPart:
     """Return a table of one model without and with an adversarial configuration.
 
     Args:
-        answer: name of the adversarial run.
-        pair: counts of the model in both arms.
+        adversarial_run: name of the run that found the configuration.
+        pair: counts of the model in both scenes.
         task: name of the task.
     """
-    arms = (("clean", pair.clean), (answer, pair.adversarial))
+    arms = (("clean", pair.clean), (adversarial_run, pair.adversarial))
     has_outcomes = any(counts.outcomes for _, counts in arms)
     rows = []
     for name, counts in arms:
@@ -408,10 +411,10 @@ def _describe_worst_configuration(summary: SweepSummary) -> str:
     values = summary.worst.values
     # Values such as "mug, studio" explain themselves, and are listed without names.
     names = ("object", "environment", "backdrop", "model")
-    names_to_omit = [name for name in names if name in values]
-    texts = [shorten_name(values[name].value) for name in names_to_omit]
+    self_explaining = [name for name in names if name in values]
+    texts = [shorten_name(values[name].value) for name in self_explaining]
     for name, described in values.items():
-        if name not in names_to_omit:
+        if name not in self_explaining:
             texts.append(f"{name} {wording.format_parameter_value(described.value)}")
     return ", ".join(texts)
 
@@ -609,9 +612,11 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
     if distance:
         yield make_claim("measured", describe_detection_distance(distance), None)
     for rates in result.drives or ():
-        heads = "mean, with its interval over drives, then the worst drive"
+        contents = "mean, with its interval over drives, then the worst drive"
         values = "; ".join(_format_drive_clause(*row) for row in make_drive_rows(rates))
-        yield make_claim("measured", f"{drive_title(rates)} ({heads}): {values}.", None)
+        yield make_claim(
+            "measured", f"{drive_title(rates)} ({contents}): {values}.", None
+        )
     verified = result.worst.verified if result.worst else None
     if verified is not None:
         yield make_claim(
@@ -630,42 +635,47 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
     draws without a grid, and for random drives.
     """
     is_sampled = result.sampler is not None
-    is_imported = not is_sampled and not result.grid
-    are_draws_dependent = result.sampler != "random" or bool(result.grid)
-    if is_imported:
+    if not is_sampled and result.grid:
+        return _describe_grid_population(result)
+    if not is_sampled:
         population = "configurations"
         if result.drives:
             population = _name_frames(result.drives)
         note = (
             " How these were selected is unknown; the interval takes them as a sample."
         )
-    elif not is_sampled:
-        population = "points of the grid"
-        if result.drives:
-            frames = _name_frames(result.drives)
-            population = f"{frames}, whose paths and times were selected"
-        note = (
-            " This states nothing about what lies between or outside of these points, "
-            "and another grid gives another fraction; the interval takes the points as "
-            "a sample."
-        )
-    elif result.drives:
+        return population, note
+
+    if result.drives:
         # The frames are the grid; what else differs between drives is sampled.
         population = (
             f"{_name_frames(result.drives)}; what else differs between drives is drawn "
             f"at random ({result.sampler})"
         )
-        note = ""
-        if result.sampler != "random":
-            note = " The interval is over drives, as if these were independent."
-    elif are_draws_dependent:
-        population = f"configurations drawn at random ({result.sampler})"
-        if result.grid:
-            population += " at each point of a grid"
-        note = " The interval is that of independent draws, which these are not."
-    else:
-        population = "configurations drawn at random from the stated ranges"
-        note = ""
+        note = " The interval is over drives, as if these were independent."
+        return population, "" if result.sampler == "random" else note
+
+    has_independent_draws = result.sampler == "random" and not result.grid
+    if has_independent_draws:
+        return "configurations drawn at random from the stated ranges", ""
+    population = f"configurations drawn at random ({result.sampler})"
+    if result.grid:
+        population += " at each point of a grid"
+    note = " The interval is that of independent draws, which these are not."
+    return population, note
+
+
+def _describe_grid_population(result: SweepSummary) -> tuple[str, str]:
+    """Return what the rates of a grid without samples are over, and a caution."""
+    population = "points of the grid"
+    if result.drives:
+        frames = _name_frames(result.drives)
+        population = f"{frames}, whose paths and times were selected"
+    note = (
+        " This states nothing about what lies between or outside of these points, "
+        "and another grid gives another fraction; the interval takes the points as "
+        "a sample."
+    )
     return population, note
 
 
@@ -675,19 +685,19 @@ def _name_frames(drives: Sequence[DriveRates]) -> str:
 
 
 def _make_arm_claims(
-    answer: str, pair: PairedRates, population: str, note: str
+    adversarial_run: str, pair: PairedRates, population: str, note: str
 ) -> Iterator[Claim]:
     """Yield the accuracy without and with an adversarial configuration.
 
     Args:
-        answer: name of the adversarial run.
-        pair: counts of one model in both arms.
+        adversarial_run: name of the run that found the configuration.
+        pair: counts of one model in both scenes.
         population: description of what the rates are over, "points of the grid" say.
         note: a caution about the interval.
     """
     arms = {
         "the clean scene": pair.clean,
-        f"the adversarial scene of {answer}": pair.adversarial,
+        f"the adversarial scene of {adversarial_run}": pair.adversarial,
     }
     for arm, counts in arms.items():
         extent = _make_accuracy_extent(
@@ -699,7 +709,7 @@ def _make_arm_claims(
             f"With {arm} {pair.model} is right in {accuracy} {population}.{note}",
             extent,
         )
-    yield make_claim("measured", format_paired_rates(answer, pair), None)
+    yield make_claim("measured", format_paired_rates(adversarial_run, pair), None)
 
 
 def _make_accuracy_claims(
@@ -720,14 +730,15 @@ def _make_accuracy_claims(
             fixed.append(f"each of the {n_values} {name}s")
     if fixed:
         population += f", as many in {' and '.join(fixed)}"
-    counts_by_model: dict[str, CountedPredictions] = {
-        f"The model {row.value}": row for row in result.axes if row.axis == "model"
-    }
     # Each model has a claim of its own: models get the same images, so that their
     # predictions are not independent of each other.
-    has_several_models = len(split_names(result.model)) > 1
-    if not has_several_models or not counts_by_model:
-        counts_by_model = {"The model": result}
+    counts_by_model = dict[str, CountedPredictions]()
+    if len(split_names(result.model)) > 1:
+        for row in result.axes:
+            if row.axis == "model":
+                counts_by_model[f"The model {row.value}"] = row
+    if not counts_by_model:
+        counts_by_model["The model"] = result
     for model, counts in counts_by_model.items():
         extent = _make_accuracy_extent(
             "configurations in which the model is right", counts
@@ -942,10 +953,10 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     # names of several objects or models stand with commas
     is_single = "," not in summary.object and "," not in summary.model
     is_comparison = summary.arms is not None
-    # Frames of a drive are not independent. Neither are images that share a draw, of
-    # which `units` is the number of draws.
+    # Frames of a drive are not independent. Neither are images that share a draw; then
+    # `units` is the number of draws.
     are_independent = summary.drives is None and summary.units is None
-    if not (is_detection and is_single and are_independent) or is_comparison:
+    if is_comparison or not (is_detection and is_single and are_independent):
         return None
     return compute_detection_distance(rows) if len(rows) > 1 else None
 
@@ -978,25 +989,26 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     significance = 0.025 / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
-    first = _find_first_beyond_dips(distances, dips)
-    falling = _fit_falling(k[first:], n[first:])  # the fitted fractions
-    # n images that are all right differ from one half if 2**-n < significance.
-    min_images: int | None = math.floor(-math.log2(significance)) + 1
-    if (n >= min_images).any():
-        min_images = None  # some distance has enough images
+    beyond_dips = slice(_find_first_beyond_dips(distances, dips), None)
+    fitted_fractions = _fit_falling(k[beyond_dips], n[beyond_dips])
+    # If each image is right with probability one half, n images are all right with
+    # probability 2**-n. The smallest n for which that is below the significance:
+    min_images = math.floor(-math.log2(significance)) + 1
+    has_enough_images = bool((n >= min_images).any())
     return DetectionDistance(
         unit=rows[0].unit,
         distances=distances,
         right_fractions=tuple((k / n).tolist()),
         intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
-        distance=_find_crossing(np.array(distances[first:]), falling),
+        distance=_find_crossing(np.array(distances[beyond_dips]), fitted_fractions),
         lower=low,
         upper=high,
-        min_images=min_images,
+        min_images=None if has_enough_images else min_images,
         loose_counts=_count_loose(rows),
         image_counts=tuple(n.tolist()),
         dips=dips,
-        is_above_half=bool(falling[-1] >= HALF),  # the last one is the smallest
+        # The last one is the smallest.
+        is_above_half=bool(fitted_fractions[-1] >= HALF),
     )
 
 
@@ -1039,7 +1051,7 @@ def _bound_distance(
     is_above_half = p_at_least < significance
     is_below_half = p_at_most < significance
     low = max(distance[is_above_half], default=None)
-    is_beyond_low = distance > (low or 0.0)  # all are, without a lower bound
+    is_beyond_low = distance > (0.0 if low is None else low)
     high = min(distance[is_below_half & is_beyond_low], default=None)
     return None if low is None else float(low), None if high is None else float(high)
 
@@ -1113,7 +1125,8 @@ def _clause_beyond_dips(
     """Return how often the model is right beyond the last dip of its detections.
 
     A dip is a distance at which the object is detected less often than farther away.
-    The clause follows the sentence about dips (`_dips_sentences`).
+    The clause follows the sentence about dips (`_dips_sentences`), to which its words
+    "Beyond that" refer.
 
     Args:
         estimate: estimate of the detection distance.
@@ -1162,9 +1175,7 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     """Return a sentence about dips, distances with fewer detections than farther away.
 
     It lists all significant dips. If none is significant, it has the dip with the
-    smallest p-value among those that contradict the estimate, if any. A dip contradicts
-    the estimate if fewer than half of its images are right, and either it is nearer
-    than the estimate or at least half of the images farther away are right.
+    smallest p-value among those that contradict the estimate, if any.
 
     Args:
         estimate: estimate of the detection distance.
@@ -1177,25 +1188,30 @@ def _dips_sentences(estimate: DetectionDistance, unit: str) -> list[str]:
     if significant:
         clauses = "; ".join(_dip_clause(dip, unit) for dip in significant)
         return [f"No one distance from which on it is seen: right in {clauses}."]
-    # The estimate states that up to this distance at least half of the images are
-    # right.
-    detected_until = estimate.distance or 0.0
-    if estimate.is_above_half:
-        detected_until = estimate.distances[-1]
-    contradicting = list[Dip]()
-    for dip in estimate.dips:
-        n_right, n_images = dip.counts
-        n_right_beyond, n_images_beyond = dip.counts_beyond
-        is_below_half = n_right < HALF * n_images
-        is_above_half_beyond = n_right_beyond >= HALF * n_images_beyond
-        is_nearer_than_estimate = dip.distance < detected_until
-        if is_below_half and (is_nearer_than_estimate or is_above_half_beyond):
-            contradicting.append(dip)
+    contradicting = [dip for dip in estimate.dips if _contradicts(dip, estimate)]
     if not contradicting:
         return []
     most_significant = min(contradicting, key=lambda dip: dip.p_value)
-    deepest = _dip_clause(most_significant, unit)
-    return [f"Nearer it is right less often: in {deepest}, which may be chance."]
+    clause = _dip_clause(most_significant, unit)
+    return [f"Nearer it is right less often: in {clause}, which may be chance."]
+
+
+def _contradicts(dip: Dip, estimate: DetectionDistance) -> bool:
+    """Return whether a dip contradicts an estimate of the detection distance.
+
+    Fewer than half of its images are right, although it is nearer than the estimate, or
+    although at least half of the images farther away are right.
+    """
+    # The estimate states that at least half of the images are right up to here.
+    detected_until = estimate.distance or 0.0
+    if estimate.is_above_half:
+        detected_until = estimate.distances[-1]
+    n_right, n_images = dip.counts
+    n_right_beyond, n_images_beyond = dip.counts_beyond
+    is_below_half = n_right < HALF * n_images
+    is_above_half_beyond = n_right_beyond >= HALF * n_images_beyond
+    is_nearer_than_estimate = dip.distance < detected_until
+    return is_below_half and (is_nearer_than_estimate or is_above_half_beyond)
 
 
 def _dip_clause(dip: Dip, unit: str) -> str:

@@ -74,6 +74,7 @@ def add_frame_axis(
     """
     travelling: Any = next((control for control in sampled if control.travels), None)
     if travelling is None:
+        # the control "path" with its defaults
         (travelling,) = make_configured_controls(config, {"path": {}})
         sampled = (*sampled, travelling)
     time_name = f"{travelling.name}.time"
@@ -117,8 +118,8 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
     """Return the nearest and the farthest distance that a drive of a sweep can have.
 
     The bounds do not depend on which drives were sampled: they are over all possible
-    paths, all times of the axis, and all scenes. So an interval of the mean distance
-    can use them.
+    paths, all times of the axis, and all scenes. The interval of the mean distance
+    needs such bounds.
 
     Args:
         job: the sweep.
@@ -132,15 +133,11 @@ def compute_distance_bounds(job: Job, axis: Axis) -> tuple[float, float] | None:
     lowest = math.inf
     highest = -math.inf
     for scene in range(len(job.scenes)):
-        for points in job.load_configurations_by_size(scene).values():
-            control: Any = next(
-                (
-                    control
-                    for control in points.space.controls
-                    if control.name == axis.control_name
-                ),
-                None,
-            )
+        for configurations in job.load_configurations_by_size(scene).values():
+            controls = {
+                control.name: control for control in configurations.space.controls
+            }
+            control: Any = controls.get(axis.control_name)
             if control is None or not control.travels:
                 return None
             # over all paths that the control can take
@@ -167,9 +164,9 @@ class _CompleteDrives(NamedTuple):
 class Drives:
     """The frames of every drive of a sweep.
 
-    The private arrays `_outcomes` (WRONG, RIGHT, ...) and `_row_numbers` (numbers of the rows)
-    have the axes (scenes, axes of the grid without the time ..., samples, models,
-    frames), with the frames in the order of their times. `_distance` has no axis for
+    The private arrays `_outcomes` (WRONG, RIGHT, ...) and `_row_numbers` (numbers of
+    the rows) have the axes (scenes, axes of the grid without the time ..., samples,
+    models, frames), with the frames in the order of their times. `_distance` has no axis for
     models, since all get the same images. `_path_of_step` has the name of the path of a
     row, and `_frame_of_step` its detected boxes; the keys are numbers of rows.
 
@@ -190,14 +187,14 @@ class Drives:
             job: the sweep, with an axis of times.
             rows: its rows so far.
         """
-        axis_index = find_time_axis(job.axes)
-        assert axis_index is not None
+        time_index = find_time_axis(job.axes)
+        assert time_index is not None
         self._job = job
-        axis = job.axes[axis_index]
+        time_axis = job.axes[time_index]
         # The units are the same in all scenes and for all sizes of images.
         points_of_first_scene = job.load_configurations_by_size(0)
         self._units = next(iter(points_of_first_scene.values())).independent_units
-        self._distance_bounds = compute_distance_bounds(job, axis)
+        self._distance_bounds = compute_distance_bounds(job, time_axis)
         # An array of this shape has an element for each row; the row's number is its
         # index in the flat array.
         shape = (
@@ -213,19 +210,22 @@ class Drives:
         self._frame_of_step: dict[int, DetectedFrame] = {}
         self._distance_unit = "object sizes"
         # fills `flags` and `distance`, and the attributes above
-        self._read_rows(rows, axis.control_name, flags, distance)
+        self._read_rows(rows, time_axis.control_name, flags, distance)
 
-        times = np.array([float(value) for value in axis.values])
+        times = np.array([float(value) for value in time_axis.values])
         order = np.argsort(times)
         self.times = times[order]
         self.seconds = float(self.times[-1] - self.times[0])
-        steps = np.arange(flags.size).reshape(shape)
-        # The time becomes the last axis, in ascending order. In `shape`, the axis of
-        # the scenes comes before those of the grid.
-        time_axis = axis_index + 1
-        self._outcomes = np.moveaxis(flags, time_axis, -1)[..., order]
-        self._row_numbers = np.moveaxis(steps, time_axis, -1)[..., order]
-        self._distance = np.moveaxis(distance, time_axis, -1)[..., order]
+        row_numbers = np.arange(flags.size).reshape(shape)
+
+        def move_frames_last(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            """Make the time the last axis, in ascending order."""
+            # The axis of the scenes comes before those of the grid.
+            return np.moveaxis(array, 1 + time_index, -1)[..., order]
+
+        self._outcomes = move_frames_last(flags)
+        self._row_numbers = move_frames_last(row_numbers)
+        self._distance = move_frames_last(distance)
 
     def _read_rows(
         self,
@@ -254,7 +254,8 @@ class Drives:
         for row in rows:
             image, model = divmod(row.step, len(job.models))
             is_hidden = row.label == OUT_OF_VIEW
-            flags.flat[row.step] = HIDDEN if is_hidden else bool(row.correct)
+            right_or_wrong = RIGHT if row.correct else WRONG
+            flags.flat[row.step] = HIDDEN if is_hidden else right_or_wrong
             if distance_name in row.values:
                 distance.flat[image] = float(str(row.values[distance_name]["value"]))
                 self._distance_unit = row.values[distance_name]["unit"]
@@ -289,15 +290,18 @@ class Drives:
             model: index of the model whose predictions are selected.
         """
         n_frames = len(self.times)
-        # Axes of the scenes' arrays: (scenes, grid ..., samples, models, frames).
-        flags = self._outcomes[scenes][..., model, :].reshape(-1, n_frames)
-        steps = self._row_numbers[scenes][..., model, :].reshape(-1, n_frames)
-        # Without the axis of models, it has the shape of one model's flags.
-        distance = self._distance[scenes].reshape(flags.shape)
-        is_known = (flags != UNKNOWN).all(axis=1)
-        is_visible = (flags != HIDDEN).any(axis=1)
-        selected = is_known & is_visible
-        return _CompleteDrives(flags[selected], distance[selected], steps[selected])
+        # The arrays of all models have the axes (scenes, ..., models, frames). From
+        # here on a row is a drive.
+        outcomes = self._outcomes[scenes][..., model, :].reshape(-1, n_frames)
+        row_numbers = self._row_numbers[scenes][..., model, :].reshape(-1, n_frames)
+        # Distances have no axis of models.
+        distance = self._distance[scenes].reshape(-1, n_frames)
+        is_complete = (outcomes != UNKNOWN).all(axis=1)
+        is_visible = (outcomes != HIDDEN).any(axis=1)
+        is_selected = is_complete & is_visible
+        return _CompleteDrives(
+            outcomes[is_selected], distance[is_selected], row_numbers[is_selected]
+        )
 
     def compute_rates(self) -> list[DriveRates]:
         """Compute the rates over drives of each model, without and with the adversarial
@@ -342,9 +346,9 @@ class Drives:
         # Drives of one draw differ only in noise and count as one. All frames of a
         # drive have the same draw, so that of the first frame is looked up.
         first_images = drives.row_numbers[:, 0] // len(self._job.models)
-        drive = np.asarray(self._units.find_draw(first_images))  # (n,) draw of each
-        n_drives = len(np.unique(drive))
-        n_right_drives = len(np.unique(drive[has_right]))
+        draw_of_drive = np.asarray(self._units.find_draw(first_images))  # (n,)
+        n_drives = len(np.unique(draw_of_drive))
+        n_right_drives = len(np.unique(draw_of_drive[has_right]))
         # The largest values that are possible: every frame is wrong, and the prediction
         # changes from each frame to the next.
         max_gap = n_frames * self._frame_interval
@@ -359,16 +363,16 @@ class Drives:
             # `min` or `max` selects the worst drive: it has the fewest right frames,
             # the longest gap, the smallest distance of the first detection.
             right=summarize_drives(
-                _right_fraction(drives.outcomes), min, drive_of_value=drive
+                _right_fraction(drives.outcomes), min, drive_of_value=draw_of_drive
             ),
             longest_gap=summarize_drives(
                 self._longest_gaps(drives.outcomes),
                 max,
                 bounds=(0.0, max_gap),
-                drive_of_value=drive,
+                drive_of_value=draw_of_drive,
             ),
             first_right=self._first_detection(
-                first_distance[has_right], drive[has_right]
+                first_distance[has_right], draw_of_drive[has_right]
             ),
             unit=self._distance_unit,
             never_right=n_drives - n_right_drives,
@@ -376,9 +380,9 @@ class Drives:
                 self._changes_per_second(drives.outcomes),
                 max,
                 bounds=(0.0, max_flicker),
-                drive_of_value=drive,
+                drive_of_value=draw_of_drive,
             ),
-            tracks=self._compute_track_rates(model, drives.row_numbers, drive),
+            tracks=self._compute_track_rates(model, drives.row_numbers, draw_of_drive),
             per_drive=drive_records,
         )
 
@@ -420,7 +424,11 @@ class Drives:
         return runs * self._frame_interval
 
     def _changes_per_second(self, flags: Flags) -> npt.NDArray[np.float64]:
-        """Return how often a second each drive (n,) changes between right and wrong."""
+        """Return how often a second each drive (n,) changes between right and wrong.
+
+        Args:
+            flags: (n, frames) RIGHT, WRONG or HIDDEN.
+        """
         is_right = flags == RIGHT
         is_visible = flags != HIDDEN
         # A change to or from a frame without the object does not count.
@@ -429,20 +437,21 @@ class Drives:
         return np.asarray(is_change.sum(axis=1) / self.seconds)
 
     def _first_detection(
-        self, distance: npt.NDArray[np.float64], drive: npt.NDArray[np.int64]
+        self, distance: npt.NDArray[np.float64], draw_of_drive: npt.NDArray[np.int64]
     ) -> OverDrives | None:
-        """Return the mean distance at the first right frame.
+        """Return mean and worst distance at the first right frame of a drive.
 
-        None if there is no such frame, or a distance is unknown.
+        None if no drive has a right frame, or a distance is unknown.
 
         Args:
-            distance: (n,) distance of each drive with a right frame.
-            drive: (n,) draw of each of these drives.
+            distance: (n,) distance at the first right frame of each drive that has one.
+            draw_of_drive: (n,) draw of each of these drives.
         """
         if not len(distance) or not np.isfinite(distance).all():
             return None
+        # `min`: in the worst drive the object is nearest when it is first detected.
         return summarize_drives(
-            distance, min, bounds=self._distance_bounds, drive_of_value=drive
+            distance, min, bounds=self._distance_bounds, drive_of_value=draw_of_drive
         )
 
     def _compute_track_rates(
@@ -467,10 +476,12 @@ class Drives:
             return None
         if any(step not in self._frame_of_step for step in steps.flat):
             return None
+        # for each drive, its frames
         frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
         tracked_drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
         ]
+        # fraction of frames that are lost even if a small overlap is enough
         lost_loosely = _compute_lost_loosely(task, tracker, frames)
         lost = np.array([tracked.lost for tracked in tracked_drives], dtype=float)
         switches = np.array(
@@ -480,10 +491,11 @@ class Drives:
         n_frames = len(self.times)
         seconds_bounds = (0.0, n_frames * self._frame_interval)
 
+        # In the worst drive each of these rates is largest: therefore `max`.
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=summarize_drives(lost, max, drive_of_value=drive),
-            # frames that are lost, but would not be if less overlap were enough
+            # frames that are lost, but not if a small overlap is enough
             loose=summarize_drives(lost - lost_loosely, max, drive_of_value=drive),
             # at most one switch between two frames
             switches=summarize_drives(
@@ -508,8 +520,9 @@ class Drives:
             run: run directory into which they are written.
         """
         all_scenes = [*range(len(self._job.scenes))]
-        drives = self._select_complete(all_scenes, 0)
-        if not len(drives.outcomes):
+        drives = self._select_complete(all_scenes, model=0)
+        has_drives = len(drives.outcomes) > 0
+        if not has_drives:
             return
         worst = _right_fraction(drives.outcomes).argmin()
         # rows are numbered by image, then model

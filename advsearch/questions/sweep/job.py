@@ -60,8 +60,8 @@ class NamedScene:
         environment_name: name of the environment.
         scene: the loaded scene.
         fixed_controls: controls of an attack, which are fixed in the sweep.
-        adversarial_configuration: (d,) the adversarial configuration of these; None leaves them at their values
-            in the clean scene.
+        adversarial_configuration: (d,) the adversarial configuration of these; None
+            leaves them at their values in the clean scene.
         arm: name of the arm if clean and adversarial scenes are compared: "clean", or
             the name of the attack's run; empty if nothing is compared.
         photograph_name: name of the scene's photograph in a folder of photographs; empty
@@ -83,7 +83,7 @@ class NamedScene:
         if self.photograph_name:
             names["backdrop"] = self.photograph_name
         if self.arm:
-            names["answer"] = self.arm
+            names["answer"] = self.arm  # the axis of clean and adversarial scenes
         return names
 
 
@@ -198,16 +198,14 @@ class Job:
         first_in_scene = numbers.start - images_before
         queries = list[Query]()
         # The configurations may differ between sizes, since framing depends on them.
-        for size, points in self.load_configurations_by_size(scene).items():
-            configurations = points.make_configurations(
-                first_in_scene, len(numbers), images_before
+        for size, configurations in self.load_configurations_by_size(scene).items():
+            all_u = configurations.make_configurations(
+                first_in_scene, len(numbers), before=images_before
             )
-            descriptions = points.describe_images(configurations, first_in_scene)
-            for number, u, values in zip(
-                numbers, configurations, descriptions, strict=True
-            ):
+            descriptions = configurations.describe_images(all_u, first_in_scene)
+            for number, u, values in zip(numbers, all_u, descriptions, strict=True):
                 queries += [
-                    self._make_query(number, model, points, u, values)
+                    self._make_query(number, model, configurations, u, values)
                     for model, model_size in enumerate(self.image_sizes)
                     if model_size == size
                 ]
@@ -219,7 +217,7 @@ class Job:
         self,
         number: int,
         model: int,
-        points: SceneConfigurations,
+        configurations: SceneConfigurations,
         u: Tensor,
         values: Mapping[str, Value],
     ) -> Query:
@@ -228,20 +226,20 @@ class Job:
         Args:
             number: number of the image in the sweep.
             model: index of the model.
-            points: points of the scene.
+            configurations: configurations of the scene.
             u: (d,) the configuration.
             values: values of the controls.
         """
         scene = number // self.images_per_scene
         # an environment that a control or an axis chooses instead of the scene's
-        environment = points.space.find_environment_name(values)
+        environment = configurations.space.find_environment_name(values)
         return Query(
             u.clone(),
-            seed=self.seeds(points.find_noise_index(number)),
+            seed=self.seeds(configurations.find_noise_index(number)),
             kind=KIND,
             row_index=number * len(self.models) + model,
             spp=self.spp,
-            draws_conditions=False,  # what is sampled is in `u` already
+            draws_conditions=False,  # `u` has all sampled values already
             values=self._make_row_values(scene, model, environment, values),
             has_success=False,  # a sweep counts right predictions, not successes
             includes_image=self.config.keep_pictures != "none",
@@ -305,15 +303,15 @@ class Job:
         space = make_space(controls, description)
         if named_scene.fixed_controls:
             space = _fix_controls(named_scene, space)
-        # What the user fixed with `set` must not be sampled. The environment is
-        # excepted, as `check_scenes` has checked it.
+        # What the user fixed with `set` must not be sampled, except for the
+        # environment, for which `check_scenes` has other rules.
         set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
         for group in space.groups:
             if group.setting in set_by_user:
                 raise InputError(
                     f"`controls` {group.control}: draws {group.parameter} by chance, "
-                    f"and `set` {group.setting} fixes "
-                    "it; leave it out of one of the two"
+                    f"and `set` {group.setting} fixes it; leave it out of one of the "
+                    "two"
                 )
         return space
 
@@ -324,7 +322,7 @@ class Job:
         of the scenes are those with it. They repeat the draws of the first half.
         """
         repeat_after_scenes = 0  # never
-        # With an attack, every scene has an arm; the clean one is named, too.
+        # In a comparison every scene has the name of an arm, clean ones, too.
         is_comparison = bool(self.scenes[0].arm)
         if is_comparison:
             repeat_after_scenes = len(self.scenes) // 2
@@ -337,6 +335,7 @@ class Job:
             seed=self.config.seed,
             repeat_after_scenes=repeat_after_scenes,
             n_scenes=len(self.scenes),
+            # 1 without a folder of photographs: all names are empty then
             n_photographs=len({scene.photograph_name for scene in self.scenes}),
         )
 
@@ -362,6 +361,7 @@ class Job:
 def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     """Fix the first controls of a space to the configuration of a scene.
 
+    Args:
         named_scene: scene with fixed controls. Without a configuration `u`, these are
             fixed to their start, as in the clean arm.
         space: space of all controls, with the fixed ones first.
@@ -369,7 +369,8 @@ def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     Raises:
         InputError: the adversarial configuration does not fit the scene.
     """
-    # These are bound to the scene; those of `named_scene` are not.
+    # The space's controls are bound to the scene, and so have a start; those of
+    # `named_scene` are not.
     fixed_controls = space.controls[: len(named_scene.fixed_controls)]
     start = torch.cat([control.start for control in fixed_controls])
     if named_scene.adversarial_configuration is None:
@@ -454,39 +455,40 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
     """Check a job by binding every scene, so that errors come before any rendering.
 
     Returns:
-        The points of the first scene, and the sampled numbers that tables count by. If
+        The configurations of the first scene, and the sampled numbers that tables count by. If
         the range of a number differs between scenes or image sizes, its parts are
         fractions of the range instead of values.
 
     Raises:
         InputError: controls sample other numbers in one scene than in another.
     """
-    scenes_and_points = list[tuple[NamedScene, SceneConfigurations]]()
+    # a pair for each scene and each size of images
+    pairs = list[tuple[NamedScene, SceneConfigurations]]()
     for scene, named_scene in enumerate(job.scenes):
-        scenes_and_points += [
-            (named_scene, points)
-            for points in job.load_configurations_by_size(scene).values()
+        pairs += [
+            (named_scene, configurations)
+            for configurations in job.load_configurations_by_size(scene).values()
         ]
         facts = job.make_ground_truth_facts(named_scene, {})
         for task, model in zip(job.tasks, job.models, strict=True):
             check_truth(
                 task, model, named_scene.scene, facts, job.config.image_settings
             )
-    first_points = scenes_and_points[0][1]
-    for named_scene, points in scenes_and_points:
-        if points.sampled_layout != first_points.sampled_layout:
+    _, first_configurations = pairs[0]
+    for named_scene, configurations in pairs:
+        if configurations.sampled_layout != first_configurations.sampled_layout:
             raise InputError(
                 f"`object` {named_scene.object_name}: its controls draw other numbers than "
-                f"those of {job.scenes[0].object_name}; sweep "
-                "the two by themselves"
+                f"those of {job.scenes[0].object_name}; sweep the two by themselves"
             )
-    # Each number has a version in each scene, whose range may be another.
-    numbers_of_scene = [points.sampled_numbers for _, points in scenes_and_points]
+    # A number may have another range in another scene or size: it has a version in
+    # each.
+    numbers_of_pair = [configurations.sampled_numbers for _, configurations in pairs]
     sampled = [
-        _merge_versions(versions, first_points.parts_per_range)
-        for versions in zip(*numbers_of_scene, strict=True)
+        _merge_versions(versions, first_configurations.parts_per_range)
+        for versions in zip(*numbers_of_pair, strict=True)
     ]
-    return first_points, tuple(sampled)
+    return first_configurations, tuple(sampled)
 
 
 def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledNumber:
@@ -557,7 +559,7 @@ class SweptScene:
             model=job.models[model],
             task=job.tasks[model],
             make_facts=make_scene_facts,
-            objective=None,
+            objective=None,  # a sweep searches for nothing
             search_spp=job.spp,
             seed=job.config.seed,
             metrics=job.metrics,
@@ -621,9 +623,8 @@ class SweptScene:
         evaluations = self._make_evaluations(
             queries, images, judgements, seconds, wrong_images
         )
-        # `light` are the summaries of what predicted images by stored light.
-        # A predictor may have been released with its count, so that the difference
-        # could be negative.
+        # A predictor that was released since is no longer counted, so that the
+        # difference could be negative.
         n_new_non_finite = max(0, self.n_non_finite - not_finite_before)
         evaluations[-1] = replace(
             evaluations[-1],
@@ -663,7 +664,8 @@ class SweptScene:
             evaluation = Evaluation.from_judgement(
                 judgements[query.row_index],
                 cost=cost,
-                predicted=image.prediction_spp,  # 0 if the image was rendered
+                # its samples per pixel; 0 if the image was rendered
+                predicted=image.prediction_spp,
                 seconds=seconds,
             )
             if model == 0:
@@ -689,7 +691,7 @@ class SweptScene:
         job = self.job
         n_models = len(job.models)
         judgement_of_query: dict[int, Judgement] = {}
-        for model, problem in enumerate(self.problems):
+        for model, problem in enumerate(self.problems):  # one for each model
             size = job.image_sizes[model]
             model_queries = [
                 query for query in queries if query.row_index % n_models == model
@@ -728,7 +730,9 @@ class SweptScene:
             is_wrong: whether the prediction of any model is wrong.
         """
         job = self.job
-        if query.includes_image and (job.config.keep_pictures == "all" or is_wrong):
+        # `keep_pictures` is "all" or "wrong" if the query includes the image.
+        stores_thumbnail = job.config.keep_pictures == "all" or is_wrong
+        if query.includes_image and stores_thumbnail:
             thumbnail = thumbnails.make_thumbnail(image.image)
             evaluation = replace(evaluation, jpeg=thumbnail)
         if job.aovs:
@@ -823,7 +827,8 @@ class SweptScene:
         """
         n_models = len(self.job.models)
         images_before = self.number * self.configurations_by_size[size].n_images
-        # The predictor numbers the images of this scene from 0.
+        # The predictor numbers the images of this scene from 0. Queries of several
+        # models about an image differ in nothing that concerns the image.
         query_of_image = {
             query.row_index // n_models - images_before: query
             for query in queries
@@ -885,7 +890,8 @@ class SceneLoader:
         Raises:
             InputError: the task is not classification.
         """
-        # Only a classifier's ground truth is the same in all configurations.
+        # `varies`: the ground truth differs between configurations. That of a
+        # classifier, the class of the object, does not.
         is_classification = not self.job.tasks[0].varies
         if not is_classification:
             raise InputError(
@@ -933,7 +939,8 @@ def verify_worst(
     if config.trials == 0:
         return None
     ladder = choose_ladder(config.verify_spp, config.pixel_sampler)
-    # `has_success` concerns what is stored: rows of a sweep state no success.
+    # The rows of a sweep state no success, so the journal stores none either; trials in
+    # memory have one.
     verifier = Verifier(
         Journal(run, ParallelEvaluator(problem)), ladder, stages, has_success=False
     )
@@ -951,8 +958,9 @@ def verify_worst(
     counts = TrialCounts(len(wrong_trials), len(trials), spp)
     verified_rate = make_rate(counts, trials, wrong_trials)
     has_converged = sample_count is not None and sample_count.converged
+    is_spp_set = len(verifier.spp_ladder) == 1
     return WorstVerified(
         **vars(verified_rate),
-        converged=len(verifier.spp_ladder) == 1 or has_converged,
+        converged=is_spp_set or has_converged,
         renders=verifier.run_state.verification_renders,
     )

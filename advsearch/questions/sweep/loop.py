@@ -145,14 +145,17 @@ class Sweep:
             )
         else:
             self._executor = executor
-        # The evaluator has no problem of its own, as each work item names its scene.
+        # Problems are loaded by the name of the scene in each work item.
         self.journal = Journal(run, ParallelEvaluator(None, executor))
-        self._n_rendered = 0  # images made now, by this process or its workers
-        # Counts of the full sweep, from its rows: also of those made before a resume.
+        self._n_rendered = (
+            0  # images, also predicted ones, since this sweep was resumed
+        )
+        # Counts of the full sweep, also of what was done before it was resumed.
         self._n_traced = 0  # images that were traced, also to prepare predictors
         self._n_predicted = 0  # images that were predicted from traced ones
         self._n_lost = 0  # rows that have no prediction, since their worker died
-        # summaries of the predictors of images, by worker and scene
+        # Summaries of the predictors of images, by worker and scene. There is one for
+        # each size of images; None if nothing that they predict moves.
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._has_non_finite = (
             run is not None and run.store.read_note(NOT_FINITE) is not None
@@ -165,12 +168,12 @@ class Sweep:
 
     def _write_notes(self, run: RunDirectory) -> None:
         """Store the parts of ranges and the independent units, which readers need."""
-        edges = {
+        bounds_by_name = {
             number.name: number.part_bounds
             for number in self._sampled_numbers
             if number.part_bounds
         }
-        run.store.write_note(EDGES_NOTE, json.dumps(edges))
+        run.store.write_note(EDGES_NOTE, json.dumps(bounds_by_name))
         run.store.write_note(UNITS_NOTE, json.dumps(asdict(self.independent_units)))
 
     def execute(self) -> SweepResult:
@@ -195,7 +198,7 @@ class Sweep:
             ending = INTERRUPTED
             # A batch may have been stored but not yet counted: so all are read again.
             predictions = self._read_predictions()
-            worst = self._find_worst(predictions)
+            worst = self._find_worst(predictions, verify=False)
         self.stages.end()
         return self._finish(predictions, ending, worst)
 
@@ -210,7 +213,8 @@ class Sweep:
 
     def _analyze_drives(self) -> None:
         """Compute the rates over drives, if the frames of a path are swept."""
-        if find_time_axis(self.job.axes) is None:
+        has_frames = find_time_axis(self.job.axes) is not None
+        if not has_frames:
             return
         self.stages.begin("drives", "rendering the frames of the worst drive")
         drives = Drives(self.job, self.iterate_rows())
@@ -270,8 +274,7 @@ class Sweep:
         """Return the hint of the progress bar about the work ahead.
 
         That is the number of predictions, and about how much disk space the stored
-        thumbnails will take: the bytes of a typical one, scaled by the number of
-        pixels.
+        thumbnails will take.
         """
         hint = (
             f"{self.n_rows} predictions, pictures of "
@@ -281,20 +284,24 @@ class Sweep:
         keep = self.job.config.keep_pictures
         if self.run is None or keep == "none":
             return hint
-        # Thumbnails are of the first model's images.
-        height, width = self.job.image_sizes[0]
-        # A thumbnail is at most THUMBNAIL_SIZE wide and high, and never enlarged.
-        scale = min(1.0, thumbnails.THUMBNAIL_SIZE / max(height, width))
-        n_pixels = scale**2 * height * width
-        size_fraction = n_pixels / thumbnails.THUMBNAIL_SIZE**2
-        n_images = self.n_rows // self.n_models
-        megabytes = n_images * thumbnails.TYPICAL_BYTES * size_fraction / 1e6
+        megabytes = self._estimate_thumbnail_megabytes()
         if megabytes >= 1e3:
             size = f"{megabytes / 1e3:.1f} GB"
         else:
             size = f"{max(megabytes, 0.1):.1f} MB"
+        # Unless all are stored, only those of wrong predictions are.
         about = "about" if keep == "all" else "at most about"
         return f"{hint}; pictures that are kept take {about} {size}"
+
+    def _estimate_thumbnail_megabytes(self) -> float:
+        """Estimate the size of the thumbnails of all images, of the first model."""
+        height, width = self.job.image_sizes[0]
+        # A thumbnail is at most THUMBNAIL_SIZE wide and high, and never enlarged.
+        scale = min(1.0, thumbnails.THUMBNAIL_SIZE / max(height, width))
+        n_pixels = scale**2 * height * width
+        fraction_of_typical = n_pixels / thumbnails.THUMBNAIL_SIZE**2
+        n_images = self.n_rows // self.n_models
+        return n_images * thumbnails.TYPICAL_BYTES * fraction_of_typical / 1e6
 
     def _save_images(self, evaluated: Sequence[tuple[Query, Evaluation]]) -> None:
         """Save thumbnails and layers that evaluations have, in the run directory."""
@@ -403,7 +410,7 @@ class Sweep:
                 self._n_traced += row.renders  # 0 for models that share an image
             elif is_first_of_size:  # rows of old versions don't state their renders
                 self._n_traced += 1
-            # Only a rendered image has a seed, that of its noise.
+            # The seed is that of the noise. A predicted image has no noise.
             was_predicted = row.seed is None
             if was_predicted and is_first_of_size:
                 self._n_predicted += 1
@@ -486,8 +493,8 @@ class Sweep:
     def _find_parts(self, images: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Return the index of the part that each of k sampled numbers is in, (n, k).
 
-        They are computed for all images up to the last one, in batches, since
-        consecutive draws are computed together.
+        They are computed for all images up to the last one, in batches of consecutive
+        images, since draws are a sequence. The sequence goes on through all scenes.
 
         Args:
             images: (n,) their numbers in the sweep, ascending, at least one.
@@ -522,8 +529,8 @@ class Sweep:
             return None
         row = self._read_row(row_number)
         image, model = divmod(row_number, self.n_models)
-        queries_of_image = self.job.make_queries(range(image, image + 1))
-        _, _, query = queries_of_image[model]  # an item ends with its query
+        item_of_model = self.job.make_queries(range(image, image + 1))
+        _, _, query = item_of_model[model]  # an item ends with its query
         scene = self._find_scene(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
@@ -555,6 +562,7 @@ class Sweep:
             problem = self._scenes.load_scene(scene).problems[model]
             truth = problem.find_truth(query.u, query.values)
         else:
+            # The facts of the scene are enough, so that it need not be loaded.
             truth = task.truth(
                 self.job.make_ground_truth_facts(self.job.scenes[scene], query.values)
             )
@@ -579,7 +587,8 @@ class Sweep:
         self.run.save_image("worst", image)
         # a second file, with the marks of the task, such as boxes
         save_with_marks(self.run, "worst", image, problem.find_marks(image, u))
-        # With more samples per pixel, the prediction may be another.
+        # The saved image has more samples per pixel than that of the sweep, so that the
+        # prediction about it may be another.
         image_claim = _make_claim(problem.judge(image, u))
         return worst.model_copy(update={"verified": verified, "pictured": image_claim})
 
@@ -659,6 +668,7 @@ class Sweep:
             "task": config.task_name,
             "environment": self._environment,
             "controls": _get_names(job.controls),
+            # the sampled numbers, with their ranges
             "drawn": {
                 number.name: number.varied_value for number in self._sampled_numbers
             },
@@ -673,7 +683,7 @@ class Sweep:
         }
 
     def _summarize_predictions(self, predictions: Predictions) -> dict[str, Any]:
-        """Return the fields of a summary that count the predictions of all rows so far."""
+        """Return the fields of a summary that count the predictions of rows so far."""
         # Accuracies count rows. Their intervals count independent units: the frames of
         # a drive, for example, are not independent, and are one unit.
         rows = np.flatnonzero(predictions.is_counted)
@@ -742,19 +752,20 @@ class Sweep:
                 # The adversarial scene has the gain of its clean scene.
                 names.pop("answer", None)  # the name of the arm
                 gains[", ".join(names.values())] = description.gain
-        if len(set(gains.values())) != 1:
+        have_same_gain = len(set(gains.values())) == 1  # False without gains
+        if not have_same_gain:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains
 
     def _compare_arms(self, predictions: Predictions) -> ArmComparison | None:
         """Compare the clean scenes with the adversarial ones; None without any."""
-        # The adversarial scenes come last.
-        adversarial = self.job.scenes[-1].arm
-        if not adversarial:
+        # The adversarial scenes come last. Their arm is named after the attack's run.
+        adversarial_run = self.job.scenes[-1].arm
+        if not adversarial_run:
             return None
         models = [model.name for model in self.job.models]
         pairs = predictions.compare_arms(models, self.independent_units)
-        return ArmComparison(adversarial_run=adversarial, pairs=pairs)
+        return ArmComparison(adversarial_run=adversarial_run, pairs=pairs)
 
     def _count_renders(self, verified: WorstVerified | None) -> dict[str, int]:
         """Return how many images were traced, and how many predicted instead."""
@@ -852,12 +863,12 @@ class Sweep:
         """
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
-        # `noise` is the number of images of a draw, which differ only in noise.
-        if self.independent_units.noise > 1 and self.independent_units.photographs == 1:
-            n_units = self.n_rows // self.independent_units.size
-            yield explain_repeats(
-                self.independent_units.name, self.independent_units.noise, n_units
-            )
+        units = self.independent_units
+        n_repeats = units.noise  # images that differ only in noise
+        # With a folder of photographs, a unit is a photograph, and not such images.
+        if n_repeats > 1 and units.photographs == 1:
+            n_units = self.n_rows // units.size
+            yield explain_repeats(units.name, n_repeats, n_units)
         yield from self._list_drive_remarks()
         yield from self._list_prediction_remarks(predictions)
         if self._has_non_finite:
@@ -869,8 +880,10 @@ class Sweep:
                 "that a check takes: noise may take part in it."
             )
         for rates in changes:
+            # The upper bound of the fraction of predictions that meet the claim; 1 if
+            # no interval is known.
             upper_bound = rates.interval[1] if rates.interval is not None else 1.0
-            # All predictions should change if the object is hidden. If the 95 %
+            # The claim is that predictions change if the object is hidden. If the 95 %
             # interval lies below one half, most of them do not.
             is_blind = rates.claim == "must_change" and upper_bound < 0.5
             if is_blind:
@@ -888,19 +901,19 @@ class Sweep:
         The sentence states the lower bound of the accuracy that so few drives would
         have even if every frame were right.
         """
-        # The model with the fewest drives counts. Without drives nothing is yielded.
-        n_drives = min(
-            (rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES
-        )
-        # `explain_repeats` has a remark on repeats of one drive.
+        if not self._drives:
+            return
+        # the number of the model with the fewest drives
+        n_drives = min(rates.drives for rates in self._drives)
+        # Then `explain_repeats` has stated that there is one drive.
         is_repeated = self.independent_units.noise > 1
         if n_drives == 1 and not is_repeated:
             yield "One drive says nothing of others: there is no interval over drives."
         elif 1 < n_drives < ENOUGH_DRIVES:
             lower_bound = max_lower_bound(n_drives)
             yield (
-                f"{format_count(n_drives, 'drive')} can show little: were the model right in "
-                "all their frames, the interval of "
+                f"{format_count(n_drives, 'drive')} can show little: were the model "
+                "right in all their frames, the interval of "
                 f"that share would begin at {100 * lower_bound:.0f} %."
             )
 
@@ -908,7 +921,7 @@ class Sweep:
         """Yield remarks on predictions that do not count, or do not count as right."""
         n_hidden = int(predictions.is_out_of_view.sum())
         if n_hidden:
-            # Each model's prediction counts as a picture here.
+            # With several models, an image counts once for each.
             images = format_count(int(predictions.has_prediction.sum()), "picture")
             # predictions that find an object of which nothing is in the image
             n_phantoms = predictions.n_phantoms_out_of_view
@@ -924,8 +937,7 @@ class Sweep:
         if predictions.n_non_finite:
             yield (
                 f"{predictions.n_non_finite} predictions of the model are not "
-                "numbers; "
-                "they count as not right."
+                "numbers; they count as not right."
             )
 
 
@@ -940,7 +952,7 @@ def _pair_evaluations(batch: BatchResult) -> list[tuple[Query, Evaluation]]:
     Evaluations state the machine that made them. If the worker of the batch died, they
     state that the evaluation is lost.
     """
-    queries = [query for _, _, query in batch.items]
+    queries = [query for _, _, query in batch.items]  # an item ends with its query
     evaluations = batch.value
     if batch.failure_reason:  # the reason, as a text
         evaluations = [

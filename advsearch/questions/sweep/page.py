@@ -231,7 +231,7 @@ def _describe_images(
         images["kept"] = [*thumbnails.numbers] if thumbnails.is_subset else None
         return images, None
     if not source.is_embedded:
-        return images, None  # neither an address nor rows: the images are not shown
+        return images, None  # without an address or rows no image can be found
     embedded: JsonObject = dict(
         thumbnails.list_data_urls(source.rows, MAX_EMBEDDED_BYTES)
     )
@@ -276,6 +276,7 @@ def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObjec
         with suppress(AdvsearchError):
             task = read_yaml(run / directory.CONFIG).get("task")
             name = task.get("name") if isinstance(task, Mapping) else task
+            # a text may have options, as in "detection=..."
             return {"task": str(name).partition("=")[0]}
         return {}  # reading the settings failed
     formation = summary.image_formation
@@ -358,7 +359,7 @@ def verdict_text(summary: SweepSummary) -> str:
 
 
 def _still_html(path: Path, summary: SweepSummary) -> Html:
-    """Return the images that a page shows in place of the explorer without a script.
+    """Return the images that stand in for the explorer if no script runs.
 
     These are the figure of the accuracy and the worst image, if the run has them. If no
     cell of the map has two configurations, the figure shows the margin instead.
@@ -370,7 +371,7 @@ def _still_html(path: Path, summary: SweepSummary) -> Html:
     measure = "Accuracy"
     if summary.cells:
         max_configurations = max(map(max, summary.cells.configurations))
-        if max_configurations <= 1:  # see `display._draw_map`
+        if max_configurations <= 1:  # as `display._draw_map` decides
             measure = "Margin"
     # The figure shows the first two axes.
     axis_names = list(dict.fromkeys(row.axis for row in summary.axes))
@@ -378,7 +379,8 @@ def _still_html(path: Path, summary: SweepSummary) -> Html:
     figure = _figure_html(path / "images" / "sweep.png", f"{measure} over {axes}.")
     worst = _figure_html(path / "images" / "worst.png", _worst_caption(summary))
     return join_html(
-        # The page's script hides elements with this attribute.
+        # The page's script hides this element once the explorer replaces it. The worst
+        # image stays.
         make_element("div", figure, class_="pictures", data_still="true")
         if figure
         else None,
@@ -452,8 +454,8 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
         The page's path.
 
     Raises:
-        InputError: the directory is there and not empty, or these runs have no common
-            page; and as `write_sweep_page`.
+        InputError: the directory is there and not empty, these runs have no common
+            page, or a run cannot be read.
     """
     check_free_folder(folder, "bundle")
     results = [(run, read_result(run)) for run in runs]
@@ -478,16 +480,17 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
 def _write_part_pages(run: Path, folder: Path) -> None:
     """Write the pages of the parts of a run, which its own page links to.
 
-    Their HTML is made again from their results: a stored page could contain anything.
+    Stored pages are not copied, as they could contain anything: they only show which
+    parts there are. Each page is made again from the result of the part.
 
     Args:
         run: run directory, whose parts are runs with results of their own.
         folder: folder of the bundle.
     """
-    # The stored pages are used only to find the parts.
-    for file in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
-        html = make_run_page(file.parent, read_result(file.parent))
-        write_text(folder / file.relative_to(run), html)
+    for page in sorted((run / directory.PARTS).glob(f"*/{directory.REPORT}")):
+        part = page.parent
+        html = make_run_page(part, read_result(part))
+        write_text(folder / page.relative_to(run), html)
 
 
 def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
@@ -510,6 +513,7 @@ def _write_source(run: Path, index: int, folder: Path) -> SweepSource:
     thumbnails = find_thumbnails(run)
     numbers = thumbnails.numbers if thumbnails else ()
     for number in numbers:
+        # Only the numbered subfolder and the name are those of a run.
         file = thumbnail_path(folder / image_folder, number)
         target = folder / image_folder / file.parent.name / file.name
         write_bytes(target, read_thumbnail(run, number))

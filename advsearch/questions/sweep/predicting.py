@@ -82,10 +82,11 @@ class Groups:
         samples: number of samples at each point of the grid.
         within: for each axis of the grid, whether images of a group may differ along
             it.
-        is_sampled: whether images of a group may differ in what is sampled. If not,
-            they differ along no axis but `frames`, since other images have other draws.
-        frames: the index of the axis with the frames of a drive, which have one draw;
-            None without a drive.
+        may_draws_differ: whether images of a group may differ in what is sampled. If
+            not, they differ along no axis but `frame_axis`, since other images have
+            other draws.
+        frame_axis: the index of the axis with the frames of a drive, which have one
+            draw; None without a drive.
 
     Attributes:
         group_size: number of images of a group.
@@ -99,22 +100,21 @@ class Groups:
         grid: ProductIndex,
         samples: int,
         within: tuple[bool, ...],
-        is_sampled: bool,
-        frames: int | None = None,
+        may_draws_differ: bool,
+        frame_axis: int | None = None,
     ) -> None:
         """Split the axes into those within and those between groups; see the class."""
         self.grid = grid
         self.samples = samples
         # Samples are like one more axis, the last and fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
-        # From one index of an axis to the next, the draws change, except between the
-        # frames of a drive. So if images of a group may not differ in the draws, they
-        # differ along no axis but that of the frames.
-        axis_is_within = [
-            may_differ and (is_sampled or axis == frames)
-            for axis, may_differ in enumerate(within)
-        ]
-        self._is_within = (*axis_is_within, is_sampled)  # the last is that of samples
+        is_within = []  # for each axis
+        for axis, may_differ in enumerate(within):
+            # Two images along any axis but that of the frames have different draws.
+            shares_draw = axis == frame_axis
+            is_within.append(may_differ and (may_draws_differ or shares_draw))
+        is_within.append(may_draws_differ)  # the axis of the samples
+        self._is_within = tuple(is_within)
         within_sizes = self._select(self._all_axes.sizes, is_within=True)
         between_sizes = self._select(self._all_axes.sizes, is_within=False)
         self._within = ProductIndex(tuple(within_sizes))
@@ -157,14 +157,14 @@ class Groups:
         return self._between.index(self._select(digits, is_within=False))
 
     def find_image_of_group(self, number: int, index: int) -> int:
-        """Return the number of an image of the same group, by its index in the group.
+        """Return the number of an image, by its index in the group of another image.
 
         Both images have the same index along every axis between groups. The index in
         the group counts along the axes within groups, the last one fastest.
 
         Args:
             number: number of any image of the group, in the scene.
-            index: index in the group of the image to find, in [0, group_size).
+            index: index of the image to find in the group, in [0, group_size).
         """
         # The digits of a number are the indices along the axes (mixed radix).
         member_digits = list(self._all_axes.digits(number))
@@ -219,16 +219,14 @@ class BasisPictures:
         """
         renderer = self._renderer
         groups = make_groups(self.parameters)
-        if renderer.formation.denoiser != "oidn":
-            return NOISE  # an image that is not denoised has noise to be reproduced
+        # Only an image without noise can be predicted from basis images.
+        is_denoised = renderer.formation.denoiser == "oidn"
+        if not is_denoised:
+            return NOISE
         # The number of lights is the same in all configurations: take the first one.
         inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
         n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
-        # All numbers of samples are per pixel. There is a basis image for each light,
-        # and `N_VIEWS` images are compared with traced ones. For each of these, two
-        # halves are traced to estimate the noise, and one image with `spp`.
-        basis_samples = n_lights * COLLECTED_SPP
-        prediction_samples = basis_samples + N_VIEWS * (2 * CHECK_SPP + spp)
+        prediction_samples = n_lights * COLLECTED_SPP + _count_check_samples(spp)
         # Rendering a group takes `spp` for each image.
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
         if groups.group_size < min_images:
@@ -271,8 +269,17 @@ ARRANGEMENT_BYTES = 50_000_000  # approximate memory of an arrangement
 LIGHT_BYTES = 4_000_000  # approximate memory of an environment's light, without its map
 
 
+def _count_check_samples(spp: int) -> int:
+    """Return how many samples per pixel the comparison with traced images takes.
+
+    Of each of the `N_VIEWS` compared images two halves are traced, to estimate the
+    noise, and once the image itself, with `spp`.
+    """
+    return N_VIEWS * (2 * CHECK_SPP + spp)
+
+
 def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> int:
-    """Return from how many images under one light on light on surfaces is used.
+    """Return the number of images under one light for which light on surfaces pays.
 
     Preparing the light and comparing it with traced images has a fixed cost; each image
     that is predicted saves `spp - PREDICTION_SPP`. The light is used if the images save
@@ -286,9 +293,7 @@ def find_break_even(renderer: Renderer, spp: int, arrangements: float = 1.0) -> 
     """
     height, width = renderer.formation.resolution
     preparation_samples = ARRANGEMENT_SAMPLES * arrangements + LIGHT_SAMPLES
-    # a view is traced in two halves, to estimate its noise, and once as images are
-    spp_of_view = 2 * CHECK_SPP + spp
-    fixed_spp = preparation_samples / (height * width) + N_VIEWS * spp_of_view
+    fixed_spp = preparation_samples / (height * width) + _count_check_samples(spp)
     return math.ceil(MIN_SAVING_FACTOR * fixed_spp / (spp - PREDICTION_SPP))
 
 
@@ -317,8 +322,9 @@ class LightOnSurfaces:
         """
         self._renderer = renderer
         self._seed = seeds.derive_seed(seed, "surface light")
+        # An arrangement is where object and surroundings are.
         self._arrangements: list[SurfaceRenderer] = []
-        self._max_arrangements = 0
+        self._max_arrangements = 0  # `find_refusal` sets it
         # which inputs of the scene change with each parameter
         self._changed_inputs = {
             group.name: find_changed_inputs(renderer, [group.name])
@@ -352,21 +358,22 @@ class LightOnSurfaces:
             make_groups: returns the groups whose images differ in some parameters.
             spp: samples per pixel of the images.
         """
-        groups = make_groups(self.parameters)
-        # An arrangement can serve several groups: all images between which neither
-        # object nor surroundings move. Colors are left out, since an arrangement holds
-        # for one color of the object.
+        # The images of one of these groups have the same light.
+        light_groups = make_groups(self.parameters)
+        # The images of one of these groups have the same arrangement: neither object
+        # nor surroundings move, and the object has one color.
+        same_arrangement_inputs = FREE_INPUTS - {COLOR_INPUT}
         arrangement_groups = make_groups(
-            self._find_parameters_changing_only(FREE_INPUTS - {COLOR_INPUT})
+            self._find_parameters_changing_only(same_arrangement_inputs)
         )
         self._max_arrangements = arrangement_groups.n_groups_to_cache
-        # Each group has a light. This is below 1 if groups share arrangements.
-        arrangements_per_light = arrangement_groups.n_groups / groups.n_groups
+        # below 1 if several lights share an arrangement
+        arrangements_per_light = arrangement_groups.n_groups / light_groups.n_groups
         min_images = find_break_even(self._renderer, spp, arrangements_per_light)
-        if groups.group_size < min_images:
+        if light_groups.group_size < min_images:
             return Refusal(
                 f"light on surfaces pays where {min_images} pictures differ in the "
-                f"camera alone; here {groups.group_size} do"
+                f"camera alone; here {light_groups.group_size} do"
             )
         refusal = find_scene_refusal(self._renderer)
         if refusal is not None:
@@ -375,11 +382,11 @@ class LightOnSurfaces:
         light_bytes = LIGHT_BYTES + 4 * environment.numel()  # 4 bytes for a float32
         n_bytes = (
             arrangement_groups.n_groups_to_cache * ARRANGEMENT_BYTES
-            + groups.n_groups_to_cache * light_bytes
+            + light_groups.n_groups_to_cache * light_bytes
         )
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
-                f"light of {groups.n_groups} groups takes too much memory; make the "
+                f"light of {light_groups.n_groups} groups takes too much memory; make the "
                 "camera the last axes of the grid"
             )
         return None
@@ -488,8 +495,8 @@ class SweepPredictor:
                 return method, None
             refused.append((method, refusal))
         for method, refusal in refused:
-            nothing_to_predict = refusal is NOTHING_MOVES
-            if not nothing_to_predict:
+            could_predict_something = refusal is not NOTHING_MOVES
+            if could_predict_something:
                 return method, refusal
         return refused[-1]
 
@@ -509,18 +516,19 @@ class SweepPredictor:
                 may differ in a group only if all sampled parameters are among them.
         """
         axis_names = [axis.name for axis in self.axes]
-        # A parameter that is not on an axis of the grid is sampled.
-        may_draws_differ = all(
-            group.name in parameters
+        # Here a group is the coordinates of one parameter.
+        sampled_names = [
+            group.name
             for group in self.renderer.space.groups
             if group.name not in axis_names
-        )
+        ]
+        may_draws_differ = parameters.issuperset(sampled_names)
         return Groups(
             self.configurations.grid,
             samples=self.configurations.samples_per_grid_point,
             within=tuple(name in parameters for name in axis_names),
-            is_sampled=may_draws_differ,
-            frames=self.configurations.independent_units.frames,
+            may_draws_differ=may_draws_differ,
+            frame_axis=self.configurations.independent_units.frames,
         )
 
     def make_images(self, query_of_image: Mapping[int, Query]) -> dict[int, SweptImage]:
@@ -546,7 +554,7 @@ class SweepPredictor:
                 image = self.renderer(
                     query.u, seed=query.seed, spp=self.problem.search_spp
                 )
-                # A predictor of its group may have been traced, and then rejected.
+                # Images may have been traced for a predictor that was then rejected.
                 n_traced = self._count_traced(number) + 1
                 images[number] = SweptImage(image, prediction_spp=0, n_traced=n_traced)
             else:
@@ -592,9 +600,10 @@ class SweepPredictor:
             oldest = next(iter(self._predictors))
             self._predictors.pop(oldest)
         begin = time.perf_counter()
-        # A scene has fewer groups than images, so that these indices differ between
-        # all groups of all scenes.
-        seed = seeds.derive_seed(self.seed, "light", self.images_before + group)
+        # A scene has no more groups than images. So no two groups of the sweep have
+        # the same index.
+        group_index = self.images_before + group
+        seed = seeds.derive_seed(self.seed, "light", group_index)
         # The configuration is that of the first image of the group, whichever image
         # comes first.
         predictor = self.method.make_predictor(
@@ -603,9 +612,11 @@ class SweepPredictor:
         deviation = self._compare(predictor, number, seed)
         self.deviations.append(deviation)
         self._n_traced_of_group[group] = predictor.n_traced_images + deviation.n_traced
-        if not deviation.is_accepted:
+        if deviation.is_accepted:
+            self._predictors[group] = predictor
+        else:
+            self._predictors[group] = None
             self.rendered_groups.add(group)
-        self._predictors[group] = predictor if deviation.is_accepted else None
         self.seconds += time.perf_counter() - begin
         return self._predictors[group]
 
@@ -630,7 +641,11 @@ class SweepPredictor:
             return self.problem.judge(round_to_8_bit(image), u).margin
 
         def compare_view(check: int) -> ComparedView:
-            """Compare a random image of the group with a traced one."""
+            """Compare a random image of the group with a traced one.
+
+            Args:
+                check: index of the comparison, for the seeds.
+            """
             index = seeds.derive_seed(seed, "check", check) % self._groups.group_size
             u = self._make_configuration(number, index)
             (predicted,) = predictor.predict_images([u])
@@ -684,15 +699,14 @@ class SweepPredictor:
         if self.rendered_groups:
             reason = (
                 f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were "
-                "rendered: "
-                "predicted pictures were too far off"
+                "rendered: predicted pictures were too far off"
             )
         predictor_bytes = sum(
             predictor.n_bytes
             for predictor in self._predictors.values()
             if predictor is not None
         )
-        # Sweeps use no matrix, so that there are no entries, and none was renewed.
+        # `entries` and `renewed` are about the matrix of an attack. Sweeps have none.
         return LinearTransport(
             used=True,
             method=self.method.name,
@@ -719,18 +733,21 @@ def combine_transport(
         nothing moves in any scene.
     """
     summaries = [summary for summary in all_summaries if summary is not None]
-    used = [summary for summary in summaries if summary.used]
-    if not used:
+    with_predictions = [summary for summary in summaries if summary.used]
+    if not with_predictions:
         return summaries[-1] if summaries else None
-    reasons = [summary.reason for summary in used if summary.reason]
-    errors = [summary.error for summary in used if summary.error]
+    reasons = [summary.reason for summary in with_predictions if summary.reason]
+    errors = [summary.error for summary in with_predictions if summary.error]
+    # `levels` is how far an image was off, in levels of 8 bits.
+    worst_error = max(errors, key=lambda error: error.levels or 0.0, default=None)
     update = {
         "reason": reasons[0] if reasons else None,  # as an example for all
-        "bytes": max(summary.bytes or 0 for summary in used),
-        "seconds": math.fsum(summary.seconds or 0.0 for summary in used),
-        "error": max(errors, key=lambda error: error.levels or 0.0, default=None),
+        "bytes": max(summary.bytes or 0 for summary in with_predictions),
+        "seconds": math.fsum(summary.seconds or 0.0 for summary in with_predictions),
+        "error": worst_error,
     }
-    return used[0].model_copy(update=update)
+    # The other fields, such as the method, are the same in all scenes.
+    return with_predictions[0].model_copy(update=update)
 
 
 def prepare_surface_light(
@@ -764,12 +781,7 @@ def prepare_surface_light(
     if not moves_camera or not can_follow:
         return
     state = verifier.run_state
-    refusal = find_scene_refusal(problem.renderer)
-    min_images = find_break_even(problem.renderer, state.spp)
-    if refusal is None and n_images < min_images:
-        reason = f"light on surfaces pays from {min_images} pictures on"
-        # Each trial counts as a step here.
-        refusal = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
+    refusal = _find_light_refusal(problem.renderer, state.spp, n_images)
     state.predictor_refusal = refusal
     if refusal is not None:
         return
@@ -783,3 +795,22 @@ def prepare_surface_light(
     state.predictor_refusal = light.accuracy_refusal
     is_accurate = light.accuracy_refusal is None
     state.predictor = light if is_accurate else None
+
+
+def _find_light_refusal(renderer: Renderer, spp: int, n_images: int) -> Refusal | None:
+    """Return why light on surfaces is not tried; None if it is.
+
+    Args:
+        renderer: renderer of the images.
+        spp: samples per pixel of the images.
+        n_images: number of images under one light.
+    """
+    refusal = find_scene_refusal(renderer)
+    if refusal is not None:
+        return refusal
+    min_images = find_break_even(renderer, spp)
+    if n_images >= min_images:
+        return None
+    reason = f"light on surfaces pays from {min_images} pictures on"
+    # The cause is named after an attack, in which each image is a step.
+    return Refusal(reason, RefusalCause.TOO_FEW_STEPS)

@@ -102,11 +102,11 @@ def count_predictions(
 
 def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
     """Return how often each outcome occurs, by its name; None if all are unknown."""
-    counts = np.bincount(outcome, minlength=len(OUTCOMES))
+    # An outcome is an index of `OUTCOMES`, or `UNKNOWN_OUTCOME`, which is larger.
+    counts = np.bincount(outcome, minlength=len(OUTCOMES))[: len(OUTCOMES)]
     count_by_name = {
         known.value: int(count)
-        # not strict: `counts` may go on to the count of `UNKNOWN_OUTCOME`
-        for known, count in zip(OUTCOMES, counts, strict=False)
+        for known, count in zip(OUTCOMES, counts, strict=True)
         if count
     }
     return count_by_name or None
@@ -172,7 +172,8 @@ class Predictions:
         label = judgement.prediction.label
         self.has_prediction[row] = True
         self.is_right[row] = judgement.right
-        # A judgement's `success` is that of an attack: the prediction is wrong.
+        # A wrong prediction is a success of an attack. If the prediction is not a
+        # number, it is neither right nor a success.
         self._wrong[row] = judgement.success
         self.margin[row] = judgement.margin
         self.is_out_of_view[row] = label == OUT_OF_VIEW
@@ -232,7 +233,7 @@ class Predictions:
 
         Args:
             models: names of the models.
-            units: maps images to draws.
+            units: maps images to independent units, such as draws.
 
         Returns:
             The comparison for each model that has pairs.
@@ -245,13 +246,13 @@ class Predictions:
         for model, name in enumerate(models):
             images = np.flatnonzero(both_counted[:, model])
             if len(images):
-                draws = units.find_cluster(images)
+                unit_of_image = units.find_cluster(images)
                 pairs.append(
                     _compare_pairs(
                         name,
                         right[:, images, model],
                         outcome[:, images, model],
-                        np.asarray(draws),
+                        np.asarray(unit_of_image),
                     )
                 )
         return pairs
@@ -395,8 +396,8 @@ def _order_for_map(axes: Sequence[TableAxis]) -> list[TableAxis]:
     """Return the axes in the order of preference for a map.
 
     Axes of the grid come first. Then come those outside of the scene in reverse order,
-    so that the model is preferred to the object. Sampled numbers are returned only if
-    there are none of these.
+    since the model comes after the object and is preferred. Sampled numbers (kind
+    "drawn") are returned only if there are none of these.
     """
     grid = [axis for axis in axes if axis.kind == "grid"]
     outside = [axis for axis in axes if axis.kind == "outside"]

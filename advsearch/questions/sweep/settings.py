@@ -331,7 +331,7 @@ class SweepConfig(SceneConfig):
         has_grid = bool(stated_settings.get("grid"))
         has_controls = bool(stated_settings.get("controls"))
         if not has_grid and not has_controls:
-            # The attack's own controls are fixed; the sweep varies its conditions.
+            # What the attack searched is fixed; its random conditions vary here.
             settings["controls"] = attack_config.over
         return settings
 

@@ -396,7 +396,7 @@ class SweepSummary(CountedPredictions, RunResult):
     def outcome_summary(self) -> str:
         """The result in a few words."""
         if self.arms and self.arms.pairs:
-            rates = self.arms.pairs[0]
+            rates = self.arms.pairs[0]  # of the first model
             return (
                 f"accuracy {rates.clean.accuracy:.1%}, {rates.adversarial.accuracy:.1%} "
                 f"with {self.arms.adversarial_run}"

@@ -50,6 +50,8 @@ Float64Array = npt.NDArray[np.float64]
 N_PERMUTATIONS = 199
 # probability that any part is significant if no part affects the predictions
 SIGNIFICANCE_LEVEL = 0.05
+# numbers of a compared part; see `_compute_comparison`
+COMPARISON_COLUMNS = ("difference", "low", "high", "p")
 
 
 class PartCounts:
@@ -82,8 +84,8 @@ class PartCounts:
             n_images: number of images that will be added.
             n_failures: number of these whose prediction is wrong.
             seed: seed of the permutations.
-            permuted_failures: permutations from `permute_draws`; None permutes single
-                images while they are added.
+            permuted_failures: permutations from `permute_draws`, if images share draws;
+                None permutes single images while they are added.
         """
         self.permuted_failures = permuted_failures
         self.n_images = n_images
@@ -91,7 +93,7 @@ class PartCounts:
         self.visible_counts = np.zeros(n_parts, np.int64)
         self.wrong_counts = np.zeros(n_parts, np.int64)
         self.permuted_counts = np.zeros((N_PERMUTATIONS, n_parts), np.uint32)
-        # for the sequential sampling in `add_image`; failures left in each permutation
+        # images that are still to be added, and failures left in each permutation
         self._images_left = n_images
         self._failures_left = np.full(N_PERMUTATIONS, n_failures)
         self._random = np.random.default_rng(seed)
@@ -109,23 +111,27 @@ class PartCounts:
         """
         self.visible_counts[parts] += 1
         self.wrong_counts[parts] += failed
-        if self.permuted_failures is not None:
-            # The column of this image has one bit for each permutation.
+        if self.permuted_failures is None:
+            is_failure = self._sample_permutations()
+        else:
             image = self.n_images - self._images_left
+            # (bytes,) one bit for each permutation
             packed_bits = self.permuted_failures[:, image]
             is_failure = np.unpackbits(packed_bits, count=N_PERMUTATIONS).astype(bool)
-        else:
-            # Sequential sampling (Knuth's algorithm S): an image is a failure with the
-            # probability failures left / images left, so that each choice of
-            # `n_failures` images is equally likely.
-            uniform = self._random.random(N_PERMUTATIONS)
-            is_failure = uniform * self._images_left < self._failures_left
         self._images_left -= 1
-        # In each permutation in which the image is a failure (True is 1), one failure
-        # fewer is left, and each of its parts has one failure more.
-        self._failures_left = self._failures_left - is_failure
         failing_permutations = np.flatnonzero(is_failure)
+        self._failures_left[failing_permutations] -= 1
         self.permuted_counts[np.ix_(failing_permutations, parts)] += 1
+
+    def _sample_permutations(self) -> npt.NDArray[np.bool_]:
+        """Sample whether the next image is a failure in each permutation.
+
+        This is sequential sampling (Knuth's algorithm S): the probability is failures
+        left / images left, so that each choice of `n_failures` images is equally
+        likely.
+        """
+        uniform = self._random.random(N_PERMUTATIONS)
+        return uniform * self._images_left < self._failures_left
 
 
 def compare_parts(
@@ -143,45 +149,56 @@ def compare_parts(
             hide it, for a comparison.
 
     Returns:
-        A row for each part, by its index; NaN if it was not `compared`. `difference`:
-        fraction of wrong predictions where the part is visible, minus that where it is
-        hidden; `low` and `high`: bounds of its 95 % interval for this part alone, NaN
-        if images share a draw; `p`: probability that any part would differ at least as
-        clearly by chance; `significant`: whether `p` is at most `SIGNIFICANCE_LEVEL`;
-        `strength`: distance of the interval from 0, which is 0 if the interval contains
-        0. Without an interval `strength` is the absolute difference.
+        A row for each part, by its index; NaN if it was not `compared`. Columns:
+        `difference`, `low`, `high` and `p`, as `_compute_comparison` returns them;
+        `significant`: whether `p` is at most `SIGNIFICANCE_LEVEL`;
+        `strength`: see `_compute_strength`.
     """
     n_visible = counts.visible_counts[part_slice]
     n_hidden = counts.n_images - n_visible
     is_compared = (n_visible >= min_images) & (n_hidden >= min_images)
-    # the columns that `_compute_comparison` returns, in its order
-    nan_columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
     part_indices = np.arange(len(counts.visible_counts))[part_slice]
-    parts = pd.DataFrame(nan_columns, index=part_indices).assign(compared=is_compared)
+    parts = pd.DataFrame(np.nan, index=part_indices, columns=list(COMPARISON_COLUMNS))
     if is_compared.any():
-        columns = _compute_comparison(counts, part_indices[is_compared])
-        parts.loc[is_compared, list(nan_columns)] = columns
-    has_no_interval = parts.low.isna()
-    # If the interval lies above 0, its distance from 0 is `low`; if it lies below,
-    # `-high`. The other one is negative then. If it contains 0, both are.
-    distance_from_0 = np.maximum(parts.low, -parts.high)
-    strength = np.where(has_no_interval, parts.difference.abs(), distance_from_0)
+        compared_parts = part_indices[is_compared]
+        parts.loc[compared_parts] = _compute_comparison(counts, compared_parts)
     return parts.assign(
+        compared=is_compared,
         significant=parts.p <= SIGNIFICANCE_LEVEL,
-        strength=np.nan_to_num(np.maximum(strength, 0.0)),
+        strength=_compute_strength(parts),
     )
 
 
-def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
-    """Compute difference, lower bound, upper bound and p-value of parts, (m, 4).
+def _compute_strength(parts: pd.DataFrame) -> Float64Array:
+    """Compute how clearly each part differs, (n,).
 
-    The difference is the rate of wrong predictions where the part is visible, minus
-    that where it is hidden. If images share a draw, they are not independent, and the
-    bounds are NaN.
+    That is the distance of the interval from 0, which is 0 if the interval contains 0.
+    Without an interval it is the absolute difference; 0 if the part was not compared.
+
+    Args:
+        parts: the `COMPARISON_COLUMNS` of each part.
+    """
+    # An interval above 0 has the distance `low`, one below 0 the distance `-high`. In
+    # both cases the other number is negative. If the interval contains 0, both are.
+    distance_from_0 = np.maximum(parts.low, -parts.high)
+    has_interval = parts.low.notna()
+    strength = np.where(has_interval, distance_from_0, parts.difference.abs())
+    return np.nan_to_num(np.maximum(strength, 0.0))
+
+
+def _compute_comparison(counts: PartCounts, parts: Int64Array) -> pd.DataFrame:
+    """Compare the rates of wrong predictions where parts are visible and hidden.
 
     Args:
         counts: counts of all parts.
         parts: (m,) indices of the parts to compare.
+
+    Returns:
+        A row for each part, by its index. `difference`: rate of wrong predictions where
+        the part is visible, minus that where it is hidden; `low` and `high`: bounds of
+        its 95 % interval for this part alone, NaN if images share a draw, since they
+        are not independent then; `p`: probability that any part would differ at least
+        as clearly by chance.
     """
     n = counts.visible_counts[parts]
     k = counts.wrong_counts[parts]
@@ -193,7 +210,8 @@ def _compute_comparison(counts: PartCounts, parts: Int64Array) -> Float64Array:
         low = np.full(len(n), np.nan)
         high = np.full(len(n), np.nan)
     p_value = _compute_permutation_p_value(counts, k, n, parts)
-    return np.stack([difference, low, high, p_value], axis=1)
+    columns = np.stack([difference, low, high, p_value], axis=1)
+    return pd.DataFrame(columns, index=parts, columns=list(COMPARISON_COLUMNS))
 
 
 def _compute_permutation_p_value(
@@ -375,6 +393,7 @@ class SurfaceCounts:
                 self._describe_part(part, counts, compared)
                 for part in self._select_spread(compared[is_candidate])
             ]
+        # `counts` has the parts of all kinds, `compared` only those of this one.
         visible_counts = counts.visible_counts[self.parts.part_slices[kind]]
         return SurfaceTable(
             object=object_name,
@@ -524,14 +543,20 @@ def _make_counts(
 def _find_draws(
     scenes: SceneLoader, wrong: npt.NDArray[np.int8], job: Job
 ) -> npt.NDArray[Any]:
-    """Return the draw of each image, (scenes, images of a scene)."""
+    """Return the draw of each image, (scenes, images of a scene).
+
+    Images are numbered through all scenes. Which image has which draw is the same for
+    all sizes of images, so those of the first size are used.
+    """
+    n_scenes, images_per_scene, _ = wrong.shape
     units = (
         scenes.load_scene(0)
         .configurations_by_size[job.image_sizes[0]]
         .independent_units
     )
-    image_numbers = np.arange(wrong[..., 0].size)
-    return np.asarray(units.find_cluster(image_numbers)).reshape(wrong.shape[:2])
+    image_numbers = np.arange(n_scenes * images_per_scene)
+    draws = np.asarray(units.find_cluster(image_numbers))
+    return draws.reshape(n_scenes, images_per_scene)
 
 
 def _make_part_counts(
@@ -620,25 +645,27 @@ def permute_draws(
         seed: seed of the permutations.
 
     Returns:
-        (bytes of N_PERMUTATIONS bits, known images) whether the predictions are wrong
-        in each permutation; None if each image has a draw of its own. A known image may
-        get an unknown prediction, which counts as not wrong.
+        Whether each image with a known prediction gets a wrong one, in each
+        permutation: uint8 (bytes, known images), where the bits of a column are the
+        permutations. A known image may get an unknown prediction, which counts as not
+        wrong. None if each image has a draw of its own.
     """
-    is_known = wrong != UNKNOWN
-    draw_sizes = np.unique(draws, return_counts=True)[1]  # images of each draw
+    _, draw_sizes = np.unique(draws, return_counts=True)
     n_draws = len(draw_sizes)
-    if draw_sizes.max(initial=1) == 1:
+    is_independent = draw_sizes.max(initial=1) == 1
+    if is_independent:
         return None
+    is_known = wrong != UNKNOWN
     is_wrong = wrong == 1
     # (draws, images of a draw): row k has the indices of the images of draw k
     images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
     generator = np.random.default_rng(seed)
-    permuted = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
-    for permutation_index in range(N_PERMUTATIONS):
-        order = generator.permutation(n_draws)
-        source_images = images_of_draw[order]
-        permuted[permutation_index, images_of_draw] = is_wrong[source_images]
-    return np.packbits(permuted[:, is_known], axis=0)
+    permuted_is_wrong = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
+    for permutation in permuted_is_wrong:  # a view of one row, which is filled
+        # The images of each draw get the predictions of another draw.
+        source_images = images_of_draw[generator.permutation(n_draws)]
+        permutation[images_of_draw] = is_wrong[source_images]
+    return np.packbits(permuted_is_wrong[:, is_known], axis=0)
 
 
 def _write_map(
@@ -767,8 +794,8 @@ def _list_arrays(
             `compare_parts`.
 
     Returns:
-        Arrays (models,) or (models, parts), and "map", which has the corners of the
-        parts.
+        Arrays (models,) or (models, parts), and "map": where the corners of each face
+        of the mesh lie on the map, (faces, 3, 2).
     """
     model_counts = counts.part_counts_of_model
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -778,7 +805,7 @@ def _list_arrays(
         "wrong": np.stack([part_counts.wrong_counts for part_counts in model_counts]),
     }
     for column in ("difference", "low", "high", "p"):
-        # Parts are numbered by kind, in the order of the kinds.
+        # The columns of all kinds, one after the other, are in the order of the parts.
         column_of_model = [
             np.concatenate([compared[column] for compared in compared_by_kind.values()])
             for compared_by_kind in comparisons
@@ -802,7 +829,7 @@ def _compute_grey_colors(
         cells: comparison of the cells, from `compare_parts`.
     """
     was_visible = counts.visible_counts[parts.part_slices["cell"]] > 0
-    # A cell may be visible though its center, which `is_covered` tests, is not covered.
+    # `is_covered` tests only the center of a cell. Another point of it may be visible.
     has_surface = parts.is_covered.ravel() | was_visible
     is_compared = cells.compared.to_numpy()
     colors = np.where(is_compared[:, None], NOT_SIGNIFICANT_GREY, NOT_COMPARED_GREY)

@@ -220,24 +220,26 @@ def track_drive(
         iou: intersection over union with the true box from which on a track is on the
             object.
     """
-    track_frame = tracker()
+    track_frame = tracker()  # a function that takes the boxes of the next frame
     last_number: int | None = None
     is_lost = list[bool]()
     n_switches = 0
     for frame in frames:
         tracks = track_frame(frame.boxes, frame.scores)
         is_visible = frame.true_box is not None
+        # pairs of overlap and number of the track
         on_object = _find_tracks_on(tracks, frame.true_box, iou)
         is_lost.append(is_visible and not on_object)
         if not on_object:
             continue
         if any(number == last_number for _, number in on_object):
-            continue
-        _, number = max(on_object)  # pairs of overlap and number: the largest overlap
+            continue  # the same track still follows the object
+        _, number = max(on_object)  # the track with the largest overlap
         if last_number is not None:
             n_switches += 1
         last_number = number
-    # Lengths of the runs of lost frames. A frame without the object ends a run.
+    # Lengths of the runs of lost frames. A frame without the object ends a run. Each
+    # True counts as 1 in the sum.
     gaps = [sum(run) for lost, run in itertools.groupby(is_lost) if lost]
     n_visible = sum(frame.true_box is not None for frame in frames)
     return DriveTracking(

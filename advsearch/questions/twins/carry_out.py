@@ -256,6 +256,7 @@ class Comparison:
         """
         if self._config.margin is not None:
             return self._config.margin
+        # The ground truth of a detector, a box, varies between images.
         is_detector = self._judges[0].task.varies
         return DETECTOR_MARGIN if is_detector else CLASSIFIER_MARGIN
 
@@ -527,14 +528,15 @@ class Comparison:
         Args:
             number: number of the object, which is that of the row.
             selection: all selected objects.
-            make_twin: function that renders the twins; it is cached, since all models
-                share them.
+            make_twin: function that renders the images of the object, which a `Twin`
+                has; it is cached, since all models share them.
             judge: judge of the model.
         """
         item = selection.objects[number]
         window = selection.window_by_row_number[number]
         twin = make_twin()
         facts = self._make_facts(item, twin)
+        pose_overlap = rendering.measure_pose(item, twin, window)
         return TwinRow(
             number=number,
             model=judge.model.name,
@@ -549,7 +551,7 @@ class Comparison:
             contrast=twin.contrast,
             texture=twin.texture_correlation,
             visible=item.visible,
-            overlap=rendering.measure_pose(item, twin, window),
+            overlap=pose_overlap,
             predictions=list(judge.predict(item.frame, twin, facts)),
         )
 
@@ -615,12 +617,12 @@ def rank_disagreement(row: TwinRow) -> tuple[bool, float]:
     """Return a key that sorts the rows with the largest disagreements first.
 
     Rows in which only one of the photograph and its composed twin is right come first.
-    Within these and the others, a larger difference of the margins comes first.
+    Within these, and within the others, a larger difference of the margins comes first.
     """
     twin = row.twin(COMPOSED)
     difference = abs(row.photo.margin - twin.margin)
     if not math.isfinite(difference):
-        difference = math.inf
+        difference = math.inf  # so that NaN has a place in the order: the first
     agrees = row.photo.right == twin.right
     return agrees, -difference
 

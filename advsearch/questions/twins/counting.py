@@ -148,8 +148,9 @@ def estimate_kappa(
 ) -> results.Estimate | None:
     """Return Cohen's kappa, the agreement of right and wrong beyond chance.
 
-    None if the photograph or the twin is wrong in too few units: then the interval
-    would say nothing. It may well be right in few.
+    None if the predictions about the photographs, or those about the twins, are wrong
+    in too few units: then the interval would say nothing. How few are right does not
+    matter.
     """
     agreement = statistics.agreement
     for wrong in (photo_wrong, twin_wrong):
@@ -206,6 +207,7 @@ def estimate_box_agreement(
             used_rows.append(row)
     if not used_rows:
         return None
+    # Rows of one frame are not independent.
     return estimate_rate(np.array(agrees), number_units(used_rows))
 
 

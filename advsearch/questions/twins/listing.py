@@ -140,7 +140,7 @@ def read_photographs(path: Path) -> Listing:
             f"photographs: {path} names {listing.n_missing} objects in photographs, "
             "and none of these photographs is in it; copy them, or name another folder"
         )
-    # The function puts the limit into the text.
+    # `{}` in the text becomes the limit.
     stored_files.check_most(
         path, len(listing.objects), MAX_VIEWS, "at most {} objects in photographs"
     )
@@ -360,7 +360,7 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
     A row is a mapping. Rows of CSV have texts as values, and no keys for empty cells.
     """
     suffix = path.suffix.lower()
-    is_yaml = suffix not in (".csv", ".json")  # YAML has two suffixes
+    is_yaml = suffix not in (".csv", ".json")  # ".yaml" or ".yml"
     text = stored_files.read_existing_text(
         path, "a list of photographs", MAX_YAML_BYTES if is_yaml else MAX_JSON_BYTES
     )
@@ -373,11 +373,10 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
     elif suffix == ".json":
         rows = stored_files.parse_text(path, text, "JSON", stored_files.parse_json)
     else:
-        # imports torch
-        from advsearch.extend import workbench
+        from advsearch.extend import workbench  # imports torch
 
         rows = stored_files.parse_text(path, text, "YAML", workbench.parse_yaml)
-    if isinstance(rows, dict):
+    if isinstance(rows, dict):  # JSON or YAML with the list under this key
         rows = rows.get("photographs")
     if not _is_rows(rows):
         raise errors.FileFormatError(

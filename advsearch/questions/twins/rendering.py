@@ -130,7 +130,7 @@ def choose_window(
     high = positions.max(axis=0)
     photo_height, photo_width = photo_size
     longer = float((high - low).max())
-    is_left_or_above = high.min() <= 0.0  # the largest x or the largest y
+    is_left_or_above = high[0] <= 0.0 or high[1] <= 0.0
     is_right_or_below = low[0] >= photo_width or low[1] >= photo_height
     if is_left_or_above or is_right_or_below or longer < MIN_SILHOUETTE:
         return None
@@ -139,7 +139,7 @@ def choose_window(
     widened = high - low + 2.0 * margin * longer
     # the smallest size with the model's aspect ratio that contains the widened box
     size = model_width_height * float((widened / model_width_height).max())
-    size *= min(1.0, photo_width / size[0], photo_height / size[1])
+    size *= min(1.0, photo_width / size[0], photo_height / size[1])  # not larger
     width, height = (max(1, math.floor(side)) for side in size)
     center = (low + high) / 2.0
     return PhotoWindow(
@@ -214,7 +214,8 @@ class LayerRenderer:
         # The photograph already has the object's shadow, so no ground is rendered.
         settings = {"ground.size": 0.0}
         scene = workbench.load_scene(asset, light, unit=unit, settings=settings)
-        # The control "background" puts a backdrop in place of the environment.
+        # The control "background" puts a backdrop in place of the environment. Here it
+        # is the photograph, which `_make_image_inputs` passes.
         self._renderer = scene.renderer({"background": {}}, resolution=film, seed=seed)
         # used to lay renders over photographs (`_make_image_inputs`)
         self._description = scene.description
@@ -237,7 +238,7 @@ class LayerRenderer:
             item: the object; its mesh is that of this renderer.
             photograph: photograph that shows it.
             window: window of the photograph around the object.
-            model_size: (height, width) of the sight that is returned for tasks.
+            model_size: (height, width) of the masks and depths that tasks get.
             number: number of the row, from which the seed of the noise is derived.
         """
         renderer = self._renderer
@@ -278,8 +279,8 @@ class LayerRenderer:
         in_window = replace(photograph, crop=window, front=front)
         description = self._description.with_backdrop(in_window)
         size = (window.height, window.width)
-        # The renderer applies the gain of its scene. The exposure corrects it to the
-        # gain that suits this photograph.
+        # The renderer applies the gain of its scene. The exposure corrects it to that
+        # which `with_backdrop` computes for this photograph.
         stops = math.log2(description.gain / self._renderer.formation.gain)
         return {
             **reading.backdrop.make_image_inputs(description, size),
@@ -462,8 +463,8 @@ def choose_film(windows: Sequence[PhotoWindow], pixel_aspect: float) -> tuple[in
         pixel_aspect: fx / fy of the camera.
     """
     largest = max(windows, key=lambda window: window.width * window.height)
-    # A pixel is `pixel_aspect` times as high as wide, in angles. Here heights are in
-    # widths of a pixel.
+    # A pixel of the photograph is `pixel_aspect` times as high as wide. The unit of
+    # this height is the width of a pixel.
     height = largest.height * pixel_aspect
     longer = max(largest.width, height)
     side = FILM_STEP * math.ceil(longer / FILM_STEP)  # rounded up
@@ -477,7 +478,8 @@ def compute_mesh_to_camera(
 ) -> Float64Array:
     """Return the rigid map (4, 4) from a mesh to OpenCV's camera coordinates.
 
-    Both are in units of the object's size: the scale does not change the image.
+    Lengths on both sides are in units of the object's size. The image does not depend
+    on the unit.
 
     Raises:
         InputError: the object is a bundled one, which has no file coordinates.
@@ -621,7 +623,7 @@ def load_object(mesh: Path, unit: str) -> assets.ObjectAsset:
     Raises:
         InputError: the file cannot be used.
     """
-    # z up and the front at +x are those of the scene, so that nothing is rotated.
+    # These are the directions of the scene, so that the mesh is not rotated.
     scene = workbench.load_scene(mesh, up="z", facing="+x", unit=unit)
     asset: assets.ObjectAsset = scene.description.object
     return asset

@@ -455,7 +455,7 @@ def _describe_overlap(result: TwinsResult) -> str:
     if result.overlap is None:
         return ""
     text = f"median overlap {result.overlap:.2f}"
-    if result.low_overlaps:
+    if result.low_overlaps:  # see `carry_out.LOW_OVERLAP`
         text += f"; under .8 in {result.low_overlaps}"
     return text
 
@@ -470,7 +470,11 @@ def summarize_twins(table: Sequence[results.TwinAgreement]) -> str:
 
 
 def summarize_composed(composed: results.TwinAgreement) -> str:
-    """Summarise how far twins in photographs hold for one model."""
+    """Summarize how often twins in photographs and the photographs agree.
+
+    Args:
+        composed: counts of one model for objects rendered into the photographs.
+    """
     agreement = wording.format_estimate(composed.agreement)
     counts = (
         f"{wording.format_count(composed.pairs, 'pair')} of "
@@ -507,7 +511,7 @@ def _make_pair_parts(result: TwinsResult) -> Iterator[ResultPart]:
             for image in row.predictions
         ]
         lines.append(f"{name}: {'; '.join(texts)}")
-        # Fewer images are stored than there are predictions: the last have none.
+        # The images of the last surroundings may not be stored.
         captions = texts[: len(pair.pictures)]
         if captions:
             captions[0] = f"{name}, {row.size:.0f} pixels. {captions[0]}"
