@@ -139,20 +139,16 @@ def cut_controls(
             not sampled, are skipped.
         arc: index of the arc, for conditions on angles.
     """
-    controls = {
-        instance: dict(control_settings)
-        for instance, control_settings in config.controls.items()
-    }
+    controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
-        is_on_names = condition.options is not None
-        if is_on_names or not is_sampled(config, condition.factor):
+        # `condition.options` is not None for a condition on names.
+        if condition.options is not None or not is_sampled(config, condition.factor):
             continue
         # the name of the control in the settings, and its parameter: "pose.yaw"
         instance, _, parameter = condition.factor.partition(".")
         declared = config.declared_parameters(instance) or {}
         low, high = _find_range(condition, table, arc)
-        passes_full_circle = high > declared[parameter].high
-        if passes_full_circle:
+        if high > declared[parameter].high:  # an arc that passes 360 degrees
             continue
         # `config` has no ranges that were added here for other conditions.
         had_ranges = bool(declared.keys() & config.controls[instance].keys())

@@ -94,7 +94,7 @@ class MeasuredRounds:
         most_expensive_of_line: dict[Any, SampleSetting] = {}
         # Later settings replace earlier ones, so that the most expensive one is left.
         for known_setting in sorted(
-            self.wall_seconds, key=lambda called_setting: called_setting.relative_cost
+            self.wall_seconds, key=lambda earlier_setting: earlier_setting.relative_cost
         ):
             most_expensive_of_line[known_setting.estimator_key] = known_setting
         seconds_per_cost = {
