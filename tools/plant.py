@@ -280,7 +280,7 @@ FAULTS = (
     Fault(
         "viewer: any name leads to the server",
         "advsearch/trust/pages.py",
-        "if not _is_server_address(host, named, port, token):",
+        "if not _is_server_address(host, listen_host, port, token):",
         "if not host:",
         ("tests/viewer/test_server.py",),
     ),

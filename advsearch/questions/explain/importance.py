@@ -248,9 +248,8 @@ class ClusteredPredictions:
             error_degrees = float(self.n_clusters - n_groups)
             corrected_fraction = fraction - chance_statistic / n_rows
 
-        statistic = n_rows * fraction / design_effect
         lower_noncentrality, upper_noncentrality = noncentrality_interval(
-            statistic, degrees, error_degrees
+            n_rows * fraction / design_effect, degrees, error_degrees
         )
         lower = min(design_effect * lower_noncentrality / n_rows, 1.0)
         upper = min(design_effect * upper_noncentrality / n_rows, 1.0)

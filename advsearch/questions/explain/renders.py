@@ -14,6 +14,7 @@ from itertools import zip_longest
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import torch
 
@@ -613,16 +614,21 @@ def find_typical_failures(
         is_unassigned[indices] = False
         if not len(indices):
             continue
-        mean_ranks = ranks[indices].mean(axis=0)
-        distance = np.abs(ranks[indices] - mean_ranks).sum(axis=1)
-        most_typical_first = indices[np.argsort(distance, kind="stable")].tolist()
-        groups.append([(index, conditions) for index in most_typical_first])
+        # the failures nearest to the mean of their group first
+        order = _sort_by_distance_from_mean(ranks[indices])
+        groups.append([(index, conditions) for index in indices[order].tolist()])
     failures = []
     # the most typical failure of each group, then the second one of each, and so on
     for failures_of_groups in zip_longest(*groups):
         # `zip_longest` yields None for a group that has no more failures.
         failures += [failure for failure in failures_of_groups if failure is not None]
     return failures[:limit]
+
+
+def _sort_by_distance_from_mean(ranks: rules.FloatArray) -> npt.NDArray[np.intp]:
+    """Return the order of rows (n, parameters) by their distance from the mean row."""
+    distance = np.abs(ranks - ranks.mean(axis=0)).sum(axis=1)
+    return np.argsort(distance, kind="stable")
 
 
 def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
