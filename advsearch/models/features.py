@@ -166,9 +166,10 @@ def _find_last_layer(
         return None
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     last = (heads or usable)[-1]
-    # the attribute of a call that holds the features
+    # the attribute of a call (`_Call`) that holds the features
     attribute = "input" if heads else "output"
-    if getattr(last, attribute) is None:  # the input is no activation, see `_Call`
+    has_features = getattr(last, attribute) is not None  # an input may be a weight
+    if not has_features:
         return None
 
     def read(batch: Tensor) -> Tensor:

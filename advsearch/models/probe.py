@@ -648,6 +648,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     # why there is no gradient, for the warning
     reason = "it is zero everywhere"
     try:
+        # the gradient of the network as it is, without ignoring `detach`
         first = _compute_first_gradient(model, images, repeatable)
         if first.reason is not None:
             reason = first.reason
@@ -665,9 +666,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     except (RuntimeError, ModelError) as error:
         has_gradient = False
         reason = get_first_line(error)
-        # The wrapper for 8 bits may be inside another wrapper.
-        networks = (model.module, getattr(model.module, "network", None))
-        if any(type(network) is EightBitInput for network in networks):
+        if _rounds_to_eight_bit(model.module):
             reason = (
                 "it takes whole numbers from 0 to 255, uint8, and rounding to these "
                 "has none"
@@ -678,6 +677,13 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
             "`auto` or a policy without gradients"
         )
     return dataclasses.replace(model, differentiable=has_gradient)
+
+
+def _rounds_to_eight_bit(module: object) -> bool:
+    """Return whether a network is wrapped to round its images to 8 bits."""
+    # This wrapper may be inside another one.
+    networks = (module, getattr(module, "network", None))
+    return any(type(network) is EightBitInput for network in networks)
 
 
 class _FirstGradient(NamedTuple):
@@ -719,7 +725,7 @@ def _compute_first_gradient(
             reason = get_first_line(error)
             no_gradient = torch.zeros_like(images)
             return _FirstGradient(rows, no_gradient, has_detached=True, reason=reason)
-    return _FirstGradient(rows, gradient, detaching.has_detached)
+    return _FirstGradient(rows, gradient, has_detached=detaching.has_detached)
 
 
 def _try_attached(

@@ -708,8 +708,9 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     likelihoods = logits[0, -len(name_tokens) - 1 : -1].float().log_softmax(dim=-1)
     expected = likelihoods.gather(1, name_tokens[:, None]).sum().double()
     computed = module(image[None])[0, index].double()
-    size = max(1.0, abs(float(expected)))
-    if not are_nearly_equal(expected, computed, size, loaded.network.dtype):
+    # The tolerance is relative to this number.
+    magnitude = max(1.0, abs(float(expected)))
+    if not are_nearly_equal(expected, computed, magnitude, loaded.network.dtype):
         raise _make_unsupported_error(
             loaded,
             "computes another likelihood with its cache than without "

@@ -413,8 +413,8 @@ def _build_grounding_dino(
     if len(token_index) != len(words):
         raise InputError(
             f"labels: model {name} reads the names as one text with full stops between "
-            f"them, in which these {len(words)} are {len(token_index)}; leave . and ? "
-            "out of names and prompt"
+            f"them, in which it finds {len(token_index)} names instead of {len(words)}; "
+            "leave . and ? out of names and prompt"
         )
 
     def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:

@@ -197,22 +197,28 @@ class SweepRunner:
                 self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
             )
             for arc in range(n_arcs):
-                # a number that is distinct for each rule, sweep and arc
-                number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
-                seed = seeds.derive_seed(self.config.seed, "confirm", number)
                 self.progress.message(
                     f"rule {index + 1}: rendering about {samples} "
                     "configurations inside it"
                 )
+                # a number that is distinct for each rule, sweep and arc
+                number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
                 config = make_sweep_inside(
-                    sweep.config, self.factor_table, rule.conditions, samples, seed, arc
+                    sweep.config,
+                    self.factor_table,
+                    rule.conditions,
+                    samples,
+                    seed=seeds.derive_seed(self.config.seed, "confirm", number),
+                    arc=arc,
                 )
                 suffix = f"-{arc}" if arc else ""
                 rows = self.run_sweep(f"rule-{index + 1}-{sweep_index}{suffix}", config)
+                # None after an interrupt, or if nothing could be rendered
                 if rows is None:
                     continue
                 inside = select_inside(rows, rule.conditions, earlier_conditions)
-                # Draws of other sweeps may have the same indices.
+                # Draws of other sweeps may have the same indices: with this number
+                # their names differ, such as "12 of 3".
                 unit = inside["unit"].astype(str) + f" of {number}"
                 fresh_frames.append(inside.assign(unit=unit))
         return fresh_frames
