@@ -133,8 +133,8 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
         names = [_normalize_name(name) for name in group]
         if key in names:
             synonyms += [name for name in names if name in indices_of_name]
-    similar = find_similar_names(word, indices_of_name)
-    contains_word = any(key in name for name in similar)
+    similar = find_similar_names(word, indices_of_name)  # keys of the mapping
+    contains_word = any(key in name for name in similar)  # as a part of the name
     if synonyms and not contains_word:
         # A synonym is a better suggestion than a name that is only spelled alike.
         similar = []

@@ -101,6 +101,7 @@ def make_feature_source(
         )
     network = loaded.network
     config = network.config
+    # the network without a head: features are its output
     backbone = network
     if zero_shot.encodes_images_and_texts(network):
         zero_shot.check_takes_pictures(network, loaded.spec)

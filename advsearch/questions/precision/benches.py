@@ -340,7 +340,7 @@ class PictureBench:
         self._margin = margin
         self._space = renderer.space
         self._formation = renderer.formation
-        # All samplers without denoiser, then two of them with a denoiser.
+        # The lines: all samplers without denoiser, then two of them with a denoiser.
         self._estimators = list(samplers)
         for name in ("independent", REFERENCE_SAMPLER):
             if name in samplers:

@@ -704,9 +704,9 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
     x = point.seconds
     y = PERCENT * point.rms_error
     lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
-    # An interval is not drawn if it is missing (NaN), or if its upper bound is over
-    # four times the error.
-    if upper < 4.0 * y:
+    # A very wide interval would dominate the diagram. A missing one is NaN.
+    has_drawn_interval = upper < 4.0 * y
+    if has_drawn_interval:
         axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
     axes.plot(
         [x],

@@ -96,8 +96,7 @@ class ReplayCondition:
             rounding). Conditions with the same key share it; None for a condition that
             shares none.
         change_image: function that is applied to the image before the model gets it;
-        None if
-            there is none.
+            None if there is none.
         unavailable_reason: why the condition cannot be rendered here; empty if it can.
     """
 
@@ -378,6 +377,8 @@ def photograph_conditions(
         threads: {"threads": number of threads} for the problems; empty for the number
             of the run.
     """
+    # by name, the parts of the attack in each photograph: those that the search did not
+    # use, and those that it used
     other_photographs, used_photographs = workbench.move_to_photographs(parts, folder)
     if len(used_photographs) == 1:
         used_photographs = {}

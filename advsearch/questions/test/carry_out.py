@@ -59,8 +59,7 @@ class PlannedClaim:
         config: settings with which it is tested.
         counterexample: the counterexample; None for a claim of the suite.
         unsuitable_reason: why a counterexample cannot be tested on the model; empty if
-        it can. If
-            it cannot, `config` has the settings with which it was found.
+            it can. If it cannot, `config` has the settings with which it was found.
     """
 
     name: str
@@ -275,7 +274,7 @@ class _SuiteRun:
 
         There are three reasons. First, a counterexample has failed unexpectedly: then
         claims are not tested unless the setting `all` is set. Second, the time is over.
-        Third, a counterexample does not suit the model.
+        Third, a counterexample does not suit the model (`unsuitable_reason`).
         """
         counterexample_failed = any(
             result.kind == "counterexample" and not result.accepted
@@ -353,8 +352,8 @@ class _SuiteRun:
     def make_result(self, ending: str, added: Counterexample | None) -> SuiteResult:
         """Make the result of the claims so far.
 
-        With the setting `update`, the verdicts of a complete run are stored as the
-        expected verdicts.
+        With the setting `update`, the verdicts of a complete run are also stored as the
+        expected verdicts of the suite.
 
         Args:
             ending: status of the run.

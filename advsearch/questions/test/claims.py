@@ -82,8 +82,7 @@ class _OtherSide(NamedTuple):
     Attributes:
         journal: evaluates the other side, and stores its evaluations.
         change_image: changes the image of the model under test to that of the other
-        side;
-            None if the other side renders its own image.
+            side; None if the other side renders its own image.
     """
 
     journal: workbench.Journal
@@ -97,8 +96,7 @@ class _PictureScore(NamedTuple):
         score: from 0 (against the claim) to 1 (for it); None if the image does not
             count, because the object is out of view.
         violation_score: rank as an example against the claim: the image with the
-        largest value
-            is reported.
+            largest value is reported.
         text: description of the predictions.
     """
 
