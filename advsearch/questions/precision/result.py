@@ -705,8 +705,8 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
     y = PERCENT * point.rms_error
     lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
     # A very wide interval would dominate the diagram. A missing one is NaN.
-    has_drawn_interval = upper < 4.0 * y
-    if has_drawn_interval:
+    is_narrow = upper < 4.0 * y
+    if is_narrow:
         axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
     axes.plot(
         [x],

@@ -461,6 +461,7 @@ def _make_ground(
     # from 0 to 1 where the corners are at -1 and 1
     texture_coordinates = corners[:, :2] * np.float32(0.5) + np.float32(0.5)
     mesh = assets.Mesh(corners * half_size, faces, normals, texture_coordinates)
+    # one texel of the color of the ground, which is in sRGB already
     texture = np.full((1, 1, 3), scene.ground_color, np.float32)
     return [assets.Shape("ground", mesh, texture, MATT)]
 
