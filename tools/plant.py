@@ -337,8 +337,8 @@ FAULTS = (
     Fault(
         "explain: what chance adds is not taken off",
         "advsearch/questions/explain/importance.py",
-        "corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / residual_degrees",
-        "corrected_share = share",
+        "1.0 - (1.0 - fraction) * (n_rows - 1) / residual_degrees",
+        "fraction",
         ("tests/questions/test_rules.py",),
     ),
     Fault(

@@ -129,6 +129,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         tokens=purpose.tokens,
         n_answers_per_image=purpose.times if is_free else 1,
     )
+    # A free answer is in words: such a model has no names.
     if not is_free:
         module.names = purpose.names or _request_names(module)
         if len(module.names) < 2:
@@ -140,6 +141,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         module=module,
         name=name,
         labels=module.names,
+        # The model takes images of any size: they are sent as they are rendered.
         preprocessing=models.Preprocessing(
             (models.DEFAULT_SIZE, models.DEFAULT_SIZE), resizes=False
         ),
@@ -444,8 +446,7 @@ class AddressModel(models.RemoteNetwork):
         """Return the answer to each image and turn: a stored one, or a new one.
 
         Each new answer is stored as it arrives, so that an interrupted run loses none.
-        An equal image with an equal turn is sent only once. Trials of one configuration
-        are all sent, since their noise differs.
+        An equal image with an equal turn is sent only once.
 
         Args:
             requests: images, each with its turn. The turn is the index of the request
@@ -461,8 +462,10 @@ class AddressModel(models.RemoteNetwork):
             request = json.dumps([body, turn, self.spec]).encode()
             key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
             keys.append(key)
-            answers[key] = self._read_stored_answer(key)
-            if not isinstance(answers[key], dict):  # it is not stored, or corrupt
+            stored_answer = self._read_stored_answer(key)
+            if isinstance(stored_answer, dict):
+                answers[key] = stored_answer
+            else:  # there is none, or it is corrupt
                 new_bodies[key] = body
         new_keys = list(new_bodies)
         read_answer = self._read_chat if self.chat_model_name else self._read_plain
@@ -489,8 +492,8 @@ class AddressModel(models.RemoteNetwork):
     def _make_body(self, image: Image8Bit) -> dict[str, Any]:
         """Return the JSON body of a request about an image.
 
-        It follows the protocol of OpenAI's chat if `chat_model_name` is not empty, and else the
-        plain protocol, {"image": PNG in base64, "prompt": question}.
+        It follows the protocol of OpenAI's chat if `chat_model_name` is not empty, and
+        else the plain protocol, {"image": PNG in base64, "prompt": question}.
         """
         encoded = base64.b64encode(models.encode_levels(image)).decode()
         if not self.chat_model_name:
@@ -633,6 +636,7 @@ class AddressModel(models.RemoteNetwork):
         max_concurrent = self._max_concurrent()
         while pending:
             models.INTERRUPTS.raise_pending()
+            # fewer than requested, if a limit is near
             count = self._reserve(min(max_concurrent, len(pending)))
             batch = pending[:count]
             del pending[:count]
@@ -641,15 +645,17 @@ class AddressModel(models.RemoteNetwork):
             )
             failures = list[str]()
             retries = list[_Request]()
-            # Whether this is the first batch of the run; `_reserve` has already counted
-            # its calls. If the connection is refused now, there is no server, and
-            # another try is pointless.
-            is_first = self.spent["calls"] <= len(batch)
+            # `_reserve` has already counted the calls of this batch. If the connection
+            # is refused in the first one, there is no server, and another try is
+            # pointless.
+            is_first_batch = self.spent["calls"] <= len(batch)
             for request, response in zip(batch, responses, strict=True):
                 if isinstance(response, dict):
                     yield request.index, response
                     continue
-                reason, retry = self._plan_retry(request, response, first=is_first)
+                reason, retry = self._plan_retry(
+                    request, response, first=is_first_batch
+                )
                 if retry is None:
                     failures.append(reason)
                 else:
@@ -657,23 +663,22 @@ class AddressModel(models.RemoteNetwork):
             # Raised only after the loop, so that no response of the batch is lost.
             if failures:
                 raise errors.ModelError(failures[0])
-            pending = self._wait_to_retry(retries) + pending
+            self._wait_for_longest(retries)
+            # twice the delay, for the case that they fail again
+            retries = [replace(request, delay=2 * request.delay) for request in retries]
+            pending = retries + pending
 
-    def _wait_to_retry(self, retries: Sequence[_Request]) -> list[_Request]:
-        """Wait before requests that failed are sent again.
-
-        The longest of their delays is waited for. They are returned with twice the
-        delay, for the case that they fail again.
-        """
+    def _wait_for_longest(self, retries: Sequence[_Request]) -> None:
+        """Wait for the longest delay of requests that are sent again, if there are any."""
         if retries:
             time.sleep(min(max(request.delay for request in retries), MAX_DELAY))
-        return [replace(request, delay=2 * request.delay) for request in retries]
 
     def _max_concurrent(self) -> int:
         """Return how many requests may be sent at once.
 
         It is one if tokens or their cost are limited: how many tokens a request takes
-        is known only from its response.
+        is known only from its response, and other requests that were sent at the same
+        time could exceed the limit.
         """
         has_money_limit = self.limits["money"] < LIMITS["money"]  # default: infinity
         limits_token_cost = self._priced_by_token and has_money_limit
@@ -708,7 +713,8 @@ class AddressModel(models.RemoteNetwork):
     def _reserve(self, max_count: int) -> int:
         """Count calls as spent before they are made, as many as the limits allow.
 
-        They are counted first, so that a crash leaves no call uncounted. Tokens are
+        They are counted first, so that a crash leaves no call uncounted. Each counted
+        call may reach the limit of calls, or that of money by its price. Tokens are
         known only after a call, so that their limit stops later calls.
 
         Args:
@@ -723,11 +729,14 @@ class AddressModel(models.RemoteNetwork):
         count = 0
         while count < max_count:
             spent = self._spent_by_limit
-            reached = [name for name in spent if spent[name] >= self.limits[name]]
-            if reached and count:
+            reached_limits = [
+                name for name in spent if spent[name] >= self.limits[name]
+            ]
+            if reached_limits and count:
                 break  # the calls that are counted so far may be made
-            if reached:
-                raise self._make_limit_error(reached[0], spent[reached[0]])
+            if reached_limits:
+                name = reached_limits[0]
+                raise self._make_limit_error(name, spent[name])
             self.spent["calls"] += 1
             count += 1
         self._store_spent()
@@ -748,8 +757,8 @@ class AddressModel(models.RemoteNetwork):
     ) -> list[dict[str, Any] | Exception]:
         """Send bodies at the same time, and return the response to each, or its error.
 
-        It takes at most the limit of `seconds`, whatever a server does: connections
-        that are still open after that are closed.
+        It takes at most `limits["seconds"]`, whatever a server does: connections that
+        are still open after that are closed.
         """
         seconds = self.limits["seconds"]
         deadline = time.monotonic() + seconds
@@ -763,7 +772,9 @@ class AddressModel(models.RemoteNetwork):
             timeout = min(seconds, threading.TIMEOUT_MAX)
             done = futures_wait(futures, timeout=timeout).done
         finally:
-            pool.shutdown(wait=False)  # after Ctrl-C nobody waits for answers
+            # After Ctrl-C the answers are not waited for. The threads end when their
+            # connections are closed.
+            pool.shutdown(wait=False)
             for connection in connections:
                 connection.break_off()
         timed_out = TimeoutError(f"timed out: no answer within {seconds:g} seconds")

@@ -84,18 +84,20 @@ def features_of(model: Model) -> Features:
     running an exported graph node by node. If neither finds one, features are the
     logits minus their mean.
     """
-    # two images, because with one it is not clear which axis is the batch
+    # Two images, if the network takes them: with one, an axis of size 1 that is not the
+    # batch would look like it.
     batch_size = min(2, model.batch_limits[1])
     gray = torch.full((batch_size, *model.input_size, 3), 0.5)
     with torch.no_grad():
         x = model.prepare(gray)
         for trace_calls in (_trace_modules, _trace_graph):
-            reader_and_source = _find_last_layer(trace_calls, model, x)
-            if reader_and_source is not None:
-                read, source = reader_and_source
+            reader_and_layer = _find_last_layer(trace_calls, model, x)
+            if reader_and_layer is not None:
+                read, layer_description = reader_and_layer
                 size = read(x).shape[1]
-                return Features(model, read, size, f"the {source}, {size} numbers")
-    source = (
+                description = f"the {layer_description}, {size} numbers"
+                return Features(model, read, size, description)
+    description = (
         f"the logits, {model.classes} numbers: no layer before them can be read in "
         f"a {type(model.module).__name__}"
     )
@@ -105,7 +107,7 @@ def features_of(model: Model) -> Features:
         logits: Tensor = model.run_network(x)
         return logits - logits.mean(dim=1, keepdim=True)
 
-    return Features(model, center_logits, model.classes, source, penultimate=False)
+    return Features(model, center_logits, model.classes, description, penultimate=False)
 
 
 class _Call(NamedTuple):
@@ -129,8 +131,8 @@ class _Call(NamedTuple):
 
 Calls = Callable[[Any, Tensor, Any], list[_Call]]
 """Runs a network (first argument) on a batch (second argument), and returns the calls
-of its layers in their order. The third argument is the only layer of interest; None for
-all layers.
+of its layers in their order. If the third argument is a layer, only its calls are
+returned.
 """
 
 
@@ -164,9 +166,10 @@ def _find_last_layer(
         return None
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     last = (heads or usable)[-1]
-    # the attribute of the call that holds the features
+    # the attribute of a call (`_Call`) that holds the features
     attribute = "input" if heads else "output"
-    if getattr(last, attribute) is None:  # the input is no activation, see `_Call`
+    has_features = getattr(last, attribute) is not None  # an input may be a weight
+    if not has_features:
         return None
 
     def read(batch: Tensor) -> Tensor:
@@ -189,7 +192,7 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         network: any network; a scripted program, or what is no `nn.Module`, has no such
             calls.
         x: a batch to run it on.
-        only: the only layer of interest; None for all.
+        only: if set, only calls of this layer are recorded; a layer of the network.
     """
     calls: list[_Call] = []
     is_program = isinstance(network, torch.jit.ScriptModule)
@@ -215,6 +218,7 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         input = args[0] if args else kwargs["input"]
         keeps_batch = len(input) == len(output) and input.dim() > 1
         if keeps_batch:
+            # The name is "" if the network itself is a layer.
             name = f"{names[layer] or 'the network'} ({type(layer).__name__})"
             # Convolutions have (N, channels, ...).
             channel_axis = -1 if isinstance(layer, nn.Linear) else 1
@@ -235,7 +239,7 @@ def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
         network: any network; only a graph, such as a `torch.export` program, has such
             calls.
         x: a batch to run it on.
-        only: the only node of interest; None for all.
+        only: if set, only calls of this node are recorded.
     """
     calls: list[_Call] = []
 
@@ -253,6 +257,8 @@ def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
                 # Weights come from `get_attr` nodes, activations from other nodes.
                 activation = None
                 if isinstance(source, fx.Node) and source.op != "get_attr":
+                    # `env` has the values of all nodes that are still needed. Those of
+                    # this node's arguments are deleted after this method.
                     activation = self.env[source]
                 call = _Call(
                     layer=n,

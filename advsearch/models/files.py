@@ -154,7 +154,8 @@ def _load_torchscript(archive: Archive) -> Source:
         if problem:
             raise FileFormatError(f"model file {path}: {problem}")
     with warnings.catch_warnings(), _report_corrupt(path, "TorchScript"):
-        # torch 2.14 and later warn by the second category.
+        # Older versions of torch warn that TorchScript is deprecated by the first
+        # category; 2.14 and later by the second one.
         for category in (DeprecationWarning, FutureWarning):
             warnings.filterwarnings(
                 "ignore",
@@ -268,8 +269,9 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     names = [name for name in program.graph_signature.user_inputs if name in nodes]
     # Example values with shape and dtype, as torch.export records them ("val").
     examples = [nodes[name].meta.get("val") for name in names]
-    is_rig = _check_inputs(source, names, examples)
+    takes_rigs = _check_inputs(source, names, examples)
     images = examples[0]
+    # A second input (N, 2) with such a name is the size of each image.
     takes_sizes = (
         len(names) == 2 and names[1] in SIZE_INPUTS and examples[1].shape[1] == 2
     )
@@ -278,19 +280,31 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
         source = replace(source, size_type=examples[1].dtype)
     else:
         # Any other second input must come from the user as a `state` (`takes_more`).
-        # `size_type` is reset, as `make_source` guesses it from names of inputs alone.
+        # `make_source` may have guessed from the names of inputs that sizes are taken.
         source = replace(source, takes_more=len(examples) > 1, size_type=None)
-    source = _apply_image_input(source, images, is_rig=is_rig)
+    source = _apply_image_input(source, images, is_rig=takes_rigs)
     min_batch, max_batch = _find_batch_limits(program, images.shape[0])
-    if not is_rig:
-        return replace(source, batch_limits=(min_batch, max_batch))
-    cameras = int(images.shape[1])
+    source = replace(source, batch_limits=(min_batch, max_batch))
+    if takes_rigs:
+        return _wrap_rig_network(source, cameras=int(images.shape[1]))
+    return source
+
+
+def _wrap_rig_network(source: Source, cameras: int) -> Source:
+    """Return the source of a network of rigs, wrapped as a network of single images.
+
+    Args:
+        source: source of the network, whose batch limits count rigs.
+        cameras: number of cameras, and so of images, of a rig.
+    """
+    # `AllAtOnce` takes images (N, 3, H, W), the default layout, and converts them.
     layout = "NKHWC" if source.layout == "NHWC" else "NKCHW"
+    min_rigs, max_rigs = source.batch_limits
     return replace(
         source,
         module=AllAtOnce(cast(nn.Module, source.module), cameras, layout),
         layout=None,
-        batch_limits=(min_batch * cameras, max_batch * cameras),
+        batch_limits=(min_rigs * cameras, max_rigs * cameras),
     )
 
 
@@ -463,7 +477,8 @@ class OnnxNetwork(nn.Module):
         Args:
             *tensors: its inputs, in the order of the file.
         """
-        # Each run has new options: the ones that `stop` used would end this run, too.
+        # Each run has new options: `stop` sets a flag in the options of a run, and that
+        # flag would end this run, too.
         self.options = self.new_options()
         names = [tensor.name for tensor in self.session.get_inputs()]
         named = {
@@ -505,6 +520,7 @@ def load_onnx(path: Path) -> Source:
     metadata = session.get_modelmeta().custom_metadata_map
     has_fixed_size = all(isinstance(size, int) for size in input_size)
     if not has_fixed_size:
+        # empty if the file does not state it
         input_size = _parse_image_size(metadata.get("imgsz", ""))
     source = Source(
         OnnxNetwork(session, runtime.RunOptions),
@@ -513,6 +529,7 @@ def load_onnx(path: Path) -> Source:
         layout="NHWC" if is_channels_last else "NCHW",
         labels=parse_names(metadata.get("names", "")),
         batch_limits=(batch_size, batch_size) if has_fixed_batch else (1, MAX_BATCH),
+        # `make_eight_bit` wraps a network of uint8 so that it takes float32.
         dtype=torch.float32 if is_eight_bit else FLOATS[images.type],
         # a second input is the sizes of the images, see `_check_onnx_inputs`
         size_type=SIZE_TYPES[inputs[1].type] if len(inputs) > 1 else None,
@@ -575,7 +592,7 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
     takes_images = (
         len(image_shape) == 4
         and (inputs[0].type == "tensor(uint8)" or inputs[0].type in FLOATS)
-        and min(fixed_sizes, default=1) > 0
+        and all(size > 0 for size in fixed_sizes)
     )
     other_inputs = inputs[1:]
     takes_sizes = (

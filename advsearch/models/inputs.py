@@ -160,8 +160,8 @@ class WithState(nn.Module):
             return self.network(images, state) if state else self.network(images)
         reset = getattr(self.network, "reset", None)
         if reset is not None:
-            reset()
-        # A policy may switch gradients on or off as it runs. The mode is set to its
-        # present value so that it is restored in the end.
+            reset()  # forgets an earlier image
+        # A policy may switch gradients on or off as it runs: this context restores the
+        # switch at its end.
         with torch.set_grad_enabled(torch.is_grad_enabled()):
             return select({PICTURE: images, **state})

@@ -120,7 +120,7 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
         Index and name of each class; the name is the part of the label that matched:
         "frying pan" of "frying pan, frypan, skillet".
     """
-    # A label with commas is left out: its parts have entries of their own.
+    # A label with commas is left out, because each name in it has its own entry.
     indices_of_name = {
         name: indices
         for name, indices in _make_name_table(labels).items()
@@ -133,8 +133,8 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
         names = [_normalize_name(name) for name in group]
         if key in names:
             synonyms += [name for name in names if name in indices_of_name]
-    similar = find_similar_names(word, indices_of_name)
-    contains_word = any(key in name for name in similar)
+    similar = find_similar_names(word, indices_of_name)  # keys of the mapping
+    contains_word = any(key in name for name in similar)  # as a part of the name
     if synonyms and not contains_word:
         # A synonym is a better suggestion than a name that is only spelled alike.
         similar = []
@@ -313,13 +313,18 @@ class LabelsOrigin(NamedTuple):
 
 
 def find_labels_origin(labels: object) -> LabelsOrigin:
-    """Return where labels come from, see `read_labels`."""
+    """Return where labels come from: the model, a file, or the user.
+
+    Args:
+        labels: what the user wrote, see `read_labels`; None for the model's labels.
+    """
     if labels is None:
         return LabelsOrigin("labels of the model")
-    is_path = isinstance(labels, (str, os.PathLike)) and str(labels) not in SETS
-    if is_path and not _is_name_list(labels):  # type: ignore[arg-type]
+    is_text = isinstance(labels, (str, os.PathLike))
+    is_named_set = str(labels) in SETS
+    if is_text and not is_named_set and not _is_name_list(labels):  # type: ignore[arg-type]
         return LabelsOrigin(f"label file {labels}", is_file=True)
-    return LabelsOrigin()
+    return LabelsOrigin()  # the user's names, or a named set
 
 
 def read_prompts(prompts: str | Sequence[str] | None) -> tuple[str, ...] | None:

@@ -243,14 +243,16 @@ def _check_reads_text(source: Source | Model, spec: object) -> None:
 
     Args:
         source: what was found for `spec`.
-        spec: what the user passed to `load_model`; it is `source` itself if that is a
-            `Model`.
+        spec: what the user passed to `load_model`. If that is a `Model`, then `source`
+            is the same object.
     """
     if isinstance(source, Source):
         reads_text = source.reads_text
     else:
+        # a language model behind an address
         reads_text = isinstance(source.module, RemoteNetwork)
-    if source is spec or not reads_text:
+    is_model_of_user = source is spec
+    if is_model_of_user or not reads_text:
         raise InputError(
             f"prompt: model {source.name} has its own classes and "
             "reads no text; leave `prompt` out"
@@ -278,8 +280,8 @@ def _adapt_model(
 
     Args:
         model: the model, whose preprocessing stays.
-        options: options of the preprocessing that the user set. Any of them is an
-            error, as the model has its preprocessing.
+        options: options of the preprocessing that the user set. Each of them is an
+            error, as the model already has its preprocessing.
         read: finds the output in what the network returns; None for the model's own
             reader.
         name: name of the model; None for its own.
@@ -294,8 +296,8 @@ def _adapt_model(
             f"model {model.name} has its own preprocessing: leave out "
             f"{', '.join(options)}, or load its network again"
         )
-    # `spec` can load the model again only without another name or other labels. `read`
-    # is not compared, since it usually follows from the task.
+    # `spec` alone does not load the model with another name or other labels. Another
+    # `read` does not matter, since it usually follows from the task.
     has_same_names = names is None and name is None
     adapted_model = replace(
         model,
@@ -338,7 +340,7 @@ def _probe_source(
     model = Model(
         module=_adapt_to_images_alone(source, preprocessing),
         name=name or source.name,
-        labels=(),
+        labels=(),  # `probe_model` sets them, when the number of classes is known
         preprocessing=preprocessing,
         # The option `max_batch` cannot go below what the network needs.
         batch_limits=(min_batch, max(min_batch, max_batch)),
@@ -355,8 +357,9 @@ def _adapt_to_images_alone(
 ) -> Callable[[Tensor], Any]:
     """Return the network of a source as one that is called with images alone.
 
-    Some networks also take the size of the images: the result passes it to them. A
-    network with a state, such as a speed, is already wrapped (`WithState`).
+    Some networks also take the size of the images (`size_type` is the type in which
+    they take it): the result passes it to them. The inputs of a network with a state,
+    such as a speed, are already complete: `WithState` passes all of them.
 
     Args:
         source: source of the network.
@@ -425,8 +428,8 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
         UnknownNameError: the text has none of these forms.
         InputError: it names a Python file instead of a module ("nets.py:build").
     """
-    network, weights = split_weights(text)
-    if network == "reference":
+    name, weights = split_weights(text)  # weights are the file behind an @
+    if name == "reference":
         return reference.load(weights=weights)
     prefix = text.partition(":")[0].lower()
     if ":" in text and prefix in SOURCES:
@@ -437,7 +440,8 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
             f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'"
         )
     if parse_code_reference(text) is not None:
-        # `SOURCES` is only for a message: the package may be a misspelt source.
+        # If there is no such package, it may be a misspelt source: the message of the
+        # error then has similar names of `SOURCES`.
         return load_callable(text, SOURCES)
     is_path = (
         Path(text).suffix.lower() in files.SUFFIXES
@@ -553,7 +557,8 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     if source.value_range is not None:
         fields["value_range"] = source.value_range
     fields |= _parse_normalization(options)
-    if any(number <= 0 for number in fields["std"] or ()):
+    std = fields["std"] or ()  # None if it is not stated
+    if any(number <= 0 for number in std):
         raise InputError(
             "std: expected numbers greater than 0, got "
             f"{options.get('std', fields['std'])!r}"
@@ -565,7 +570,8 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     for key, choices in (("layout", ("NCHW", "NHWC")), ("channels", ("RGB", "BGR"))):
         if key in options:
             fields[key] = _parse_choice(key, options[key], choices)
-    # `Preprocessing` has defaults for what neither the source nor the user states.
+    # Fields that neither the source nor the user states are None or empty: for these,
+    # `Preprocessing` has defaults.
     stated_fields = {key: value for key, value in fields.items() if value}
     return Preprocessing(**stated_fields)
 
@@ -598,6 +604,7 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
         value = options.get(key)
         if isinstance(value, str) and value.strip().lower() in PRESETS:
             preset_mean, preset_std = PRESETS[value.strip().lower()]
+            # The preset does not replace the other option, if the user stated it.
             if key == "mean" or "mean" not in options:
                 fields["mean"] = preset_mean
             if key == "std" or "std" not in options:

@@ -74,6 +74,7 @@ class _Recomputed(torch.autograd.Function):
         create_graph = torch.is_grad_enabled()
         with torch.enable_grad():
             if not create_graph:
+                # The graph of this computation begins at the images.
                 images = images.detach().requires_grad_()
             tensors, _ = tree_flatten(ctx.function(images))
         outputs = []
@@ -99,9 +100,9 @@ class _Recomputed(torch.autograd.Function):
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
     """Return `function(images)` without storing activations.
 
-    For the gradient, the function is computed a second time. So the activations of only
-    one batch are in memory at a time (Chen et al. 2016, *Training Deep Nets with
-    Sublinear Memory Cost*, section 3).
+    For the gradient, the function is computed a second time. If each batch is passed by
+    a call of its own, memory holds the activations of one batch at a time (Chen et al.
+    2016, *Training Deep Nets with Sublinear Memory Cost*, section 3).
 
     Args:
         function: function that returns a tensor, or lists and mappings of tensors.
@@ -358,21 +359,19 @@ class Model:
             ModelError: the network's output is not (N, classes), or `read` finds no
                 output in it.
         """
-        images = check_images(images)
-        if self.cameras > 1:
-            # (N, H, cameras * W, 3) to (N * cameras, H, W, 3)
-            images = images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
+        images = self._split_cameras(check_images(images))
         # whether activations are computed again for the gradient, and not stored
         recomputes = self._must_recompute(images)
 
         def return_to_device(output: Tensor) -> Tensor:
             """Return an output on the device of the images.
 
-            It is a copy, because a network may write into the same memory again.
+            It is a copy, because the network may write its next output into the same
+            memory. An output with a gradient is a new tensor in each call.
             """
             returned = output.to(images.device)
-            is_same_memory = returned is output and not output.requires_grad
-            return returned.clone() if is_same_memory else returned
+            may_be_overwritten = returned is output and not output.requires_grad
+            return returned.clone() if may_be_overwritten else returned
 
         def run_batch(batch: Tensor) -> Any:
             """Return the output for a batch of images (N, H, W, 3)."""
@@ -386,13 +385,29 @@ class Model:
             for batch in images.split(self._find_max_batch(recomputes=recomputes))
         ]
         output = outputs[0] if len(outputs) == 1 else join_outputs(outputs)
+        return output if self.cameras == 1 else self._group_by_image(output)
+
+    def _split_cameras(self, images: Tensor) -> Tensor:
+        """Return the images of all cameras, (N * cameras, H, W, 3).
+
+        Args:
+            images: (N, H, cameras * W, 3), the cameras side by side.
+        """
         if self.cameras == 1:
-            return output
-        # one tuple for each original image, with the output for each of its cameras
-        image_outputs = [output[index : index + 1] for index in range(len(output))]
+            return images
+        return images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
+
+    def _group_by_image(self, output: Any) -> list[tuple[Any, ...]]:
+        """Return a tuple for each image, with the output for each of its cameras.
+
+        Args:
+            output: tensor or list with an element for each camera of each image.
+        """
+        # A slice of one element keeps the batch axis of a tensor.
+        camera_outputs = [output[index : index + 1] for index in range(len(output))]
         return [
-            tuple(image_outputs[start : start + self.cameras])
-            for start in range(0, len(image_outputs), self.cameras)
+            tuple(camera_outputs[start : start + self.cameras])
+            for start in range(0, len(camera_outputs), self.cameras)
         ]
 
     def _must_recompute(self, images: Tensor) -> bool:
@@ -413,16 +428,17 @@ class Model:
     def _find_max_batch(self, *, recomputes: bool) -> int:
         """Return the maximum number of images in a batch.
 
-        The images of all cameras of a rig stay in one batch, if they fit into it. With
-        `recomputes`, a batch has at most `MAX_STORED_IMAGES`, because the activations
-        of one batch are in memory at a time.
+        The images of all cameras of a rig stay in one batch, if they fit into it.
+
+        Args:
+            recomputes: whether the activations of each batch are computed again for
+                the gradient. Then memory is saved by batches of at most
+                `MAX_STORED_IMAGES`.
         """
         max_batch = self.batch_limits[1]
-        if self.cameras > 1:
-            # The largest multiple of the number of cameras. It is 0 if a single rig has
-            # more images than are allowed: then the batch is as large as is allowed.
-            n_images_of_full_rigs = max_batch - max_batch % self.cameras
-            max_batch = max(n_images_of_full_rigs, min(max_batch, self.cameras))
+        fits_full_rig = max_batch >= self.cameras
+        if fits_full_rig:
+            max_batch -= max_batch % self.cameras  # as many full rigs as fit
         return min(max_batch, MAX_STORED_IMAGES) if recomputes else max_batch
 
     def copy_network(self) -> nn.Module:
@@ -445,11 +461,13 @@ class Model:
     def with_network(self, network: nn.Module) -> Model:
         """Return the same model with another network of the same kind.
 
-        The model has a copy of the network in evaluation mode that shares its weights:
-        it follows them when they are trained in place, and collects no gradients for
-        them.
+        The model has a copy of the network in evaluation mode that shares the memory of
+        its weights: the copy follows when the network is trained in place. Parameters
+        of the copy are other objects, which collect no gradients; those of `network`
+        still do.
         """
         shared = copy_sharing_weights(network).eval().requires_grad_(False)
+        # `make_trainable` would return the weights of the old network.
         return replace(self, module=shared, make_trainable=None)
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
@@ -479,8 +497,10 @@ class Model:
             batch = torch.cat([images, images[-1:].expand(n_missing, -1, -1, -1)])
         batch = batch.to(device=self.device, dtype=torch.float32)
         x = self.preprocessing(batch).to(self.dtype)
-        is_view = x.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
-        return x.clone() if is_view else x
+        shares_memory = (
+            x.untyped_storage().data_ptr() == images.untyped_storage().data_ptr()
+        )
+        return x.clone() if shares_memory else x
 
     def run_network(self, x: Tensor, *, raw: bool = False) -> Any:
         """Run the network on a batch that `prepare` returned.
@@ -495,12 +515,13 @@ class Model:
             value.
         """
         INTERRUPTS.raise_pending()  # ends here after Ctrl-C
-        # In an `attached` model, gradients also go through what its network detaches.
-        ignores_detach = self.attached and torch.is_grad_enabled()
-        mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
-        # The network may switch gradients on or off as it runs. The mode is set to its
-        # present value so that it is restored in the end.
-        with mode, torch.set_grad_enabled(torch.is_grad_enabled()):
+        computes_gradients = torch.is_grad_enabled()
+        # For an `attached` model, `detach` does nothing, so that gradients pass it.
+        ignores_detach = self.attached and computes_gradients
+        detach_mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
+        # The network may switch gradients on or off as it runs: this context restores
+        # the switch at its end.
+        with detach_mode, torch.set_grad_enabled(computes_gradients):
             returned = self.module(x)
         if raw:
             return returned
@@ -515,23 +536,22 @@ class Model:
 def copy_sharing_weights(module: nn.Module) -> nn.Module:
     """Return a copy of a module that shares its weights, but not their gradients.
 
-    Weights that were created in `torch.inference_mode` are copied, since autograd
-    cannot use them.
+    Parameters of the copy are new objects with the memory of the old ones. Weights that
+    were created in `torch.inference_mode` are copied, since autograd cannot use them.
     """
 
     def make_differentiable(weights: torch.Tensor) -> torch.Tensor:
         """Return weights through which autograd can differentiate."""
         return weights.clone() if weights.is_inference() else weights
 
-    # `deepcopy` uses the object that is stored here under the id of another one in
-    # place of a copy of that one.
-    memo: dict[int, Any] = {}
+    # the object that `deepcopy` uses in place of a copy, by the id of the original
+    replacements: dict[int, Any] = {}
     for parameter in module.parameters():
         weights = make_differentiable(parameter.detach())
-        memo[id(parameter)] = nn.Parameter(weights, parameter.requires_grad)
-    for buffer in module.buffers():
-        memo[id(buffer)] = make_differentiable(buffer)
-    return copy.deepcopy(module, memo)
+        replacements[id(parameter)] = nn.Parameter(weights, parameter.requires_grad)
+    for buffer in module.buffers():  # these have no gradients
+        replacements[id(buffer)] = make_differentiable(buffer)
+    return copy.deepcopy(module, replacements)
 
 
 DETACHING = (torch.Tensor.detach, torch.Tensor.detach_, torch.detach, torch.detach_)
@@ -571,9 +591,10 @@ class DetachMode(TorchFunctionMode):
             kwargs: its keyword arguments.
         """
         if function in DETACHING:
-            self.has_detached = self.has_detached or args[0].requires_grad
+            tensor = args[0]
+            self.has_detached = self.has_detached or tensor.requires_grad
             if self.ignored:
-                return args[0]
+                return tensor
         return function(*args, **(kwargs or {}))
 
 
@@ -653,13 +674,14 @@ def _advise_on_output(returned: Any, task: str | None) -> str:
     advice = _advise_on_missing_scores(returned)
     if advice:
         return advice
+    other_task_advice = "wrap the network, or ask for another task"
+    if task == "command":
+        # Actions have the form of rows of scores: the guess would be classification.
+        return other_task_advice
     likely_task = _guess_task(returned)
-    # The actions that task `command` reads look like rows of scores. So an output that
-    # it cannot read says nothing about the right task.
-    is_certain = task != "command"
-    if likely_task and likely_task != task and is_certain:
+    if likely_task and likely_task != task:
         return _advise_other_task(likely_task)
-    return "wrap the network, or ask for another task"
+    return other_task_advice
 
 
 def describe_output(returned: Any) -> str:
@@ -724,7 +746,8 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
     Raises:
         ModelError: there is no such tensor, or its shape or type is not that of logits.
     """
-    # The usual case, a tensor of the right shape, comes first because it is fast.
+    # The usual case, a tensor of the right shape, comes first because it is fast. It
+    # never applies if `classes` is None.
     if (
         isinstance(output, Tensor)
         and output.is_floating_point()
@@ -765,7 +788,7 @@ def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> N
     Args:
         output: output of the network.
         tensor: tensor of logits in it; None if there is none.
-        expected: beginning of the message.
+        expected: beginning of the message, such as "model net: expected logits".
     """
     advice = _advise_on_missing_scores(output)
     if advice:
@@ -773,7 +796,8 @@ def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> N
         raise ModelError(f"{expected}, got {got}; {advice}")
     likely_task = _guess_task(output)
     other_tasks = ("detection", "segmentation", "depth", "similarity")
-    # A map of scores for each pixel gets the caller's advice on its shape instead.
+    # For a map of scores for each pixel, the caller raises an error with better advice,
+    # about its shape.
     is_map = tensor is not None and tensor.dim() == 4
     if likely_task in other_tasks and not is_map:
         raise ModelError(
@@ -788,7 +812,8 @@ def correct_batch_norm_gradients(output: Any) -> None:
     On the CPU, batch norms of torch 2.13 read the gradient of a single image in a wrong
     order, without a warning, if it comes from ``flatten(2).transpose(1, 2)``. Networks
     whose convolutions are followed by a transformer are examples. Gradients of batches
-    are right. The hooks copy such a gradient to the memory layout of the input.
+    are right. The batch norm assumes that its gradient has the memory layout of its
+    input, so the hooks copy it to that layout.
 
     Args:
         output: output of a network, whose graph gets hooks.
@@ -814,7 +839,7 @@ def correct_batch_norm_gradients(output: Any) -> None:
 
     # Walk back through the graph of the output, and hook every batch norm in it.
     pending: list[Any] = [tensor.grad_fn for tensor in list_tensors(output)]
-    visited = {None}
+    visited = {None}  # a tensor without a graph has the node None
     while pending:
         node = pending.pop()
         if node in visited:

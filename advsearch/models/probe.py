@@ -93,9 +93,9 @@ def probe_model(
     """Run a model on test images, and set the fields of the model that follow from it.
 
     These are `labels`, `probabilities`, `differentiable`, `attached` and
-    `batch_limits`. The images are a gray one and one of uniform noise. AutoAttack looks
-    for probabilities, randomness and missing gradients before an attack, too (Croce and
-    Hein 2020, the flags of its reference implementation).
+    `batch_limits`. The images are a gray one and one of uniform noise. AutoAttack, a
+    set of attacks, checks networks for probabilities, randomness and missing gradients,
+    too (Croce and Hein 2020, the flags of its reference implementation).
 
     Args:
         model: the model, without labels.
@@ -148,7 +148,10 @@ def probe_model(
         named=labels is not None,
         probabilities=probabilities,
         batch_limits=_find_batch_limits(
-            model, torch.cat([gray, noise]), rows if repeatable else None
+            model,
+            torch.cat([gray, noise]),
+            # The outputs for a batch are compared with these of single images.
+            rows if repeatable else None,
         ),
     )
 
@@ -231,8 +234,10 @@ def _compute_output_rows(model: Model, images: Tensor) -> Tensor:
     their sum, and the sum of their absolute values.
     """
     if model.read is None:
-        returned, count = _run_network(model, images)
-        return read_logits(returned, count, None, model.name)[: len(images)].cpu()
+        # The batch may be filled up with copies of an image, whose logits are cut off.
+        returned, batch_size = _run_network(model, images)
+        logits = read_logits(returned, batch_size, classes=None, name=model.name)
+        return logits[: len(images)].cpu()
     rows = []
     for output in _run_and_read(model, images):
         # `cat` needs at least one tensor, but an output may have none: an empty one is
@@ -271,8 +276,8 @@ def _run_network(model: Model, images: Tensor) -> tuple[Any, int]:
     the return value (`raw`).
     """
     x = model.prepare(images)
-    # A network that raises may leave gradients switched on or off. The mode is set to
-    # its present value so that it is restored in the end.
+    # A network that raises may leave gradients switched on or off: this context
+    # restores the switch at its end.
     with torch.set_grad_enabled(torch.is_grad_enabled()):
         returned = _call_guarded(model, lambda: model.run_network(x, raw=True))
         return returned, len(x)
@@ -420,9 +425,10 @@ def _are_probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -
 def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     """Describe scores (N, classes) that are neither logits nor probabilities.
 
-    Scores in [0, 1] are those of a sigmoid if they stay in [0, 1] for colors far
-    outside of it (logits, such as the small ones of an untrained network, do not) and
-    are not all 0 for a black image (means of the image are).
+    Scores in [0, 1] are taken for those of a sigmoid under two conditions. They stay in
+    [0, 1] for colors far outside of that range: small logits, such as those of an
+    untrained network, do not. And they are not all 0 for a black image: means of the
+    image's colors are.
 
     Args:
         model: model that is probed.
@@ -436,8 +442,8 @@ def _describe_odd_scores(model: Model, rows: Tensor) -> str:
     if is_non_negative and float(rows.max()) <= 1.0:
         all_rows = torch.cat([rows, _run_on_extreme_images(model)])
     is_in_unit_range = float(all_rows.min()) >= 0.0 and float(all_rows.max()) <= 1.0
-    has_no_zero_row = bool(all_rows.any(dim=1).all())
-    if is_in_unit_range and has_no_zero_row:
+    every_row_has_score = bool(all_rows.any(dim=1).all())  # a score other than 0
+    if is_in_unit_range and every_row_has_score:
         return (
             "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
         )
@@ -480,11 +486,9 @@ def _check_range(model: Model, images: Tensor) -> None:
         model: model that is probed.
         images: (3, H, W, 3) a black, a white and a random image.
     """
-    network = _unwrap(model.module)
-    # a program from a file; `OnnxNetwork` has a method `stop`
-    is_program = isinstance(network, PROGRAMS) or hasattr(network, "stop")
     returns_logits = model.read is None
-    if _is_range_declared(model) or not (returns_logits or is_program):
+    is_checked = returns_logits or _is_program(_unwrap(model.module))
+    if _is_range_declared(model) or not is_checked:
         return
     outputs = _collect_numbers(model, images)
     if outputs is None or _follows_images(outputs):
@@ -499,8 +503,9 @@ def _check_range(model: Model, images: Tensor) -> None:
     ):
         return
     magnitude = outputs.abs().amax(dim=0).mean()
-    growth = float(wide_outputs.abs().amax(dim=0).mean() / magnitude)
-    # Outputs of untrained networks grow with the colors: these say nothing.
+    wide_magnitude = wide_outputs.abs().amax(dim=0).mean()
+    growth = float(wide_magnitude / magnitude)  # infinite or NaN if all outputs are 0
+    # Outputs of untrained networks grow with the colors in any case: no warning.
     if 1.0 / MAX_GROWTH < growth < MAX_GROWTH:
         warn(
             f"outputs of model {model.name} hardly follow the picture: they differ by "
@@ -509,6 +514,12 @@ def _check_range(model: Model, images: Tensor) -> None:
             f"{_compute_relative_change(wide_outputs):.0%} if colors go from 0 to "
             "255. If it is made for these, give `value_range=0,255`"
         )
+
+
+def _is_program(network: object) -> bool:
+    """Return whether a network is a program from a file, and no Python code."""
+    # Only `OnnxNetwork` has a method `stop`.
+    return isinstance(network, PROGRAMS) or hasattr(network, "stop")
 
 
 def _is_range_declared(model: Model) -> bool:
@@ -542,7 +553,7 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
     rows = []
     for image in images:
         try:
-            returned, _ = _run_network(model, image[None])
+            returned, _batch_size = _run_network(model, image[None])
         except ModelError:
             # A network may reject colors of another range, such as 255.
             return None
@@ -558,8 +569,8 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
     outputs = torch.stack(rows)
     if not bool(outputs.isfinite().all()):
         return None
-    is_score = float(outputs.min()) >= 0.0 and float(outputs.max()) <= 1.0
-    return torch.logit(outputs, eps=1e-6) if is_score else outputs
+    are_scores = float(outputs.min()) >= 0.0 and float(outputs.max()) <= 1.0
+    return torch.logit(outputs, eps=1e-6) if are_scores else outputs
 
 
 def _compute_relative_change(outputs: Tensor) -> float:
@@ -598,7 +609,7 @@ def _find_batch_limits(
     """
     min_batch, max_batch = model.batch_limits
     if isinstance(model.module, AllAtOnce):
-        # The images of a rig stay together.
+        # The images of a rig stay together: the maximum is a multiple of their number.
         cameras = model.module.cameras
         max_batch = max(min_batch, max_batch - max_batch % cameras)
         return max(min_batch, cameras), max_batch
@@ -637,6 +648,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     # why there is no gradient, for the warning
     reason = "it is zero everywhere"
     try:
+        # the gradient of the network as it is, without ignoring `detach`
         first = _compute_first_gradient(model, images, repeatable)
         if first.reason is not None:
             reason = first.reason
@@ -645,7 +657,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
             return dataclasses.replace(model, differentiable=True)
         gradient = first.gradient
         if repeatable and first.has_detached:
-            # May set `model.attached`: then gradients go through `detach`.
+            # The result may have `attached` set: then gradients go through `detach`.
             model, gradient = _try_attached(model, images, gradient)
         has_gradient = bool((gradient != 0).any())
         if has_gradient and repeatable:
@@ -654,8 +666,7 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
     except (RuntimeError, ModelError) as error:
         has_gradient = False
         reason = get_first_line(error)
-        networks = (model.module, getattr(model.module, "network", None))
-        if any(type(network) is EightBitInput for network in networks):
+        if _rounds_to_eight_bit(model.module):
             reason = (
                 "it takes whole numbers from 0 to 255, uint8, and rounding to these "
                 "has none"
@@ -666,6 +677,13 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
             "`auto` or a policy without gradients"
         )
     return dataclasses.replace(model, differentiable=has_gradient)
+
+
+def _rounds_to_eight_bit(module: object) -> bool:
+    """Return whether a network is wrapped to round its images to 8 bits."""
+    # This wrapper may be inside another one.
+    networks = (module, getattr(module, "network", None))
+    return any(type(network) is EightBitInput for network in networks)
 
 
 class _FirstGradient(NamedTuple):
@@ -690,7 +708,8 @@ def _compute_first_gradient(
     """Compute the gradient of a network's outputs with respect to images (N, H, W, 3).
 
     If the network detaches everything, autograd raises an error. If outputs are
-    repeatable, the gradient is then zero: the caller tries to ignore `detach`.
+    repeatable, the result then has a gradient of zero, and the caller tries to ignore
+    `detach`. Otherwise the error is raised.
 
     Raises:
         RuntimeError: there is no gradient for another reason.
@@ -706,7 +725,7 @@ def _compute_first_gradient(
             reason = get_first_line(error)
             no_gradient = torch.zeros_like(images)
             return _FirstGradient(rows, no_gradient, has_detached=True, reason=reason)
-    return _FirstGradient(rows, gradient, detaching.has_detached)
+    return _FirstGradient(rows, gradient, has_detached=detaching.has_detached)
 
 
 def _try_attached(
@@ -715,9 +734,10 @@ def _try_attached(
     """Return the model that ignores `detach`, if its gradient is better.
 
     Each gradient predicts how outputs change over a small step: the one that is closer
-    to the actual change is better. The step follows the sign of their difference, where
-    they disagree most. A network with a straight-through gradient, which rounds behind
-    a `detach`, keeps its own gradient, because ignoring `detach` makes it zero.
+    to the actual change is better. The step follows the sign of the difference of both
+    gradients, since their predictions differ most there. A network with a
+    straight-through gradient, which rounds behind a `detach`, keeps its own gradient,
+    because ignoring `detach` makes it zero.
 
     Args:
         model: model that is probed.
@@ -731,17 +751,18 @@ def _try_attached(
     # A network may have to detach a tensor, such as for numpy, and raises an error if
     # `detach` is ignored. It keeps its own gradient.
     with suppress(RuntimeError, ModelError):
-        attached_gradient = _compute_gradient(attached, images)[1]
+        _, attached_gradient = _compute_gradient(attached, images)
+        # A smaller step would be rounded.
         min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
         for step_size in (STEP, SMALL_STEP):
             step = max(step_size, min_step) * (attached_gradient - gradient).sign()
             change = _measure_change(model, images, step, attached_gradient, gradient)
             attached_change, detached_change = change.predicted
             detached_error = abs(change.actual - detached_change)
-            # The error has to be smaller than that of the network's own gradient, and
-            # small compared to the change.
-            max_error = min(detached_error, MAX_ATTACHED_ERROR * abs(attached_change))
-            if abs(change.actual - attached_change) < max_error:
+            attached_error = abs(change.actual - attached_change)
+            is_better = attached_error < detached_error
+            is_accurate = attached_error < MAX_ATTACHED_ERROR * abs(attached_change)
+            if is_better and is_accurate:
                 return attached, attached_gradient
     return model, gradient
 
@@ -793,7 +814,8 @@ class _Change(NamedTuple):
         actual: the change.
         predicted: the change that each gradient predicts.
         ends: the two batches of images, after the step and before it.
-        total: sum of the absolute values of the outputs for the first batch.
+        total: sum of the absolute values of the outputs after the step. A change that
+            is much smaller may be rounding.
     """
 
     actual: float
@@ -823,6 +845,7 @@ def _measure_change(
     end_rows = _compute_output_rows(model, end)
     start_rows = _compute_output_rows(model, start)
     return _Change(
+        # f is linear in the rows, so that this is f(x + step) - f(x - step).
         actual=float(_compute_checked_value(end_rows - start_rows)),
         predicted=[float(((end - start) * gradient).sum()) for gradient in gradients],
         ends=[end, start],
@@ -859,9 +882,9 @@ def _check_gradient(
                 return  # outputs that jump cannot be compared with a gradient
         predicted = change.predicted[0]  # there is one gradient
         size = max(abs(change.actual), abs(predicted))
-        is_too_small_to_tell = size <= MIN_CHANGE * change.total
+        may_be_rounding = size <= MIN_CHANGE * change.total
         is_predicted = abs(change.actual - predicted) <= MAX_GRADIENT_ERROR * size
-        if is_too_small_to_tell or is_predicted:
+        if may_be_rounding or is_predicted:
             return
     # The change for the last step size is reported.
     reason = "Steps that round, or a defence that masks gradients?"
@@ -884,15 +907,16 @@ def _choose_step_sizes(model: Model) -> tuple[float, ...]:
     They are tried in this order, and it is enough if the gradient holds for one.
     """
     min_step = ROUNDING_STEPS * torch.finfo(model.dtype).eps
-    if min_step > STEP:
-        # Half precision: a step that is large compared to rounding may be too large for
-        # a linear prediction, and a smaller one may be rounded. Both are tried.
+    is_half_precision = min_step > STEP
+    if is_half_precision:
+        # A step that is large compared to rounding may be too large for a linear
+        # prediction, and a smaller one may be rounded. Both are tried.
         return (min_step, min_step / STEP_RATIO)
     returns_logits = model.read is None
     if returns_logits:
         return (STEP,)
-    # Outputs of detectors may jump over the larger step only: then other boxes are
-    # suppressed.
+    # A detector may suppress other boxes after the larger step, so that its outputs
+    # jump. Then the smaller step is tried.
     return (STEP, SMALL_STEP)
 
 
@@ -914,6 +938,7 @@ def _collect_discrete_values(model: Model, images: Tensor) -> str:
     discrete_values = list[Any]()
     for tensor in list_tensors(outputs):
         columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
+        # Classes may be stored as floating-point numbers.
         is_integer = (columns == columns.round()).all(dim=1)
         discrete_values.append((tensor.shape, columns[is_integer].tolist()))
     for output in outputs:

@@ -202,11 +202,12 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
 def load_network(
     folder: Path | None = None, weights: Path | None = None
 ) -> tuple[ReferenceNet, tuple[str, ...]]:
-    """Return the network, which can be trained further, and its labels.
+    """Load the network and its labels. The network can be trained further.
 
     Args:
         folder: folder with `WEIGHTS` and `METADATA`; by default that of the package.
-        weights: a safetensors file whose weights replace those of the folder.
+        weights: a safetensors file whose weights replace those of the folder, after
+            these were loaded.
 
     Raises:
         ModelError: a file of the folder is missing or corrupt, or weights are not of

@@ -366,8 +366,8 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
         ModelError: the module cannot be imported; or what it defines raises, returns
             something else, or does not fit the weights.
         UnknownNameError: the module has no such attribute; the message has similar
-            names. InputError: the module may not be imported
-            (`trust.code.check_import`).
+            names.
+        InputError: the module may not be imported (`trust.code.check_import`).
     """
     target, weights = split_weights(spec)
     check_import(target)

@@ -231,10 +231,11 @@ def rewrite_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
             those for files, or the pickles name tensors whose data is missing.
     """
     code = _read_code(archive)
+    # the two pickles that torch reads, and the folders of their tensors
     pickles = list(FOLDER_OF_PICKLE)
+    tensor_folders = FOLDER_OF_PICKLE.values()
     for name in pickles:
         _check_pickle(archive, name)
-    tensor_folders = FOLDER_OF_PICKLE.values()
     tensors = [
         name for name in archive.members if name.partition("/")[0] in tensor_folders
     ]
@@ -320,8 +321,9 @@ def _hides_character(escape: str) -> bool:
     """Return whether an escape in source code may hide a character from a reader.
 
     Torch writes printable ASCII characters without escapes. So an escape of one was
-    made to hide it. An escape of a control character could change the terminal. Octal
-    escapes of bytes over 127 are parts of letters of other languages, and are allowed.
+    made to hide it. An escape of a control character could change the terminal. Allowed
+    are octal escapes of white space, and of bytes over 127: these are parts of letters
+    of other languages.
 
     Args:
         escape: text after the backslash as `_ESCAPE` finds it: octal digits, such as
@@ -336,15 +338,20 @@ def _hides_character(escape: str) -> bool:
 
 
 class _Inert:
-    """A placeholder for any object that a pickle creates. It does nothing."""
+    """A placeholder for any object that a pickle creates. It does nothing.
+
+    With placeholders, the values in a pickle can be checked, while none of its classes
+    is imported.
+    """
 
     name = ""
     parts: list[Any]
 
     def __new__(cls, *parts: Any) -> _Inert:
-        """Create a placeholder, as a pickle does by `__reduce__` or ``cls.__new__``.
+        """Create a placeholder with the arguments of the object as its parts.
 
-        There is no `__init__`.
+        A pickle creates objects by calling their class, or by ``cls.__new__``, which
+        does not call `__init__`. Both call this method.
         """
         instance = super().__new__(cls)
         instance.parts = list(parts)
@@ -461,13 +468,15 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
             `DEPTH`.
     """
     level = [value]  # the objects at one depth
+    # All objects belong to `value`, so that none is freed and no id is used twice.
     checked_ids = {id(value)}
     for _ in range(DEPTH):
         characters = {char for item in level if isinstance(item, str) for char in item}
-        if any(
+        has_hidden_character = any(
             ord(char) not in _WHITE_SPACE_CODES and not char.isprintable()
             for char in characters
-        ):
+        )
+        if has_hidden_character:
             raise make_archive_error(
                 archive.path, f"{name!r} has text with hidden characters"
             )

@@ -130,7 +130,8 @@ def allow_code_of_call(function: Function) -> Function:
     """Make a function allow the code that its caller names in the arguments.
 
     Decorate only functions that users call from Python: there the user names the code,
-    and no file does.
+    and no file does. The parameters of the function have the names of settings, such as
+    `model` and `controls`.
     """
     signature = inspect.signature(function)
 

@@ -118,7 +118,7 @@ def _check(node: ast.expr, depth: int, max_power: int) -> None:
             nested powers multiply, so that (9**9)**9 is bounded, too.
 
     Raises:
-        ValueError: it is not; the message is a clause about what was got instead.
+        ValueError: it is not; the message says what was found instead.
     """
     if depth <= 0:
         raise ValueError("it is nested too deeply")
@@ -131,6 +131,7 @@ def _check(node: ast.expr, depth: int, max_power: int) -> None:
             is_numbered_symbol = is_symbol(name) and name[-1].isdecimal()
             if name not in NAMES and not is_numbered_symbol:
                 raise ValueError(f"the name {name[:40]!r}")
+        # A call of `Pow` has an exponent, which lowers the maximum for its base.
         case ast.Call():
             operands, max_power = _check_call(node, max_power)
         # `_divide_max_power` checks the exponent of a power: only the base is left.
@@ -351,7 +352,8 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
     """Copy the network and the weights of an archive into a new, safe archive.
 
     `torch.export.load` reads the new archive. Members that could run code, such as
-    compiled code and pickled objects, are left out or rejected.
+    compiled code and pickled objects, are left out or rejected. A pickle of nothing but
+    tensors is kept (`_check_pickle`).
 
     Raises:
         FileFormatError: the archive has something that a plain network does not have;
@@ -360,10 +362,11 @@ def rewrite_program(archive: Archive) -> io.BytesIO:
     # This import takes a second, and only this kind of model needs it.
     from torch.export.pt2_archive import PT2ArchiveWriter
 
-    # archives up to torch 2.7 have other names for the same members
+    # The names of members in this archive, by their present names: archives up to torch
+    # 2.7 have others.
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}
     program = _read_program(archive, names[PROGRAM])
-    for name in EXAMPLE:
+    for name in EXAMPLE:  # the names that example inputs may have
         if name in archive:
             _check_pickle(archive, name)
     buffer = io.BytesIO()
@@ -432,10 +435,11 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
             archive.path,
             f"expected a table of tensors in {config!r}, got something else",
         )
-    # "tensor_name" has no special check: the keys of the table have to be plain names.
+    # Names of tensors are the keys of the table: they have to be plain names.
     table = _check_value(archive.path, table, "tensor_name")
     copied: set[str] = set()  # multiple tensors may share a file of numbers
     for name, entry in table.items():
+        # If this member is missing, `read_member` raises an error below.
         member = f"{folder}{_get_record(archive, name, entry)}"
         shape = _read_shape(archive, member, entry)
         # For an empty file torch would allocate a tensor of any size that the table
@@ -505,6 +509,10 @@ def _read_shape(archive: Archive, member: str, entry: JsonObject) -> list[int]:
 def _check_value(path: Path, value: JsonValue, key: str) -> Any:
     """Check a value of the network's description, with all values inside of it.
 
+    A text is checked by the rules for the entry that holds it. A key of a mapping may
+    be the name of a tensor, and is checked in the same way as a text would be: in
+    {"tensor_values": {"x": ...}}, "x" is checked by the rules for "tensor_values".
+
     Args:
         path: path of the archive, for errors.
         value: any JSON value.
@@ -521,27 +529,25 @@ def _check_value(path: Path, value: JsonValue, key: str) -> Any:
     if isinstance(value, list):
         return [_check_value(path, inner, key) for inner in value]
     if not isinstance(value, dict):
-        if wrong := _find_problem(value, key):
-            raise make_archive_error(path, wrong)
+        problem = _find_problem(value, key)
+        if problem:
+            raise make_archive_error(path, problem)
         return value
     checked: JsonObject = {}
     for name, inner in value.items():
-        # Keys of a mapping may be names of tensors. So in {"tensor_values": {"x":
-        # ...}}, the key "x" is checked in the same way as a text in "tensor_values"
-        # would be.
-        is_unchecked_key = name in ("", *_EMPTIED_ENTRIES)
-        wrong = "" if is_unchecked_key else _find_problem(name, key)
+        if name in _EMPTIED_ENTRIES:
+            # The value is not used, so that it needs no check.
+            checked[name] = _EMPTIED_ENTRIES[name]
+            continue
+        problem = _find_problem(name, key) if name else ""  # the empty key is allowed
         is_custom_object = name in ("as_custom_obj", "custom_obj")
         # torch always writes this table, which is empty for a plain network.
         has_custom_objects = name == "custom_obj_values" and bool(inner)
         if is_custom_object or has_custom_objects:
-            wrong = "holds a custom object, which is never loaded"
-        if wrong:
-            raise make_archive_error(path, wrong)
-        if name in _EMPTIED_ENTRIES:
-            checked[name] = _EMPTIED_ENTRIES[name]
-        else:
-            checked[name] = _check_value(path, inner, name)
+            problem = "holds a custom object, which is never loaded"
+        if problem:
+            raise make_archive_error(path, problem)
+        checked[name] = _check_value(path, inner, name)
     return checked
 
 
@@ -611,7 +617,7 @@ def _find_tree_problem(text: str) -> str:
     """Return what is wrong with the structure of inputs or outputs; "" for nothing.
 
     Torch imports the types of containers that the structure names. So only tuples,
-    lists and dicts are allowed.
+    lists and dicts are allowed. The type of a leaf, a single input or output, is None.
 
     Args:
         text: JSON of [version, node]; a node has a type, a context (the keys of a dict,
@@ -681,9 +687,10 @@ _TEXT_CHECKS: dict[str, Callable[[str], str]] = {
 def _check_pickle(archive: Archive, name: str) -> None:
     """Check that a member is a file of `torch.save` that holds only tensors.
 
-    They may be in tuples and dicts. An empty member is accepted, too. Nothing is
-    unpickled here, since that may run code: the steps of the pickle are read one by
-    one, and a step that imports anything but the classes of tensors is rejected.
+    They may be in tuples and dicts. An empty member, which `rewrite_program` writes for
+    example inputs, is accepted, too. Nothing is unpickled here, since that may run
+    code: the steps of the pickle are read one by one, and a step that imports anything
+    but the classes of tensors is rejected.
 
     Args:
         archive: archive of the network.
@@ -710,7 +717,7 @@ def _check_pickle(archive: Archive, name: str) -> None:
         steps = list(pickletools.genops(inner.read_member("data.pkl", LARGEST_TEXT)))
     except (ValueError, IndexError, UnicodeDecodeError):
         raise refusal from None
-    for step, argument, _ in steps:
+    for step, argument, _position in steps:
         imports_other = step.name == "GLOBAL" and not _GLOBALS.fullmatch(str(argument))
         if imports_other or step.name in _OTHER_IMPORTS:
             raise refusal

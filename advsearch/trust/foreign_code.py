@@ -65,8 +65,9 @@ def run_within_limits(
         stop: function that asks the code to end when the time is up.
 
     Raises:
-        TimedOut: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`). Its
-            thread may go on, since Python cannot end a thread.
+        ForeignCodeTimeoutError: it has not ended in `LONGEST` seconds, which a user may
+            extend (`scale_limit`). Its thread may go on, since Python cannot end a
+            thread.
     """
     outcome: Future[Result] = Future()
     # Torch has this switch for each thread, so it is copied to the new one.
@@ -97,8 +98,8 @@ def try_torchscript(archive: io.BytesIO) -> str:
     """Load TorchScript in another process, and return what is wrong; "" for nothing.
 
     In this process loading could not be stopped, since torch blocks Python while it
-    loads. Only a crash and a timeout are reported. An error of torch is not, since
-    loading the archive in this process raises it again.
+    loads. Only a crash and a timeout are reported. An error that torch raises is not:
+    the caller loads the archive in this process afterwards, which raises it again.
 
     Args:
         archive: the TorchScript file, in memory.
@@ -171,7 +172,7 @@ _outside: list[TorchState] = []
 
 @contextmanager
 def use_default_torch_state() -> Iterator[None]:
-    """Set torch's global switches to their defaults (`DEFAULT_TORCH_STATE`) inside the block.
+    """Set torch's global switches to `DEFAULT_TORCH_STATE` inside the block.
 
     `torch.inference_mode` is switched off, too. All are restored afterwards. So our own
     computations depend neither on the caller's switches nor on those that foreign code
@@ -195,24 +196,27 @@ def use_default_torch_state() -> Iterator[None]:
 
 
 def find_expected_torch_state() -> TorchState:
-    """Return the switches that the code of a network expects, and set `DEFAULT_TORCH_STATE` again.
+    """Return the switches of torch that the code of a network expects.
 
-    Call it inside `use_default_torch_state`, after the code was loaded. If loading the code
-    has set switches, such as the default dtype, the network expects these. Otherwise it
-    expects those from before the outermost `use_default_torch_state`.
+    Call it inside `use_default_torch_state`, after the code was loaded. If loading the
+    code has set switches, such as the default dtype, the network expects these, and
+    they are set back to `DEFAULT_TORCH_STATE`. Otherwise it expects those from before
+    the outermost `use_default_torch_state`.
     """
     current = TorchState.read_current()
-    if current == DEFAULT_TORCH_STATE:  # loading the code has set no switches
-        return _outside[0] if _outside else DEFAULT_TORCH_STATE
-    DEFAULT_TORCH_STATE.apply()
-    return current
+    has_set_switches = current != DEFAULT_TORCH_STATE
+    if has_set_switches:
+        DEFAULT_TORCH_STATE.apply()
+        return current
+    # `_outside` has the switches before each block, the outermost first.
+    return _outside[0] if _outside else DEFAULT_TORCH_STATE
 
 
 def use_torch_state_in_calls(module: nn.Module, torch_state: TorchState) -> None:
     """Make a module create its new tensors with the dtype and device of `torch_state`.
 
     Hooks set the two before each call of the module, and restore those of the caller
-    after it. No hooks are added if both are the defaults.
+    after it. They stay on the module. No hooks are added if both are the defaults.
     """
     if (torch_state.dtype, torch_state.device) == (
         DEFAULT_TORCH_STATE.dtype,

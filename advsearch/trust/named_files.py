@@ -40,9 +40,10 @@ def _list_spellings(name: str) -> list[str]:
     """Return the names under which a file that a mesh file names may be found.
 
     A mesh file may name its textures as another system or another folder did, such as
-    "C:\\textures\\wood.png". The name is tried as written, and as this system writes
-    it. Each of the two is tried unchanged, without a leading slash, and as a bare name
-    in the folder of the mesh; the result is in this order.
+    "C:\\textures\\wood.png". The name is tried as written, then as this system writes it
+    (`normalize_name`). Each of the two is tried unchanged, without a leading slash, and
+    as a bare name in the folder of the mesh. The result is in the order of these six
+    trials, without repeated and empty names.
     """
     spellings = [
         spelling
@@ -56,8 +57,8 @@ class ReferencedFiles:
     """Read the files that a mesh file names.
 
     Attributes:
-        refusal_by_name: files that were not read, by their normalized name (`normalize_name`),
-            and the reason: `MISSING`, `OUTSIDE` or another clause.
+        refusal_by_name: why files were not read, by their normalized name
+            (`normalize_name`): `MISSING`, `OUTSIDE` or another clause.
     """
 
     def __init__(self, path: Path) -> None:
@@ -84,9 +85,12 @@ class ReferencedFiles:
     def read_or_explain(self, name: str) -> bytes | str:
         """Return the content of a file that a mesh file names, or why it is not read.
 
-        The reason is a text; unlike `read_file`, this method does not store it in `refusal_by_name`.
-        If no spelling of the name works, it is the reason of the last spelling that was
-        refused for more than a missing file.
+        All spellings of the name are tried.
+
+        Returns:
+            The content, or the reason as a text. The reason is that of the last
+            spelling that was rejected; a spelling for which there is no file does not
+            count. Unlike in `read_file`, it is not stored in `refusal_by_name`.
         """
         reason = MISSING
         for spelling in _list_spellings(name):
@@ -95,6 +99,7 @@ class ReferencedFiles:
             except ValueError:  # a zero byte in the name
                 continue
             except OSError as error:
+                # Other errors say more than that there is no such file.
                 if error.errno not in _NO_SUCH_NAME:
                     reason = f"cannot be read ({error.strerror})"
             except FileFormatError as error:

@@ -96,7 +96,10 @@ def check_request(
             "the request is from a page of another origin; open the address that was "
             "printed",
         )
-    is_same_origin = headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin")
+    # "none" is a request of the user, such as an address that was typed. The header is
+    # missing in requests of programs and old browsers.
+    site = headers.get("Sec-Fetch-Site", "none")
+    is_same_origin = site in ("none", "same-origin")
     # Another site may link to a page here, which the user then sees. It cannot read
     # that page, and a POST from it is rejected, since that could change something.
     follows_link = headers.get("Sec-Fetch-Mode") == "navigate" and command != "POST"
@@ -223,11 +226,13 @@ def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
         is_inside_script = opening.start() < end
         if is_inside_script:
             continue
-        begin = page.find(b">", opening.end()) + 1
-        if not begin:  # the tag has no end, so that nothing after it runs
+        tag_end = page.find(b">", opening.end())
+        if tag_end == -1:  # nothing after a tag without an end runs
             return False
+        begin = tag_end + 1
         close = re.compile(rb"</script", re.IGNORECASE).search(page, begin)
         end = close.start() if close else len(page)
+        # Our own pages write `type` as the first attribute of data.
         is_data = page.startswith(b' type="application/', opening.end())
         if not is_data and compute_script_digest(page[begin:end]) not in digests:
             return True

@@ -110,9 +110,11 @@ class OmittedSetting(NamedTuple):
     def advice(self) -> str:
         """How the user sets the value of the file, and how to use the default instead.
 
-        Both are texts to type on the command line, after the name of a file or a run.
+        An example is "overwrite=true if you want that, or overwrite=false to do
+        without". Both assignments can be typed on the command line, after the name of a
+        file or a run.
         """
-        # The value is from a file, so that it is quoted for the shell.
+        # The value is from a file, and may be anything: it is quoted for the shell.
         assignment = shlex.quote(f"{self.name}={_format_typed(self.value)}")
         default = "null" if self.default is None else _format_typed(self.default)
         return f"{assignment} if you want that, or {self.name}={default} to do without"

@@ -47,10 +47,11 @@ _OPENED: dict[str, dict[str, None]] = {}
 def track_opened_files(path: Path | str) -> Iterator[None]:
     """Record each file that is opened inside the block as a part of the file `path`.
 
-    `list_opened_files` lists these files. Inside another such block, they are recorded
-    as parts of the file of the outer block.
+    `record_opened` records them, and `list_opened_files` lists them. Inside another
+    such block, they are recorded as parts of the file of the outer block.
     """
-    token = _ROOT.set(_ROOT.get() or os.path.abspath(path))
+    outer_path = _ROOT.get()
+    token = _ROOT.set(outer_path or os.path.abspath(path))
     try:
         yield
     finally:

@@ -57,8 +57,8 @@ def storage_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
-        # Raises another error if the folder of the run was moved, since that is the
-        # reason of all other errors.
+        # If the folder of the run was moved, that is the cause of this error: then the
+        # function raises an error that says so.
         check_not_moved(path)
         advice = _find_advice(error)
         if advice is None:
@@ -101,13 +101,14 @@ def replace_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
         StorageError: the file cannot be written.
     """
     part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
-    check_not_moved(path)  # otherwise a folder that was moved would be created again
+    # Without this check, the folder of a run that was moved would be created again.
+    check_not_moved(path)
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             # A link of somebody else at this path would lead the writing elsewhere.
             part.unlink(missing_ok=True)
-            yield part
+            yield part  # the caller writes this file
             if durable:
                 _flush(part)
             os.replace(part, path)
@@ -302,7 +303,8 @@ class RunLock:
             os.truncate(self._descriptor, 0)
             os.write(self._descriptor, str(os.getpid()).encode())
         except OSError as error:
-            # The process that holds the lock has written its number into the file.
+            # A process that holds the lock has written its number into the file. For other
+            # errors the file may be empty.
             pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
             self.release()
             raise _make_lock_error(folder, error, pid) from None
@@ -341,8 +343,8 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
         run: the folder of the run.
         contents: names in this folder that are checked, in addition to the lock; other
             names are ignored.
-        unchecked_suffix: end of a path. If the path of a folder has this end, its
-            subfolders are not checked.
+        unchecked_suffix: end of the path of a folder whose subfolders are not checked,
+            such as that of thumbnails. The folder itself is checked.
 
     Raises:
         FileFormatError: there is a link, a pipe or another special file.
@@ -353,6 +355,7 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
         is_root = folder == str(run)
         try:
             with os.scandir(folder) as entries:
+                # In the folder of the run itself, other names are ignored.
                 inside = [
                     entry
                     for entry in entries
@@ -371,7 +374,9 @@ def check_no_links(run: Path, contents: Collection[str], unchecked_suffix: str) 
                     "link; remove it"
                 )
             if entry.is_dir(follow_symlinks=False):
-                if not folder.endswith(unchecked_suffix):
+                # `folder` is the one that contains this subfolder.
+                checks_subfolders = not folder.endswith(unchecked_suffix)
+                if checks_subfolders:
                     folders.append(entry.path)  # its contents are checked, too
             # `RunLock` checks the lock itself when it opens it.
             elif not entry.is_file(follow_symlinks=False) and entry.name != LOCK:

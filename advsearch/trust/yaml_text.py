@@ -37,9 +37,11 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
 
     def construct_yaml_int(self, node: yaml.Node) -> int:
         """Return an integer; raise a YAMLError if it has too many digits."""
+        # raised below if the number is too long
         error = _make_yaml_error(node, f"a number of more than {DIGITS} digits")
-        # In binary, a number has up to 3.3 times as many digits as in decimal. The
-        # length is checked first because converting a long text takes long.
+        # The length is checked first because converting a long text takes long. In
+        # binary, a number has up to 3.3 times as many digits as in decimal, and there
+        # may be a sign, a prefix and underscores: 4 times is enough for usual ones.
         if len(node.value) > 4 * DIGITS:
             raise error
         number = int(super().construct_yaml_int(node))
@@ -136,7 +138,8 @@ def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
         raise _make_yaml_error(node, f"the tag {node.tag[:40]!r}, which no setting has")
     if isinstance(node, yaml.ScalarNode):
         return 1
-    # A node that is still being counted contains an alias of itself.
+    # A node that is still being counted contains an alias of itself: its nesting is
+    # infinite.
     contains_itself = counts.get(id(node)) == _UNFINISHED
     if depth >= DEPTH or contains_itself:
         raise _make_yaml_error(node, f"lists or mappings nested deeper than {DEPTH}")
@@ -154,7 +157,7 @@ def _count_checked(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
             if total > MAX_VALUES:
                 raise _make_yaml_error(node, f"more than {MAX_VALUES:,} values")
         counts[id(node)] = total
-    return counts[id(node)]
+    return counts[id(node)]  # an alias counts as much as its node
 
 
 def _check_names(node: yaml.MappingNode) -> None:

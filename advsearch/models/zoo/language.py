@@ -43,7 +43,9 @@ MIN_LARGE_WEIGHTS = 500_000_000
 def generates_text(architecture: str, network: Any) -> bool:
     """Return whether an architecture of transformers continues images and texts.
 
-    Only its name is used.
+    Args:
+        architecture: name of the architecture, which decides.
+        network: not used; families of networks have functions with this signature.
     """
     transformers: Any = sys.modules["transformers"]
     names = transformers.models.auto.modeling_auto.MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING_NAMES
@@ -77,12 +79,16 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         reader = _LanguageModel(loaded, processor, question or models.QUESTION)
         # Without names, likelihoods are checked with another text.
         tokens = reader.tokenize_names(names or (CHECK_TEXT,))
-        max_new_tokens = max(purpose.tokens if is_free else 0, *map(len, tokens))
+        max_new_tokens = max(map(len, tokens))
+        if is_free:
+            max_new_tokens = max(max_new_tokens, purpose.tokens)
         _check_length(loaded, reader, max_new_tokens)
+        # A network that answers freely needs the classifier for the check only.
         classifier = _NameClassifier(reader, tokens)
         module = _FreeAnswerer(reader, purpose.tokens) if is_free else classifier
         with torch.no_grad():
             _check_likelihood(loaded, classifier)
+            # A black image is only timed.
             start_time = time.perf_counter()
             module(torch.zeros((1, 3, *reader.image_size)))
             seconds = time.perf_counter() - start_time
@@ -217,14 +223,15 @@ class _LanguageModel(nn.Module):
         # by image size, see `get_prompt`
         self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
         self.text = _make_prompt_text(processor, question)
+        # size, mean and standard deviation; None if the processor is not affine
         processing = _measure_affine_processor(processor, self.text, loaded.spec)
         self.is_affine = processing is not None
         if processing is None:
+            # Only with torchvision does a gradient go through the processor.
             _check_torchvision_installed(loaded.spec)
             processing = Processing()
-        self.image_size = processing.get(
-            "input_size", _read_image_size(loaded.network.config)
-        )
+        default_size = _read_image_size(loaded.network.config)
+        self.image_size = processing.get("input_size", default_size)
         self.preprocessing = Processing(**{**processing, "input_size": self.image_size})
         self._check_pixels(loaded.spec)
 
@@ -235,7 +242,8 @@ class _LanguageModel(nn.Module):
             ModelError: the processor treats them differently.
         """
         height, width = self.image_size
-        # A test image (3, H, W) from 0 to 255, with a different ramp in each channel.
+        # A test image (3, H, W) of 8-bit levels with a different ramp in each channel:
+        # an exchange of channels or axes is noticed.
         vertical = torch.linspace(0, 200, height)[:, None].expand(height, width)
         horizontal = torch.linspace(0, 200, width).expand(height, width)
         diagonal = (vertical + horizontal) / 4 + 100  # from 100 to 200
@@ -244,6 +252,7 @@ class _LanguageModel(nn.Module):
         expected = self._process(image_8bit)["pixel_values"]
         image = levels / 255.0
         if self.is_affine:
+            # In use, `Preprocessing` does this before the image reaches this module.
             mean = image.new_tensor(self.preprocessing["mean"]).view(3, 1, 1)
             std = image.new_tensor(self.preprocessing["std"]).view(3, 1, 1)
             if self.preprocessing["channels"] != "RGB":
@@ -300,8 +309,8 @@ class _LanguageModel(nn.Module):
         """
         words = get_spoken_names(names)
         separator = self._find_separator()
-        # The processor adds the same tokens at the end of each text, if any: the first
-        # word is enough to find out.
+        # A processor that adds tokens at the end of a text adds them to every text: the
+        # first word is enough to find out.
         processor_keeps_prompt = self._keeps_prompt(f"{separator}{words[0]}")
         tokens_of_names: list[list[int]] = []
         for word in words:
@@ -435,9 +444,11 @@ class _NameClassifier(nn.Module):
     def __init__(self, reader: _LanguageModel, tokens: Sequence[Sequence[int]]) -> None:
         """Prepare stems, and the indices of the likelihoods of each name.
 
-        `forward` computes a table of log-likelihoods of the next token. It has a column
-        for each token of the vocabulary. Its first row follows the prompt. After it,
-        each token of each stem has a row; all stems are padded to the same length.
+        `forward` computes a table of log-likelihoods of the next token, with a column
+        for each token of the vocabulary. Row 0 is for the token after the prompt. Then
+        follow the rows of the first stem, those of the second stem, and so on: a row
+        for the token after each token of the stem. All stems are padded to the same
+        length.
 
         Args:
             reader: the network.
@@ -455,6 +466,7 @@ class _NameClassifier(nn.Module):
         columns = torch.zeros_like(rows)
         is_token = torch.zeros_like(rows)
         for index, name_tokens in enumerate(self.tokens):
+            # the stem that is, or begins with, all tokens of the name but the last
             stem_index = _find_stem(stems, name_tokens[:-1])
             first_stem_row = 1 + stem_index * stem_length
             for position, token in enumerate(name_tokens):
@@ -474,8 +486,8 @@ class _NameClassifier(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Return the log-likelihoods (N, names) for images (N, 3, H, W)."""
         stems = self._stems.to(images.device)
-        # Row and column of each token of each name in the table below, and whether
-        # there is a token: shorter names are padded.
+        # (names, longest name) each: row and column of each token of a name in the table
+        # below; and 1, or 0 in the padding of a shorter name
         rows = self._rows.to(images.device)
         columns = self._columns.to(images.device)
         is_token = self._is_token.to(images.device)
@@ -484,13 +496,14 @@ class _NameClassifier(nn.Module):
             logits, past = self.reader.read_prompt(image)
             # Table (1 + stems * stem length, vocabulary) of log-likelihoods of the next
             # token: after the prompt, and after each token of each stem.
-            likelihoods = logits.log_softmax(dim=-1)[None]
+            table = logits.log_softmax(dim=-1)[None]
             if len(stems):
-                # `past` is used only once, so that it may be changed.
+                # This changes `past`, which is not used again.
                 stem_logits = self.reader.continue_with(stems, past)
-                stem_likelihoods = stem_logits.log_softmax(dim=-1).flatten(0, 1)
-                likelihoods = torch.cat([likelihoods, stem_likelihoods])
-            scores.append((likelihoods[rows, columns] * is_token).sum(dim=1))
+                stem_rows = stem_logits.log_softmax(dim=-1).flatten(0, 1)
+                table = torch.cat([table, stem_rows])
+            token_likelihoods = table[rows, columns] * is_token
+            scores.append(token_likelihoods.sum(dim=1))
         return torch.stack(scores)
 
 
@@ -522,11 +535,16 @@ def _measure_affine_processor(
 
     None if it does more to an image than to apply a gain and an offset.
     """
+    # `measure_processor` raises ModelError for a processor that cuts images into
+    # patches, which is not affine.
     with suppress(errors.ModelError):
         processing = measure_processor(
-            lambda **options: processor(text=[prompt], **options), spec
+            # The processor takes no images without a text.
+            lambda **options: processor(text=[prompt], **options),
+            spec,
         )
-        if "mean" in processing:
+        is_affine = "mean" in processing
+        if is_affine:
             return processing
     return None
 
@@ -610,7 +628,8 @@ class _FreeAnswerer(nn.Module):
             while tokens[-1] not in self.end_tokens and len(tokens) < self.max_tokens:
                 # one alternative of one token, (1, 1)
                 last_token = next_logits.new_tensor([[tokens[-1]]], dtype=torch.long)
-                # This also adds the token to the cache `past`.
+                # This also adds the token to the cache `past`. There is one alternative,
+                # and the logits after its last token are used.
                 next_logits = self.reader.continue_with(last_token, past)[0, -1]
                 logits_of_steps.append(next_logits)
                 tokens.append(int(next_logits.argmax()))
@@ -654,6 +673,7 @@ def _append_tokens(prompt: Mapping[str, Tensor], tokens: Tensor) -> dict[str, Te
             # In most networks type 1 means image, and 0 means text. PaliGemma is an
             # exception: all tokens of its prompt, the image too, have type 0 in
             # `token_type_ids`, and type 1 means answer.
+            # Other networks mark the image by 1, so that not all types are 0.
             marks_answer = key == "token_type_ids" and not prompt[key].any()
             is_mask = key == "attention_mask"
             value = 1 if is_mask or marks_answer else 0
@@ -688,8 +708,9 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     likelihoods = logits[0, -len(name_tokens) - 1 : -1].float().log_softmax(dim=-1)
     expected = likelihoods.gather(1, name_tokens[:, None]).sum().double()
     computed = module(image[None])[0, index].double()
-    size = max(1.0, abs(float(expected)))
-    if not are_nearly_equal(expected, computed, size, loaded.network.dtype):
+    # The tolerance is relative to this number.
+    magnitude = max(1.0, abs(float(expected)))
+    if not are_nearly_equal(expected, computed, magnitude, loaded.network.dtype):
         raise _make_unsupported_error(
             loaded,
             "computes another likelihood with its cache than without "

@@ -28,8 +28,12 @@ from advsearch.extend import errors, models
 def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     """Turn what a library raises while it loads a model's weights into a ModelError.
 
-    The message ends with `advice` on what the user may set instead. Nothing is
-    unpickled, and nothing is fetched for a model that only a file names.
+    Inside this context nothing is unpickled. Nothing is fetched if only a file, and not
+    the user, names the model.
+
+    Args:
+        spec: name of the model.
+        advice: end of the message: what the user may set instead.
     """
     disabled_before = logging.root.manager.disable
     # Libraries log failed connections. This is not needed: an error is raised in the
@@ -131,11 +135,11 @@ def measure_processor(processor: Any, spec: str) -> Processing:
     """Measure the preprocessing of a transformers processor.
 
     The result has size, mean, standard deviation and channel order, if the processor is
-    an affine map of colors. These follow from images of a single color, which are the
-    same after resizing and cropping: with x in [0, 1],
-    ``gain x + offset = (x - mean) / std``. The size is that of the output for a square
-    image. The result for any other processor is a function that calls it, if it is
-    differentiable.
+    an affine map of colors. With x in [0, 1], it returns ``gain x + offset``, which is
+    ``(x - mean) / std``. Gains and offset are measured on images of a single color,
+    which resizing and cropping do not change. The size is that of the output for a
+    square image. The result for any other processor is a function that calls it, if it
+    is differentiable.
 
     Raises:
         ModelError: no gradient goes through it, or it pads images or cuts them into
@@ -165,6 +169,7 @@ def measure_processor(processor: Any, spec: str) -> Processing:
     if not _predicts_grays(process_color, gains, offset, tolerance):
         problem = "changes pixels by something else than a gain and an offset"
         return _wrap_processor(processor, spec, processing, problem)
+    # None if an output channel depends on several input channels, or falls with one
     normalization = _find_normalization(gains, offset, tolerance)
     if normalization is None:
         problem = "mixes the channels of a picture, or turns it into its negative"
@@ -207,15 +212,17 @@ def _find_normalization(
         offset: (3,) output for black.
         tolerance: gains up to this one count as 0.
     """
-    gain_of_order = {
-        channels: np.diag(matrix)
-        for channels, matrix in (("RGB", gains), ("BGR", gains[:, ::-1]))
-        if np.abs(matrix - np.diag(np.diag(matrix))).max() <= tolerance
-    }
+    # With the input channels in the order of the network, the matrix of gains is
+    # diagonal.
+    gain_of_order = {}
+    for order, matrix in (("RGB", gains), ("BGR", gains[:, ::-1])):
+        diagonal = np.diag(matrix)
+        if np.abs(matrix - np.diag(diagonal)).max() <= tolerance:
+            gain_of_order[order] = diagonal
     # Both orders fit only if all gains are about zero.
     if len(gain_of_order) != 1:
         return None
-    ((channels, gain),) = gain_of_order.items()
+    channels, gain = gain_of_order.popitem()
     if gain.min() <= 0.0:
         return None
     return Processing(
@@ -269,14 +276,20 @@ def _wrap_processor(
     process = _disable_resizing(processor)
 
     def call(images: Tensor) -> Tensor:
-        """Process images (N, 3, H, W) in [0, 1]; values up to 255 stay unrounded."""
+        """Process images (N, 3, H, W) in [0, 1].
+
+        The processor expects values up to 255. They are not rounded to integers, since
+        rounding has no gradient.
+        """
         outputs = [
             process(images=255.0 * image, return_tensors="pt")["pixel_values"]
             for image in images
         ]
         return torch.cat(outputs).to(images)
 
-    height, width = processing.get("input_size", (PROBE_SIZES[0], PROBE_SIZES[0]))
+    # A processor without a fixed size takes any.
+    default_size = (PROBE_SIZES[0], PROBE_SIZES[0])
+    height, width = processing.get("input_size", default_size)
     levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     expected = _run_processor(process, levels, spec)
     image = torch.from_numpy(levels).float() / 255.0
@@ -300,7 +313,8 @@ def _wrap_processor(
         raise _make_processor_error(
             spec,
             processor,
-            f"{what}, and rounds or does otherwise where a gradient goes through it",
+            f"{what}, and returns other values for floating-point images than for 8-bit "
+            "images, or no gradient",
         )
     return Processing(processor=call, **processing)
 
@@ -363,7 +377,8 @@ class AdaptedNetwork(nn.Module):
     Args:
         network: network of the library.
         run_network: calls the network as its library requires.
-        boxes: whether the output has boxes as corners in pixels.
+        returns_pixel_boxes: whether the output has boxes as corners in pixels. The task
+            detection reads this attribute.
     """
 
     def __init__(
@@ -432,12 +447,14 @@ class LoadedNetwork:
     def get_sized_preprocessing(self, config: Any) -> Processing:
         """Return the preprocessing with an image size.
 
-        If the measured preprocessing has no size, it is that in the network's config.
+        The measured size takes precedence. If there is none, because the processor
+        keeps the size of images, the size that the network's config states is used.
 
         Args:
             config: ``config`` of the network, or a part of it such as
                 ``config.vision_config``; None if there is none.
         """
+        # one number for a square, a list of two numbers, or None
         size = getattr(config, "image_size", None)
         input_size = (size, size) if isinstance(size, int) else tuple(size or ())
         default = Processing()

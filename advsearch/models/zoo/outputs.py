@@ -49,7 +49,8 @@ def gives_features(architecture: str, network: Any) -> bool:
         or zero_shot.encodes_images_and_texts(network)
     ):
         return False
-    # A network that can take `encoder_outputs` has a decoder, which finds objects.
+    # A network that can take `encoder_outputs` has a decoder, which looks for objects in
+    # the features of the encoder, as in DETR.
     is_detector = (
         "encoder_outputs" in inspect.signature(network.forward).parameters
         or "Detr" in architecture
@@ -81,8 +82,8 @@ def make_feature_source(
 
     Args:
         loaded: the network.
-        plain: makes the source for any other task; None if the network has only
-            features.
+        plain: makes the source of the network for its other tasks; None if the network
+            has only features.
 
     Raises:
         ModelError: the network has no classes, or no features.
@@ -100,12 +101,14 @@ def make_feature_source(
         )
     network = loaded.network
     config = network.config
+    # the network without a head: features are its output
     backbone = network
     if zero_shot.encodes_images_and_texts(network):
         zero_shot.check_takes_pictures(network, loaded.spec)
         config = getattr(config, "vision_config", config)
     elif "ForImageClassification" in type(network).__name__:
         backbone = _find_backbone(network, loaded.spec)
+    # The parameters of a class token have names such as "cls_token".
     has_class_token = any(
         word in name
         for name, _ in backbone.named_parameters()
@@ -178,9 +181,10 @@ def make_depth_source(loaded: LoadedNetwork) -> models.Source:
         """Return the values (N, h, w) under their kind for images (N, 3, H, W)."""
         if not is_padded:
             return {kind: network(pixel_values=images).predicted_depth}
-        # ZoeDepth was trained on images with a mirrored border. Its processor in
-        # transformers adds a border of this size and resizes the result to the input
-        # size, and its post-processing cuts the border off.
+        # ZoeDepth was trained on images with a mirrored border. This repeats what its
+        # processor in transformers does: it adds a border of this size (the formula is
+        # that of the library) and resizes the result to the input size. The
+        # post-processing resizes back and cuts the border off.
         height, width = images.shape[2:]
         top = int(math.sqrt(height / 2.0) * 3.0)
         left = int(math.sqrt(width / 2.0) * 3.0)
@@ -231,6 +235,7 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
     def run_network(network: Any, images: Tensor) -> Tensor:
         """Return logarithms of scores (N, classes, H, W) for images (N, 3, H, W)."""
         size = (images.shape[2], images.shape[3])
+        # OneFormer also takes a sentence that states the task.
         task_inputs = {}
         if sentence is not None:
             tokens = sentence.to(images.device).expand(len(images), -1)
@@ -362,7 +367,7 @@ def _make_timm_source(
         pretrained_config: replacement of its ``pretrained_cfg``.
         labels: names of classes that take precedence over timm's.
     """
-    needs_features = purpose.task == TASK
+    needs_features = purpose.task == TASK  # the task that compares features
     has_head = module.num_classes > 0
     if not has_head and not needs_features:
         raise make_no_classes_error(
@@ -375,6 +380,7 @@ def _make_timm_source(
 
     def compute_features(network: Any, images: Tensor) -> Any:
         """Return the features (N, D) that the head turns into logits."""
+        # With `pre_logits`, timm leaves out the last layer of the head.
         return network.forward_head(network.forward_features(images), pre_logits=True)
 
     network = module
@@ -429,6 +435,7 @@ def load_torchvision(spec: str) -> models.Source:
     detectors = zoo.list_models(module=zoo.detection)
     known_names = (*classifiers, *segmenters, *detectors)
     if name not in known_names:
+        # A network for videos, or a quantized one, has an error of its own.
         _check_reads_images(zoo, name, spec)
         raise errors.UnknownNameError(
             "torchvision network", name, models.find_near_names(name, known_names)
@@ -445,7 +452,7 @@ def load_torchvision(spec: str) -> models.Source:
         models.load_weights(module, weights, name)
     if name in classifiers:
         return models.make_source(module, name, **_get_default_fields(default, module))
-    fields = _get_default_fields(default, None)
+    fields = _get_default_fields(default, classifier=None)
     if name in segmenters:
         return models.make_source(
             AdaptedNetwork(module, _run_segmenter), name, **fields
@@ -555,7 +562,9 @@ def _get_default_fields(
         if numbers is not None:
             fields[key] = tuple(map(float, numbers))
     labels = tuple(str(label) for label in default.meta.get("categories", ()))
-    if labels and (classifier is None or _count_classes(classifier) == len(labels)):
+    # The user's weights may have other classes than the default weights.
+    fits_classes = classifier is None or _count_classes(classifier) == len(labels)
+    if labels and fits_classes:
         fields["labels"] = labels
     return fields
 

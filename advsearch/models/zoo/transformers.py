@@ -64,18 +64,19 @@ ADVICE = (
 def load(spec: str, purpose: models.Purpose) -> models.Source:
     """Load ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``.
 
-    The network belongs to one of the families in `NETWORKS`. If it reads texts, its
-    classes are the names that the user states (`zero_shot`, `language`); otherwise its
-    labels are in its ``config``. Size, channel order and normalization are measured on
-    its image processor (`library.measure_processor`); there is a ModelWarning if it has
-    none. Code in a repository is never run, and weights are read from safetensors only.
-    A repository that timm has saved is loaded by timm.
+    The network belongs to one of the families in `NETWORKS`. If it reads texts (modules
+    `zero_shot` and `language`), its classes are the names that the user states;
+    otherwise its labels are in its ``config``. Size, channel order and normalization
+    are measured on its image processor (`library.measure_processor`); there is a
+    ModelWarning if it has none. Code in a repository is never run, and weights are read
+    from safetensors only. A repository that timm has saved is loaded by timm.
 
     Raises:
         ModelError: transformers is missing; the repository cannot be loaded or lacks
             weights; its network is of another kind or does not fit into the memory; or
             its processor does more than `Preprocessing` can do.
     """
+    # "hf:NAME@REVISION"
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = models.import_library("transformers", spec, "hf")
     name = _resolve_name(name, spec)
@@ -170,11 +171,13 @@ def find_transformers_source(
 
     None for any other network. Names of classes are in its ``config``. The
     preprocessing comes from the repository or directory from which it was loaded; there
-    is a ModelWarning if that has no image processor, or cannot be read any more.
+    is a ModelWarning (by `LoadedNetwork.preprocessing`) if that has no image processor,
+    or cannot be read any more.
     """
     transformers: Any = sys.modules.get("transformers")
     if transformers is None or not isinstance(network, transformers.PreTrainedModel):
         return None
+    # The class of the network stands for its name in messages, too.
     spec = type(network).__name__
     family = _find_family(spec, network, spec)
     origin = str(getattr(network, "name_or_path", "") or "")
@@ -182,7 +185,7 @@ def find_transformers_source(
     processor = None
     if origin:
         # The repository or directory may not exist any more.
-        with suppress(errors.ModelError), report_library_errors(spec, ""):
+        with suppress(errors.ModelError), report_library_errors(spec, advice=""):
             processor = load_processor(transformers, origin, hub_options)
     loaded = LoadedNetwork(
         network=network,
@@ -276,8 +279,9 @@ def _load_config(
         return config
     except OSError as error:
         if Path(name).is_dir():
-            raise
+            raise  # the error of the library says what is wrong with the directory
         cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
+        # names of repositories: "OWNER/NAME" is stored as "models--OWNER--NAME"
         cached = [
             folder.name.partition("--")[2].replace("--", "/")
             for folder in cache.glob("models--*")

@@ -52,8 +52,8 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
     prompts = models.get_patterns(loaded.purpose.prompts)
     tokenizer = loaded.load_component("AutoTokenizer")
     words = get_spoken_names(names)
-    # One text per name, by which scores are checked and equal names are found. The
-    # first prompt is enough for both.
+    # One text per name, with the first prompt: scores are checked with the first of
+    # them, and names with equal tokens are found by all of them.
     texts = [prompts[0].replace("{}", word) for word in words]
     with (
         models.translate_errors(f"model {name}: cannot embed the names of `labels`"),
@@ -67,6 +67,7 @@ def make_zero_shot_source(loaded: LoadedNetwork) -> models.Source:
         source = loaded.make_text_source(classifier, names, network.dtype)
         _check_scores(network, classifier, tokenizer, texts[0], source)
     warn_of_equal_texts(tokenizer, texts, names, name)
+    # Networks of this kind, such as SigLIP, are the only ones with a bias of logits.
     is_trained_with_sigmoid = hasattr(loaded.network, "logit_bias")
     if is_trained_with_sigmoid:
         models.warn(
@@ -106,6 +107,7 @@ def _make_head(network: Any, embeddings: Tensor) -> nn.Linear:
     else:
         scale = network.logit_scale.exp()
     head = nn.Linear(embeddings.shape[1], embeddings.shape[0])
+    # `copy_` needs a context without gradients, which the caller has opened.
     # An image's embedding has length 1 too, so that products are cosines.
     head.weight.copy_(scale.float() * embeddings)
     has_bias = hasattr(network, "logit_bias")
@@ -220,6 +222,8 @@ class _CosineClassifier(nn.Module):
     def __init__(self, network: nn.Module, head: nn.Linear) -> None:
         super().__init__()
         self.network: Any = models.copy_sharing_weights(network)
+        # This is a copy, so that its text encoder (children such as "text_model" and
+        # "text_projection") can be removed.
         child_names = [name for name, _ in self.network.named_children()]
         for name in child_names:
             if name.startswith("text"):
@@ -270,9 +274,10 @@ def _check_scores(
     embedding = scale * embed_words(network, tokenizer, [text], ["{}"])
     bias = classifier.head.bias[0]  # the same for all names
     computed = classifier.embed_images(noise) @ embedding.T + bias
-    size = max(float(scale), float(expected.abs().max()))
+    # Scores are scaled cosines, whose rounding errors are in proportion to the scale.
+    magnitude = max(float(scale), float(expected.abs().max()))
     are_equal = expected.shape == computed.shape and are_nearly_equal(
-        expected, computed, size, network.dtype
+        expected, computed, magnitude, network.dtype
     )
     if not are_equal:
         raise errors.ModelError(
@@ -350,8 +355,8 @@ def _build_owl(
 
     Each patch of the image has one box, and its features are compared with those of the
     names (Minderer et al. 2022, arXiv 2205.06230, section 3). The features of a name
-    are averaged over prompts, as in CLIP. After that the network's text encoder is
-    removed.
+    are averaged over prompts, as in CLIP. After they were computed, the text encoder is
+    removed from `network`, which nothing else uses.
     """
     base_model = getattr(network, network.base_model_prefix)
     prompts = models.get_patterns(loaded.purpose.prompts)
@@ -364,7 +369,8 @@ def _build_owl(
         features = network.image_embedder(pixel_values=images)[0]
         patches = features.flatten(1, 2)
         queries = embeddings.to(patches).expand(len(images), -1, -1)
-        logits, _ = network.class_predictor(patches, queries)
+        # It also returns embeddings of the patches, which are not needed.
+        logits, _embeddings = network.class_predictor(patches, queries)
         boxes = network.box_predictor(patches, features)
         return to_pixel_corners(boxes, images), logits.sigmoid()
 
@@ -401,13 +407,14 @@ def _build_grounding_dino(
             f"labels: model {name} reads a text of at most {max_tokens} tokens, and "
             f"the names take {len(tokens)}; give fewer"
         )
-    # (names, longest name): special tokens include the full stop between names
+    # (names, longest name) indices of the tokens of each name. The full stop between
+    # names is one of the special tokens, so that each run of other tokens is a name.
     token_index = _find_token_runs(tokens, network.model.special_tokens)
     if len(token_index) != len(words):
         raise InputError(
             f"labels: model {name} reads the names as one text with full stops between "
-            f"them, in which these {len(words)} are {len(token_index)}; leave . and ? "
-            "out of names and prompt"
+            f"them, in which it finds {len(token_index)} names instead of {len(words)}; "
+            "leave . and ? out of names and prompt"
         )
 
     def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -424,9 +431,11 @@ def _build_grounding_dino(
 def _find_token_runs(tokens: Tensor, separators: Any) -> Tensor:
     """Return the indices of the tokens between separators.
 
+    A run is a sequence of tokens between two separators.
+
     Args:
         tokens: (L,) tokens of a text.
-        separators: the tokens that separate runs of other tokens.
+        separators: tensor or list of the tokens that separate runs.
 
     Returns:
         (runs, longest run) indices; a shorter run is padded with its first index.

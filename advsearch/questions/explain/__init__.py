@@ -95,7 +95,7 @@ class ExplainConfig(Config):
     "explain mug-sweep-001 --confirm 0 --pairs 0 --json",
     positional_args=("sweeps",),
     about="sweeps",
-    positional=PositionalArgument("RUN", "the run of a sweep", "", True),
+    positional=PositionalArgument("RUN", "the run of a sweep", is_repeatable=True),
     view=make_explain_view,
     claims=make_explain_claims,
     triggering=list_rule_triggers,

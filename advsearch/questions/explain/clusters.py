@@ -64,9 +64,8 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     points = decomposition.PCA(n_components, random_state=0).fit_transform(directions)
 
     silhouette, cluster_of_point = cluster_points(points)
-    are_separated = _is_clearer_than_noise(seed, points, silhouette)
-
     n_clusters = int(cluster_of_point.max()) + 1
+    # the points of each cluster, the most central first
     members = [
         sort_by_distance(points, np.flatnonzero(cluster_of_point == index))
         for index in range(n_clusters)
@@ -74,6 +73,7 @@ def find_clusters(features: FloatArray, seed: int) -> Clusters:
     members.sort(key=len, reverse=True)
     if n_clusters < 2:
         return Clusters(tuple(members), silhouette=None, are_separated=False)
+    are_separated = _is_clearer_than_noise(seed, points, silhouette)
     return Clusters(tuple(members), silhouette, are_separated)
 
 

@@ -35,9 +35,9 @@ def find_envelope(
 ) -> EnvelopeRow | None:
     """Find the largest box of values inside which a model has an accuracy.
 
-    A box is peeled until the lower bound of its accuracy among the choosing rows is
-    large enough. It holds if the lower bound among the counting rows is large enough,
-    too.
+    A box is peeled (made smaller, see `list_peels`) until the lower bound of its
+    accuracy among the selection rows is large enough. It is confirmed if the lower
+    bound among the test rows is large enough, too.
 
     Args:
         selection_rows: half of the rows, by which the box is chosen.
@@ -49,13 +49,13 @@ def find_envelope(
     """
     if selection_rows.empty:
         return None
-    # The choosing rows have to reach a little more than the accuracy, since their
-    # estimate is biased. Near 1, where `ACCURACY_RESERVE` might exceed 1, the reserve
-    # is half of the distance to 1.
+    # The box is chosen for its accuracy among the selection rows, which therefore is
+    # too large on average: a reserve is added to the required accuracy. Near 1 it is
+    # half of the distance to 1.
     required = min(accuracy + ACCURACY_RESERVE, (1.0 + accuracy) / 2.0)
     box: rules.RuleConditions = ()  # without conditions: everything
     inside = selection_rows
-    while rules.estimate_interval(inside)[0] < required:
+    while rules.estimate_interval(inside)[0] < required:  # the lower bound
         smaller_box = find_best_peel(box, inside, selection_rows)
         if smaller_box is None:
             return None
@@ -63,9 +63,12 @@ def find_envelope(
         inside = selection_rows[rules.find_covered(box, selection_rows)]
     counts = count_right(test_rows[rules.find_covered(box, test_rows)])
     conditions = [condition.row for condition in box]  # as a result stores them
-    is_held = counts.interval[0] >= accuracy
+    lower_bound = counts.interval[0]
     return EnvelopeRow(
-        conditions=conditions, **vars(counts), accuracy=accuracy, confirmed=is_held
+        conditions=conditions,
+        **vars(counts),
+        accuracy=accuracy,
+        confirmed=lower_bound >= accuracy,
     )
 
 
@@ -80,8 +83,8 @@ def find_best_peel(
 
     Args:
         box: the conditions of the box.
-        inside: the choosing rows inside it.
-        selection_rows: all choosing rows.
+        inside: the selection rows inside it, which decide where it is peeled.
+        selection_rows: all selection rows.
     """
     is_independent = selection_rows["unit"].is_unique
     best_box = None
@@ -110,6 +113,7 @@ def list_peels(
     for factor, unit in inside.attrs["units"].items():
         condition = condition_of_factor.get(factor, rules.RuleCondition(factor, unit))
         for smaller in list_factor_peels(condition, inside[factor]):
+            # never so for a condition on names, which has infinite bounds
             is_empty = smaller.low >= smaller.high
             if smaller != condition and not is_empty:
                 conditions = {**condition_of_factor, factor: smaller}
@@ -134,6 +138,7 @@ def list_factor_peels(
         column: values of the factor in the rows inside the box.
     """
     if column.dtype == "category":
+        # A new condition has no `options`: it allows all names.
         names = condition.options or frozenset(column.cat.categories)
         if len(names) > 1:
             for name in sorted(names):
@@ -151,7 +156,8 @@ def _find_higher_low(values: rules.FloatArray) -> float:
 
     Values above the bound stay. The bound leaves out about `PEELED_FRACTION` of the
     values, and is rounded to three digits. If rounding would leave out none or all of
-    them, only the lowest value is left out.
+    them, only the lowest value is left out. If all values are the same, this leaves out
+    all of them; `find_best_peel` ignores a box without rows.
     """
     lowest = values.min()
     low = _round_to_3_digits(np.quantile(values, PEELED_FRACTION))

@@ -20,8 +20,9 @@ def count_right(rows: pd.DataFrame) -> RightCounts:
     """Count right predictions among rows, with the fraction of right ones.
 
     A unit is an independent draw. If several rows belong to a unit, such as the frames
-    of a drive, they are not independent. So the fraction is the mean over units of the
-    fraction of each, and every unit has the same weight. None without rows.
+    of a drive, they are not independent. So the fraction (`share`) is the mean over
+    units of the fraction of each, and every unit has the same weight. The fraction is
+    None if there are no rows.
     """
     right_fraction = None if rows.empty else rules.estimate_rate(rows)
     return RightCounts(
@@ -34,10 +35,12 @@ def count_right(rows: pd.DataFrame) -> RightCounts:
 
 
 def describe_rule(rule: rules.CountedRule) -> dict[str, Any]:
-    """Return the fields of a rule: conditions, and counts inside and elsewhere."""
-    conditions = [
-        condition.row for condition in rule.conditions
-    ]  # as results store them
+    """Return the fields of a rule: conditions, and counts inside and elsewhere.
+
+    The counts inside are fields of the rule itself, such as `right` and `total`.
+    """
+    # conditions as results store them
+    conditions = [condition.row for condition in rule.conditions]
     return {
         "conditions": conditions,
         **vars(count_right(rule.inside)),
@@ -59,6 +62,7 @@ def make_rejected_rule(
     """
     if rule is None:
         return None
+    # how many times as many rows would be needed
     needed_factor = rule.find_needed_factor()
     n_needed = None if needed_factor is None else round_up(needed_factor * n_rows)
     return RejectedRule(

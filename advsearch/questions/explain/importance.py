@@ -62,12 +62,12 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
 
     Args:
         table: a row for each prediction, with the columns `correct`, `unit` (the
-            cluster) and a column for each factor, whose names are `attrs["units"]`.
+            cluster) and a column for each factor. The keys of `attrs["units"]` are
+            the names of the factors.
 
     Returns:
-        The factors by descending fraction, from which the part that chance adds is
-        subtracted; then the pairs in the same way. Empty if all predictions are the
-        same.
+        The factors by descending fraction of the variance that they explain, then the
+        pairs in the same way. Empty if all predictions are the same.
     """
     if table["correct"].nunique() < 2:
         return []
@@ -88,15 +88,15 @@ def _find_interacting_pairs(
 ) -> list[ParameterWeight]:
     """Return the weights of the pairs of factors that interact significantly.
 
-    Two factors interact if the fraction of both together exceeds the sum of their
-    single fractions.
+    Two factors interact if together they explain a larger fraction of the variance of
+    predictions than the sum of what each explains.
 
     Args:
         table: the predictions, and a column of values for each factor.
         sample: the same predictions with their clusters.
     """
-    # Each factor has few groups, so that the cells of two factors have enough rows on
-    # average.
+    # Two factors have n_groups^2 cells: few groups, so that a cell has
+    # `MIN_ROWS_PER_CELL` clusters on average.
     n_groups = max(2, math.isqrt(sample.n_clusters // MIN_ROWS_PER_CELL))
     group_of_factor = {
         factor: cut_into_groups(table[factor], n_groups)
@@ -201,29 +201,32 @@ class ClusteredPredictions:
             np.bincount(group, self.weight * self.correct)[is_used] / used_weight
         )
         sum_of_squares = float((used_weight * (group_rate - self.mean) ** 2).sum())
-        return sum_of_squares / len(self.correct) / self.variance, len(group_rate)
+        # The sum of all weights is the number of rows.
+        fraction = sum_of_squares / len(self.correct) / self.variance
+        n_groups = len(group_rate)
+        return fraction, n_groups
 
     def estimate_weight(self, factors: list[str], group: IntArray) -> ParameterWeight:
         """Estimate the fraction of the variance between groups with its 95 % interval.
 
-        Even the groups of a factor without effect differ by chance. The average of this
-        effect is subtracted from the fraction: as in the adjusted R squared if rows are
-        independent, and by `expected_statistic` if they are in clusters. If that is not
-        known, or if there is a single group, the fraction is 0 and its interval 0 to 1:
-        nothing is known.
+        Even the groups of a factor without effect differ by chance. What chance adds on
+        average is subtracted from the fraction: as in the adjusted R squared if rows
+        are independent, and by `expected_statistic` if they are in clusters. If that is
+        not known, or if there is a single group, the fraction is 0 and its interval 0
+        to 1: nothing is known.
 
-        The interval follows from the statistic n s / D, with n rows, fraction s and
-        design effect D. It has a noncentral chi-squared distribution (with clusters,
-        degrees times a noncentral F). Its noncentrality L = n * true fraction / D has
-        an interval, which is multiplied by D / n.
+        The interval follows from the statistic rows * fraction / design effect. It has
+        a noncentral chi-squared distribution (with clusters, a noncentral F, multiplied
+        by the degrees of freedom). Its noncentrality is rows * true fraction / design
+        effect: an interval of the noncentrality gives one of the true fraction.
 
         Args:
             factors: names of the factors.
             group: (n,) the group of each prediction, by the values of the factors.
         """
-        share, n_groups = self.explained_fraction(group)
-        expected_statistic = self.expected_statistic(group)
-        is_known = n_groups >= 2 and not math.isnan(expected_statistic)
+        fraction, n_groups = self.explained_fraction(group)
+        chance_statistic = self.expected_statistic(group)  # without any effect
+        is_known = n_groups >= 2 and not math.isnan(chance_statistic)
         if not is_known:
             return ParameterWeight(
                 parameters=factors, share=0.0, interval=(0.0, 1.0), parts=n_groups
@@ -236,21 +239,23 @@ class ClusteredPredictions:
             error_degrees = math.inf
             # adjusted R squared: 1 - (1 - R²) (n - 1) / (n - k)
             residual_degrees = max(n_rows - n_groups, 1)
-            corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / residual_degrees
+            corrected_fraction = (
+                1.0 - (1.0 - fraction) * (n_rows - 1) / residual_degrees
+            )
         else:
-            # the expected statistic, divided by that of independent rows
-            design_effect = expected_statistic / degrees
+            # Independent rows have `degrees` as their expected statistic.
+            design_effect = chance_statistic / degrees
             error_degrees = float(self.n_clusters - n_groups)
-            corrected_share = share - expected_statistic / n_rows
+            corrected_fraction = fraction - chance_statistic / n_rows
 
         lower_noncentrality, upper_noncentrality = noncentrality_interval(
-            n_rows * share / design_effect, degrees, error_degrees
+            n_rows * fraction / design_effect, degrees, error_degrees
         )
         lower = min(design_effect * lower_noncentrality / n_rows, 1.0)
         upper = min(design_effect * upper_noncentrality / n_rows, 1.0)
         return ParameterWeight(
             parameters=factors,
-            share=max(corrected_share, 0.0),
+            share=max(corrected_fraction, 0.0),
             interval=(lower, upper),
             parts=n_groups,
         )
@@ -264,10 +269,11 @@ class ClusteredPredictions:
         1). With clusters, it is (groups - 1) times the design effect (Rao and Scott
         1981, section 3).
 
-        In that case the expectation of the sum is the sum of weight * variance of the
-        group's rate, minus rows * variance of the overall rate. Both are estimated from
-        the residuals of clusters. The result is at least `MIN_INFLATION` times (groups
-        - 1). It is NaN if a group has fewer than two clusters.
+        With clusters, the sum over groups has this expectation: the sum over groups of
+        weight * variance of the group's rate, minus rows * variance of the overall
+        rate. Both variances are estimated from the residuals of clusters. The result is
+        at least `MIN_INFLATION` times (groups - 1). It is NaN if a group has fewer than
+        two clusters.
 
         Args:
             group: (n,) the group of each prediction.
@@ -278,7 +284,8 @@ class ClusteredPredictions:
         if self.is_independent:
             return float(n_groups - 1)
 
-        # A cell is a cluster inside a group; `cell` (n,) is that of each prediction.
+        # A cell is what a cluster and a group have in common; `cell` (n,) is the index
+        # of the cell of each prediction.
         cell_id, cell = np.unique(
             group * self.n_clusters + self.cluster, return_inverse=True
         )
@@ -314,6 +321,8 @@ class ClusteredPredictions:
     ) -> FloatArray:
         """Return weight * (prediction - rate of its group) of each prediction, (n,).
 
+        The weights (`weight`) give each cluster the same total.
+
         Args:
             group: (n,) the group of each prediction.
             group_weight: (groups,) sum of the weights.
@@ -331,9 +340,10 @@ class ClusteredPredictions:
     ) -> float:
         """Return the number of rows times the variance of the overall rate.
 
-        With K clusters, whose weighted residuals have the sums r, the variance of the
-        overall rate is sum(r^2) * K / (K - 1) / rows^2. The factor K / (K - 1) makes it
-        unbiased.
+        The overall rate is that of all groups. With K clusters, whose weighted
+        residuals have the sums r, its variance is sum(r^2) * K / (K - 1) / rows^2. The
+        factor K / (K - 1) makes it unbiased. A cluster may have several cells, one in
+        each of its groups.
 
         Args:
             cell_cluster: (cells,) the cluster of each cell.
@@ -354,9 +364,10 @@ class ClusteredPredictions:
         The statistic of a grouping is the number of rows times its explained fraction.
         Without an interaction, the statistic of both factors together is the sum of the
         statistics of each. The excess over this sum is the test statistic. If rows are
-        independent, its distribution is chi-squared with (cells - first groups - second
-        groups + 1) degrees of freedom. With clusters it is divided by its expectation,
-        and its distribution is F. The p-value is 1 if there are too few clusters.
+        independent, its distribution is chi-squared. Its degrees of freedom are (cells
+        - 1) - (first groups - 1) - (second groups - 1), where a cell is a group of
+        both factors. With clusters it is divided by its expectation, and its
+        distribution is F. The p-value is 1 if there are too few clusters.
 
         Args:
             joint_group: (n,) the group of each prediction by both factors.
@@ -376,7 +387,8 @@ class ClusteredPredictions:
         expected -= self.expected_statistic(first_group)
         expected -= self.expected_statistic(second_group)
         error_degrees = self.n_clusters - degrees - 1
-        is_known = expected > 0.0  # False for NaN
+        # `expected_statistic` is NaN if it is not known: then this is False.
+        is_known = expected > 0.0
         if not is_known or error_degrees < 1:
             return 1.0
         return float(f_distribution.sf(statistic / expected, degrees, error_degrees))
@@ -414,12 +426,13 @@ def noncentrality_interval(
     distribution; at the upper end, it is the 2.5 % quantile.
 
     Args:
-        statistic: the statistic, chi-squared or `degrees` times one of F.
+        statistic: the statistic, of a chi-squared distribution; or of F, multiplied by
+            `degrees`, so that it has about the same size.
         degrees: degrees of freedom.
         error_degrees: degrees of freedom of F's denominator; infinity for chi-squared.
     """
-    # The expected statistic of a factor without effect is its degrees of freedom. A
-    # smaller statistic would give an upper bound that is too small.
+    # A factor without effect has `degrees` as its expected statistic. A smaller one is
+    # chance: the upper bound would be too small with it, or 0.
     upper_statistic = max(statistic, float(degrees))
     tail = (1.0 - statistics.intervals.CONFIDENCE) / 2.0
     lower = find_noncentrality(statistic, degrees, error_degrees, 1.0 - tail)
@@ -445,7 +458,7 @@ def find_noncentrality(
     """
 
     def excess_probability(noncentrality: float) -> float:
-        """Return by how much the probability of the statistic exceeds `probability`."""
+        """Return P(value <= statistic) - `probability`, which falls to below 0."""
         is_central = noncentrality <= 0.0
         if math.isinf(error_degrees):
             distribution = chi2(degrees) if is_central else ncx2(degrees, noncentrality)
@@ -455,7 +468,7 @@ def find_noncentrality(
             distribution = (
                 central if is_central else ncf(degrees, error_degrees, noncentrality)
             )
-            cumulative = distribution.cdf(statistic / degrees)
+            cumulative = distribution.cdf(statistic / degrees)  # one of F
         # scipy returns NaN for a noncentrality that is too large: P is then about 0.
         return float(np.nan_to_num(cumulative)) - probability
 

@@ -14,6 +14,7 @@ from itertools import zip_longest
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import torch
 
@@ -92,7 +93,8 @@ class SweepRunner:
     def run_sweep(self, name: str, config: SweepConfig) -> pd.DataFrame | None:
         """Run a sweep and return its rows.
 
-        If its scene is no longer available, a warning is added.
+        If its scene is no longer available, a warning is added. After an interrupt, no
+        further sweep is run.
 
         Args:
             name: name of the run in the directory of this experiment.
@@ -149,6 +151,7 @@ class SweepRunner:
         # Fresh rows that earlier rules cover are left out afterwards. The smaller the
         # fraction of the others, the more configurations are rendered.
         is_uncovered = find_uncovered(earlier_conditions, covered_rows)
+        # at least `MIN_UNCOVERED_FRACTION`, which limits the number of renders
         uncovered_fraction = max(float(is_uncovered.mean()), MIN_UNCOVERED_FRACTION)
         fresh_frames = self._render_inside(
             index, rule, uncovered_fraction, earlier_conditions
@@ -156,9 +159,10 @@ class SweepRunner:
         fresh_rows = pd.concat(fresh_frames) if fresh_frames else self.rows[:0]
         if fresh_rows.empty:
             return None
-        # The indices of draws become texts, as they are in fresh rows ("12 of 3"): so
-        # old and fresh draws can be compared, and are distinct.
+        # Draws of fresh rows have names ("12 of 3"). The old draws get names, too
+        # ("12"), so that no old draw is taken for a fresh one.
         elsewhere = rule.elsewhere.assign(unit=rule.elsewhere["unit"].astype(str))
+        # `holds` compares the fresh rows inside with the old rows elsewhere.
         fresh_rule = rules.CountedRule(rule.conditions, fresh_rows, elsewhere)
         return Confirmation(**vars(count_right(fresh_rows)), confirmed=fresh_rule.holds)
 
@@ -187,26 +191,34 @@ class SweepRunner:
         fresh_frames = []
         for sweep_index, sweep in enumerate(self.sweeps):
             n_arcs = count_arcs(sweep.config, rule.conditions)
+            # `confirm` is the number of rows of a rule that no earlier rule covers. It
+            # is divided evenly among sweeps and arcs.
             samples = math.ceil(
                 self.config.confirm / len(self.sweeps) / n_arcs / uncovered_fraction
             )
             for arc in range(n_arcs):
-                # a number that is distinct for each rule, sweep and arc
-                number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
-                seed = seeds.derive_seed(self.config.seed, "confirm", number)
                 self.progress.message(
                     f"rule {index + 1}: rendering about {samples} "
                     "configurations inside it"
                 )
+                # a number that is distinct for each rule, sweep and arc
+                number = (index * len(self.sweeps) + sweep_index) * MAX_ARCS + arc
                 config = make_sweep_inside(
-                    sweep.config, self.factor_table, rule.conditions, samples, seed, arc
+                    sweep.config,
+                    self.factor_table,
+                    rule.conditions,
+                    samples,
+                    seed=seeds.derive_seed(self.config.seed, "confirm", number),
+                    arc=arc,
                 )
                 suffix = f"-{arc}" if arc else ""
                 rows = self.run_sweep(f"rule-{index + 1}-{sweep_index}{suffix}", config)
+                # None after an interrupt, or if nothing could be rendered
                 if rows is None:
                     continue
                 inside = select_inside(rows, rule.conditions, earlier_conditions)
-                # Draws of other sweeps may have the same indices.
+                # Draws of other sweeps may have the same indices: with this number
+                # their names differ, such as "12 of 3".
                 unit = inside["unit"].astype(str) + f" of {number}"
                 fresh_frames.append(inside.assign(unit=unit))
         return fresh_frames
@@ -239,7 +251,8 @@ class SweepRunner:
                 if factor not in rule_factors
             ]
             # groups to try: all factors of the rule, then each other factor by itself
-            for factors in (rule_factors, *([factor] for factor in other_factors)):
+            factor_groups = [rule_factors, *([factor] for factor in other_factors)]
+            for factors in factor_groups:
                 attempts = [
                     self._find_nearest_right(f"pair-{number}", index, factor)
                     for factor in factors
@@ -257,6 +270,7 @@ class SweepRunner:
         column = self.factor_table[pair.parameter]
         if column.dtype == "category":
             return 1.0
+        # not 0, as the columns of this table vary
         value_range = float(column.max() - column.min())
         return abs(float(pair.right_at) - float(pair.wrong_at)) / value_range
 
@@ -286,7 +300,7 @@ class SweepRunner:
         frames = self._render_twice(run_name, config, failure, factor)
         if frames is None:
             return None
-        self._tried_failures.add(index)
+        self._tried_failures.add(index)  # counted in `pairs_sought`
 
         frame_a, frame_b = frames  # the same configurations, with different noise
         wrong_value = failure[factor]
@@ -307,6 +321,7 @@ class SweepRunner:
             right_at=values[nearest_row],
             failure_label=frame_a["label"][failure_row],
             right_label=frame_a["label"][nearest_row],
+            # images of the first of both renders
             pictures=self._list_thumbnails(f"{run_name}-0", (failure_row, nearest_row)),
         )
 
@@ -405,6 +420,8 @@ class SweepRunner:
         clusters = find_clusters(
             compute_features(images).double().numpy(), self.config.seed
         )
+        # The first member of a cluster is the most typical one. Members are indices of
+        # both the images and the sampled rows.
         described_clusters = [
             self._describe_cluster(
                 number, sampled.iloc[list(members)], images[members[0]]
@@ -412,7 +429,7 @@ class SweepRunner:
             for number, members in enumerate(clusters.members, start=1)
         ]
         return FailureClusters(
-            features=compute_features.source,
+            features=compute_features.source_description,
             failures=len(sampled),
             silhouette=clusters.silhouette,
             are_separated=clusters.are_separated,
@@ -433,7 +450,9 @@ class SweepRunner:
             an image could not be rendered; then a warning is added.
         """
         try:
+            # After Ctrl-C this block ends, and `ending` is set.
             with self.context.until_interrupted():
+                # The column `step` has the index of the image in its sweep.
                 batches = [
                     self.render_again(self.sweeps[index], rows["step"].tolist())
                     for index, rows in sampled.groupby("sweep")
@@ -496,13 +515,13 @@ class SweepRunner:
         model. If there is none, no sweep is selected.
         """
         models_of_sweeps = [sweep.config.models for sweep in self.sweeps]
-        single_model = next(
-            (names for names in models_of_sweeps if len(names) == 1), None
-        )
+        single_models = [names for names in models_of_sweeps if len(names) == 1]
+        if not single_models:
+            return []
         return [
             index
             for index, names in enumerate(models_of_sweeps)
-            if names == single_model
+            if names == single_models[0]
         ]
 
     def render_again(
@@ -520,14 +539,15 @@ class SweepRunner:
 
         Raises:
             InputError: the scene is no longer available, or the task is not
-                classification.
+                classification (raised by `find_features`).
         """
-        features = sweep.scenes.find_features()
+        # a function from images to features
+        compute_features = sweep.scenes.find_features()
         images = []
         for number in numbers:
             images.append(sweep.scenes.render_image(number))
             self.progress.advance(1)
-        return torch.stack(images), features
+        return torch.stack(images), compute_features
 
 
 def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:
@@ -536,7 +556,8 @@ def count_arcs(config: SweepConfig, conditions: rules.RuleConditions) -> int:
     A condition on an angle may have two opposite arcs of the circle, each of which
     needs a sweep. Conditions on other factors have no arcs, and need one sweep. If two
     angles have two arcs each, two sweeps are used, too: `cut_controls` combines the
-    first arcs in one of them and the second arcs in the other.
+    first arcs in one of them and the second arcs in the other. The other two
+    combinations are not rendered.
     """
     # The range of a factor that is not sampled is not cut to arcs.
     n_arcs = [
@@ -591,21 +612,29 @@ def find_typical_failures(
     ranks = _rank_rows(table)  # (n, parameters)
     is_unassigned: rules.Mask = ~table["correct"].to_numpy()
     no_conditions: rules.RuleConditions = ()  # these cover every row
-    # the failures of each group, the most typical first
-    queues = []
-    for conditions in (*(rule.conditions for rule in counted_rules), no_conditions):
-        indices = np.flatnonzero(is_unassigned & rules.find_covered(conditions, table))
+    group_conditions = [*(rule.conditions for rule in counted_rules), no_conditions]
+    groups = []  # lists of failures, the most typical first
+    for conditions in group_conditions:
+        is_in_group = is_unassigned & rules.find_covered(conditions, table)
+        indices = np.flatnonzero(is_in_group)
         is_unassigned[indices] = False
         if not len(indices):
             continue
-        distance = np.abs(ranks[indices] - ranks[indices].mean(axis=0)).sum(axis=1)
-        most_typical_first = indices[np.argsort(distance, kind="stable")].tolist()
-        queues.append([(index, conditions) for index in most_typical_first])
+        # the failures nearest to the mean of their group first
+        order = _sort_by_distance_from_mean(ranks[indices])
+        groups.append([(index, conditions) for index in indices[order].tolist()])
     failures = []
-    for turn in zip_longest(*queues):
-        # `zip_longest` yields None for a queue that has ended.
-        failures += [failure for failure in turn if failure is not None]
+    # the most typical failure of each group, then the second one of each, and so on
+    for failures_of_groups in zip_longest(*groups):
+        # `zip_longest` yields None for a group that has no more failures.
+        failures += [failure for failure in failures_of_groups if failure is not None]
     return failures[:limit]
+
+
+def _sort_by_distance_from_mean(ranks: rules.FloatArray) -> npt.NDArray[np.intp]:
+    """Return the order of rows (n, parameters) by their distance from the mean row."""
+    distance = np.abs(ranks - ranks.mean(axis=0)).sum(axis=1)
+    return np.argsort(distance, kind="stable")
 
 
 def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
@@ -615,6 +644,7 @@ def _rank_rows(table: pd.DataFrame) -> rules.FloatArray:
     """
     parameters = list(table.attrs["units"])
     columns = [table[name] for name in parameters]
+    # Names are ranked by the index of their category.
     values = [
         column.cat.codes if column.dtype == "category" else column for column in columns
     ]

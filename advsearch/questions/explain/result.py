@@ -270,11 +270,12 @@ def make_explain_view(result: ExplainResult) -> ShownResult:
         ),
         ResultPart("Where it can be relied on", [describe_envelope(result)]),
     ]
-    if result.pairs_sought:
+    if result.pairs_sought:  # the number of failures for which a pair was looked for
         sections.append(ResultPart("One thing changed", [describe_pairs(result)]))
     sections += [_pair_section(pair) for pair in result.pairs]
     if result.clusters:
         sections.append(_cluster_section(result.clusters))
+    # None if each row is an independent draw
     draws = f", of {result.units:,} independent draws" if result.units else ""
     facts = {
         # for example "right in 88 % (84 to 91) of 340, of 20 independent draws"
@@ -384,6 +385,7 @@ def describe_envelope(result: ExplainResult) -> str:
     if box is None:
         return "No box of enough rows has the required accuracy."
     where = wording.format_conditions(box.conditions)
+    # `box.text` is the rate of the rows that tested the box: "88 % (84 to 91) of 340"
     if not box.confirmed:
         return (
             f"Not confirmed: inside {where} the rows that did not choose the box are "
@@ -415,8 +417,9 @@ def _cluster_section(clusters: FailureClusters) -> ResultPart:
     most typical image of each.
     """
     failures = f"the {clusters.failures} failures that were rendered again"
+    # `features` describes where they come from: "the input of head (Linear)"
     text = f"One kind: {failures} are alike by {clusters.features}."
-    has_multiple_clusters = clusters.silhouette is not None
+    has_multiple_clusters = clusters.silhouette is not None  # one cluster has none
     if has_multiple_clusters:
         reservation = ""
         if not clusters.are_separated:

@@ -25,11 +25,16 @@ many there are or what is stored.
 def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     """Read the rows of several sweeps as one frame.
 
-    The column `sweep` has the index of the sweep, and `unit` the index of the draw:
-    rows of the same draw are not independent. A longer sweep with the same seed repeats
-    the images of a shorter one; repeated images are left out. Object, environment and
-    model are shortened to the names in figures. Parameters that a sweep does not have
-    are missing values (NaN). `attrs["units"]` maps the parameters to their units.
+    A longer sweep with the same seed repeats the images of a shorter one; repeated
+    images are left out. Names of objects, environments and models are shortened, as in
+    figures.
+
+    Returns:
+        The rows. The column `sweep` has the index of the sweep. The column `unit` has
+        the index of the draw: rows of the same draw, such as the frames of a drive, are
+        not independent. The value of a parameter that a sweep does not have is NaN.
+        `attrs["units"]` maps each parameter, or scene setting, to its unit of
+        measurement.
     """
     frames = []
     for index, sweep in enumerate(sweeps):
@@ -49,10 +54,11 @@ def read_predictions(sweeps: Sequence[workbench.StoredSweep]) -> pd.DataFrame:
     table = table[~is_repeated].reset_index(drop=True)
     units = _collect_units(frames)
     for name in units:
-        if not pd.api.types.is_float_dtype(table[name]):
+        has_names = not pd.api.types.is_float_dtype(table[name])
+        if has_names:
             table[name] = table[name].astype("category")
-    # the index of the draw of each row
-    table["unit"] = np.unique(table["draw"], return_inverse=True)[1]
+    _, draw_indices = np.unique(table["draw"], return_inverse=True)
+    table["unit"] = draw_indices
     table = table.drop(columns=["draw", "image"])
     table["correct"] = (table["correct"] == 1) & rules.is_in_view(table)
     table.attrs["units"] = units
@@ -104,9 +110,10 @@ def name_draws(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
 def name_images(sweep: workbench.StoredSweep, rows: pd.DataFrame) -> list[str]:
     """Return a name of each row (n,), equal for the same prediction of the same image.
 
-    The name consists of the settings that decide the image, the index of the row in its
-    sweep, the values, and whether the prediction is right. `EXTENT_SETTINGS`, such as
-    the number of samples, are left out: they do not change an image.
+    The name consists of the settings that decide the image, the index of the image in
+    its sweep (column `step`), the values, and whether the prediction is right.
+    `EXTENT_SETTINGS`, such as the number of samples, are left out: they do not change
+    an image.
 
     Args:
         sweep: the sweep.

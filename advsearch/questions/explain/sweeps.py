@@ -31,11 +31,12 @@ def make_sweep_inside(
     """Return the settings of a sweep whose configurations mostly lie under conditions.
 
     Sampled ranges are cut to the conditions. Axes of the grid, and the lists of
-    objects, environments and models, are reduced to the values that rows under the
-    conditions have. If this makes more than twice as many configurations as requested,
-    every second value of the longest axis is left out, repeatedly. Some conditions
-    cannot be expressed in this way. So some configurations may lie outside of them, and
-    the caller has to filter these.
+    objects, environments and models, are reduced to the values of those rows for which
+    the conditions hold. If this makes more than twice as many configurations as
+    requested, every second value of the longest axis is left out, repeatedly.
+
+    Settings cannot express every condition, such as one on an arc that passes 360
+    degrees. So the caller has to leave out configurations outside of the conditions.
 
     Args:
         config: settings of the original sweep.
@@ -46,6 +47,7 @@ def make_sweep_inside(
         arc: index of the arc to render, if a condition on an angle has two arcs.
     """
     inside = table[rules.find_covered(conditions, table)]
+    # the different values of each parameter in these rows
     values_inside = {
         name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]
     }
@@ -54,13 +56,16 @@ def make_sweep_inside(
         len(settings.split_names(names)) if names else 1
         for names in scene_settings.values()
     )
+    # An axis that does not vary in the rows keeps its values.
     full_grid = {
         name: values_inside.get(name, values) for name, values in config.grid.items()
     }
+    # twice the number of samples, for all scenes together
     grid = thin_grid(full_grid, max_points=2 * samples / n_scenes)
     n_configurations = count_grid_points(grid) * n_scenes
     controls = cut_controls(config, table, conditions, arc)
-    # number of draws at each point of the grid in each scene, if anything is sampled
+    # number of draws at each point of the grid in each scene; None if nothing is
+    # sampled
     draws = math.ceil(samples / n_configurations) if controls else None
     return make_minimal_config(
         config, grid=grid, controls=controls, samples=draws, seed=seed, **scene_settings
@@ -119,13 +124,13 @@ def cut_controls(
 
     A range is cut to the bounds of its condition, and to the values that rows have. A
     condition on an angle may have two opposite arcs of the circle: the range becomes
-    one of them. An arc that passes 360 degrees cannot be set: the range is not cut
-    then.
+    one of them. It is not cut to an arc that passes 360 degrees, which settings cannot
+    express.
 
-    If no parameter of a control has a range in the settings, all of them are sampled
-    from their full ranges. If some have a range, only these are sampled. So if a
-    control gets its first range here, its other parameters get the ranges of the rows'
-    values.
+    A control without any range in the settings samples all of its parameters from their
+    full ranges; otherwise it samples only those that have a range. So a control that
+    gets its first range here gets ranges for its other parameters, too: those of the
+    values in the rows.
 
     Args:
         config: settings of the sweep.
@@ -136,17 +141,18 @@ def cut_controls(
     """
     controls = {name: dict(options) for name, options in config.controls.items()}
     for condition in conditions:
-        # `options` are the names of a condition on names.
+        # `condition.options` is not None for a condition on names.
         if condition.options is not None or not is_sampled(config, condition.factor):
             continue
+        # the name of the control in the settings, and its parameter: "pose.yaw"
         instance, _, parameter = condition.factor.partition(".")
         declared = config.declared_parameters(instance) or {}
         low, high = _find_range(condition, table, arc)
         if high > declared[parameter].high:  # an arc that passes 360 degrees
             continue
-        # the settings of the sweep, without ranges that were added for other conditions
-        has_ranges = bool(declared.keys() & config.controls[instance].keys())
-        if not has_ranges:
+        # `config` has no ranges that were added here for other conditions.
+        had_ranges = bool(declared.keys() & config.controls[instance].keys())
+        if not had_ranges:
             ranges = observed_ranges(config, table, instance, declared)
             for name, values in ranges.items():
                 controls[instance].setdefault(name, values)
@@ -163,9 +169,10 @@ def _find_range(
         condition: the condition.
         table: rows of the sweep, whose values limit the range of a factor that is no
             angle.
-        arc: index of the arc, for an angle. A condition with a single arc uses it for
-            every index.
+        arc: index of the arc, for an angle. A condition with a single arc has the same
+            range for every index.
     """
+    # `turn` is the period of the factor: 0 for a factor that is no angle.
     is_of_angle = condition.turn > 0.0
     if is_of_angle:
         return condition.arcs[arc % len(condition.arcs)]
@@ -214,9 +221,9 @@ def make_sweep_along(
 ) -> SweepConfig:
     """Return the settings of a sweep along one factor, with all else as in a row.
 
-    The values of the factor are the row's own value, then all names, or
+    The first value of the factor is that of the row. It is followed by all names, or by
     `N_VALUES_ALONG` evenly spaced numbers. Every other parameter is an axis of the grid
-    with one value, that of the row.
+    with one value, that of the row. Nothing is sampled.
 
     Args:
         config: settings of the original sweep.
@@ -353,9 +360,10 @@ def is_settable(config: SweepConfig, name: str) -> bool:
 
 
 def find_names(config: SweepConfig, setting: str, value: str) -> list[str]:
-    """Return the names in a setting that rows write as `value`; else the first name.
+    """Return the names in a setting that rows write as `value`.
 
-    Empty if the setting is empty.
+    Rows may have a shorter form of a name. If no name matches, the first name in the
+    setting is returned; the result is empty if the setting is empty.
     """
     setting_value = getattr(config, setting)
     names = settings.split_names(setting_value) if setting_value else ()

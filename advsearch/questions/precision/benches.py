@@ -83,26 +83,39 @@ class MeasuredRounds:
         """Estimate the seconds of a call other than the first ones.
 
         If the setting has been called, the estimate is the median of its last calls.
-        Otherwise it is the cost of the setting times the seconds per unit of cost of
-        the most expensive setting on its line (the same estimator with another sample
-        count). If its line has not been called, those of the slowest line are used. The
-        estimate is 0 if nothing has been called.
+        Otherwise it is the cost of the setting times the seconds per unit of cost on
+        its line. A line has the same estimator (`estimator_key`) with several sample
+        counts; its most expensive setting that has been called decides. If none on the
+        line has been called, the slowest line is used. The estimate is 0 if nothing has
+        been called.
         """
         if setting in self.wall_seconds:
-            call_seconds = self.wall_seconds[setting]
-            warm_calls = call_seconds[COLD_CALLS:] or call_seconds[-1:]
-            return statistics.median(warm_calls[-3:])
-        by_cost = sorted(self.wall_seconds, key=lambda known: known.relative_cost)
+            return self._median_of_last_calls(setting)
+        most_expensive_of_line: dict[Any, SampleSetting] = {}
         # Later settings replace earlier ones, so that the most expensive one is left.
-        most_expensive = {known.estimator_key: known for known in by_cost}
+        for known_setting in sorted(
+            self.wall_seconds, key=lambda earlier_setting: earlier_setting.relative_cost
+        ):
+            most_expensive_of_line[known_setting.estimator_key] = known_setting
         seconds_per_cost = {
-            line: self.estimate_call_seconds(known) / known.relative_cost
-            for line, known in most_expensive.items()
+            line: self._median_of_last_calls(known_setting)
+            / known_setting.relative_cost
+            for line, known_setting in most_expensive_of_line.items()
         }
-        highest = max(seconds_per_cost.values(), default=0.0)
+        slowest_line = max(seconds_per_cost.values(), default=0.0)
         return setting.relative_cost * seconds_per_cost.get(
-            setting.estimator_key, highest
+            setting.estimator_key, slowest_line
         )
+
+    def _median_of_last_calls(self, setting: SampleSetting) -> float:
+        """Return the median of the seconds of the last three calls of a setting.
+
+        The first calls (`COLD_CALLS`), which compile kernels, are left out if there are
+        others; otherwise the last of them is used.
+        """
+        call_seconds = self.wall_seconds[setting]
+        warm_calls = call_seconds[COLD_CALLS:] or call_seconds[-1:]
+        return statistics.median(warm_calls[-3:])
 
     def fits_in_time(self, setting: SampleSetting, seconds_left: float) -> bool:
         """Return whether a new setting fits into the remaining time."""
@@ -114,28 +127,30 @@ class MeasuredRounds:
         """Estimate the seconds until new and earlier settings have enough calls.
 
         A setting needs `MIN_CALLS` calls. Its first calls take longer, as they compile
-        kernels. The extra time of the new setting is estimated as the median of that of
-        earlier ones. An earlier setting that needs more than the fraction
-        `MAX_SETTING_FRACTION` of the remaining time has turned out to be too expensive:
-        it is not counted here, and is measured last.
+        kernels: the extra time of the new setting is estimated as the median of the
+        extra times of earlier ones. An earlier setting whose missing calls need more
+        than the fraction `MAX_SETTING_FRACTION` of the remaining time is not counted:
+        it gets further calls only if time is left.
 
         Args:
             setting: the new setting, which has no calls yet.
             seconds_left: seconds left of the budget.
         """
-        extra_of_first_calls = list[float]()
+        extras_of_settings = list[float]()
         earlier_seconds = 0.0
-        for known, call_seconds in self.wall_seconds.items():
-            warm_seconds = self.estimate_call_seconds(known)
-            if len(call_seconds) > COLD_CALLS:
+        for earlier, call_seconds in self.wall_seconds.items():
+            warm_seconds = self.estimate_call_seconds(earlier)
+            has_warm_calls = len(call_seconds) > COLD_CALLS
+            if has_warm_calls:
                 first_seconds = sum(call_seconds[:COLD_CALLS])
-                extra_of_first_calls.append(first_seconds - COLD_CALLS * warm_seconds)
-            needed = max(0, MIN_CALLS - len(call_seconds)) * warm_seconds
-            if needed <= MAX_SETTING_FRACTION * seconds_left:
-                earlier_seconds += needed
+                extras_of_settings.append(first_seconds - COLD_CALLS * warm_seconds)
+            n_missing = max(0, MIN_CALLS - len(call_seconds))
+            missing_seconds = n_missing * warm_seconds
+            if missing_seconds <= MAX_SETTING_FRACTION * seconds_left:
+                earlier_seconds += missing_seconds
         extra_seconds = 0.0
-        if extra_of_first_calls:
-            extra_seconds = max(0.0, statistics.median(extra_of_first_calls))
+        if extras_of_settings:
+            extra_seconds = max(0.0, statistics.median(extras_of_settings))
         new_seconds = MIN_CALLS * self.estimate_call_seconds(setting)
         return extra_seconds + new_seconds + earlier_seconds
 
@@ -153,17 +168,17 @@ def measure_in_rounds(
 
     In the first round a setting is started only if there is time for `MIN_CALLS` calls
     of it and of all settings before it. The first setting is always measured. A first
-    call compiles kernels and takes longer. So each setting is called twice at once, and
-    its time is estimated from the second call. A call that is not expected to fit is
-    not started: only the first calls of a setting can exceed the budget. Each call has
-    its own seed.
+    call compiles kernels and takes longer. So each setting is called `COLD_CALLS` times
+    in the first round, and its time is estimated from the last of these calls. A call
+    that is not expected to fit is not started: only the first calls of a setting can
+    exceed the budget. Each call has its own seed.
 
     Args:
         settings: the settings, in any order.
         measure: measures a setting with a seed.
         budget: the time of all rounds.
         rounds: number of rounds. A round calls each setting once, the first round
-            twice.
+            `COLD_CALLS` times.
         seed: root of the seeds.
         on_done: called with the setting after each call.
     """
@@ -186,7 +201,7 @@ def measure_in_rounds(
                 measure_once(setting)
         else:
             measured.skipped.append(setting)
-    # The first round is over: each setting was called twice.
+    # The first round is over.
     for _ in range(1, rounds):
         for setting in measured.results_by_setting:
             if measured.estimate_call_seconds(setting) <= budget.seconds_left:
@@ -203,7 +218,7 @@ def take_reference_parts(
     """Return as many independent parts of a reference as fit into a budget.
 
     Each part has its own seed. There are at least two parts, however long they take,
-    because the error is estimated from their difference. There are at most
+    because the error is estimated from the differences of parts. There are at most
     `MAX_REFERENCE_PARTS`.
 
     Args:
@@ -219,8 +234,8 @@ def take_reference_parts(
             break
         start = budget.clock()
         parts.append(take_part(seeds.derive_seed(seed, "reference", len(parts))))
-        # The next part may be as slow as the slowest so far, whose influence halves
-        # with each part.
+        # The next part may be as slow as the slowest so far. A slow part counts half
+        # after each later part, since it may have been slow by chance.
         expected_seconds = max(budget.clock() - start, 0.5 * expected_seconds)
         on_done()
     return parts
@@ -325,18 +340,19 @@ class PictureBench:
         self._margin = margin
         self._space = renderer.space
         self._formation = renderer.formation
-        # All samplers without denoiser, then two of them with a denoiser.
+        # The lines: all samplers without denoiser, then two of them with a denoiser.
         self._estimators = list(samplers)
         for name in ("independent", REFERENCE_SAMPLER):
             if name in samplers:
                 self._estimators.append(name + OIDN)
-        # references, by quantity ("picture" or "margin") and denoiser
+        # references, by quantity ("picture" or "margin") and denoiser ("none", "oidn")
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {
             name: renderer.scene.copy_with(sampler=name)
             for name in {*samplers, REFERENCE_SAMPLER}
         }
-        # The lines of references have renderers, too, even if they are not measured.
+        # References are rendered by `REFERENCE_SAMPLER`, which has renderers even if it
+        # is not measured.
         self._renderers = {
             line: renderer.copy_with(
                 scenes[line.removesuffix(OIDN)], denoiser=get_denoiser(line)
@@ -366,7 +382,8 @@ class PictureBench:
         Returns:
             A row of the result for each reference.
         """
-        # "none" comes first, as in `_estimators`: the other references need it.
+        # "none" comes first, since the estimators without denoiser do: the other
+        # references need the reference without denoiser.
         denoisers = list(dict.fromkeys(map(get_denoiser, self._estimators)))
         rows = []
         for index, denoiser in enumerate(denoisers):
@@ -397,16 +414,21 @@ class PictureBench:
 
         Returns:
             A row of the result for the image (without denoiser only) and one for the
-                margin.
+            margin.
         """
         line = REFERENCE_SAMPLER if denoiser == "none" else REFERENCE_SAMPLER + OIDN
-        # These renders are only timed, so that any seed will do.
+        # the largest sample count with which several parts fit into the budget; these
+        # renders are only timed, so that any seed will do
         spp = choose_part_samples(
             lambda count: self._render_radiance(line, seed=0, spp=count),
             budget.seconds_left,
         )
         radiances = take_reference_parts(
-            partial(self._render_radiance, line, spp=spp), budget, on_done, seed
+            # a function of the seed
+            partial(self._render_radiance, line, spp=spp),
+            budget,
+            on_done,
+            seed,
         )
         parts = [flatten(radiance) for radiance in radiances]
         rows = []
@@ -554,8 +576,9 @@ def list_gradient_parts(
     Args:
         groups: parameters of the search space, with the estimators that are valid for
             each.
-        linear: whether the loss is linear; then differences of the loss ("secant")
-            equal those of the image, and are left out.
+        linear: whether the loss is a linear function of the image. Then the estimator
+            "secant", by differences of the loss, equals the one by differences of the
+            image, and is left out.
     """
     # `valid` lists the estimators of a group; without any it has no gradient.
     differentiable_groups = [group for group in groups if len(group.valid) > 0]
@@ -613,21 +636,22 @@ class GradientBench:
         self._loss = loss
         self._u = u
         self.part = part
-        # renderer of references, with the sampler that is fastest at the same error
+        # renderer of references: its sampler needs the least time for the same error
         self._exact = renderer.copy_with(
             renderer.scene.copy_with(sampler=REFERENCE_SAMPLER)
         )
-        # Differences do not have the bias of an adjoint, but need renders for each
-        # coordinate.
+        # An adjoint may be biased, since it ignores moving edges. Differences are not,
+        # but need renders for each coordinate.
         self._by_differences = part.size <= MAX_DIFFERENCE_COORDINATES
         if self._by_differences:
             self._reference_estimator = "differences"
         else:
             adjoints = [name for name in part.estimators if name in ADJOINT_COST]
-            # the first adjoint; without any, the first estimator
+            # the first adjoint (`ADJOINT_COST` lists them); without any, the first
+            # estimator
             self._reference_estimator = adjoints[0] if adjoints else part.estimators[0]
         self.reference: ReferenceValue | None = None
-        # Gradients have the sample counts of images with the independent sampler.
+        # the same sample counts as for images with the independent sampler
         self.settings = [
             self.make_setting(estimator, count)
             for estimator in part.estimators
@@ -692,19 +716,24 @@ class GradientBench:
         probes = self._list_probes()
         # These renders are only timed, so that any seed will do.
         spp = choose_part_samples(
-            lambda count: self._compute_derivatives(probes, noise=0, spp=count),
+            lambda count: self._compute_derivatives(probes, seed=0, spp=count),
             budget.seconds_left,
             parts=DIFFERENCE_PARTS,
             counts=DIFFERENCE_SAMPLE_COUNTS,
         )
         parts = take_reference_parts(
-            partial(self._compute_derivatives, probes, spp=spp), budget, on_done, seed
+            # a function of the seed, which returns derivatives and disagreements
+            partial(self._compute_derivatives, probes, spp=spp),
+            budget,
+            on_done,
+            seed,
         )
         derivatives = [derivative for derivative, _ in parts]
         # The values with two steps differ. Extrapolation to a step of 0 removes most of
         # that difference: a quarter of it is assumed to be left as a bias.
         disagreements = [disagreement for _, disagreement in parts]
-        bias = float(np.linalg.norm(np.mean(disagreements, axis=0))) / 4.0
+        mean_disagreement = float(np.linalg.norm(np.mean(disagreements, axis=0)))
+        bias = mean_disagreement / 4.0
         return estimate_reference(derivatives, bias=bias), spp
 
     def _compute_reference_by_estimator(
@@ -720,6 +749,7 @@ class GradientBench:
         Returns:
             The reference, and the samples per pixel of each of its parts.
         """
+        # a function of the seed and of the samples per pixel
         compute = partial(
             self._compute_gradient, self._exact, self._reference_estimator
         )
@@ -738,16 +768,16 @@ class GradientBench:
                 index = group.begin + number
                 direction = torch.zeros_like(self._u)
                 direction[index] = 1.0
+                # a group of this coordinate alone
                 coordinate = replace(group, size=1, begin=index)
-                probes.append(
-                    gradients.Probe(
-                        coordinate, f"{group.name}.{number}", direction, group.step
-                    )
-                )
+                name = f"{group.name}.{number}"
+                # the last argument is the step of differences
+                probe = gradients.Probe(coordinate, name, direction, group.step)
+                probes.append(probe)
         return probes
 
     def _compute_derivatives(
-        self, probes: Sequence[gradients.Probe], noise: int, spp: int
+        self, probes: Sequence[gradients.Probe], seed: int, spp: int
     ) -> Float64Array:
         """Compute the derivatives along directions by finite differences.
 
@@ -755,19 +785,20 @@ class GradientBench:
 
         Args:
             probes: n directions.
-            noise: seed of the renders' noise.
+            seed: seed of the renders' noise.
             spp: samples per pixel.
 
         Returns:
             (2, n): the derivatives; and the differences between the values with both
             steps, which show how accurate the derivatives are.
         """
-        bench = gradients.Bench(self._exact, self._loss, self._u, noise, spp)
+        bench = gradients.Bench(self._exact, self._loss, self._u, seed, spp)
         derivatives = []
         disagreements = []
         for probe in probes:
             # one seed: `repeats` are the minimum and the maximum number of seeds
             reference = gradients.measure_reference(bench, probe, repeats=(1, 1))
+            # the derivative by differences over a step, and over half of it
             value_at_step, value_at_half_step = reference.steps
             derivatives.append(reference.value)
             disagreements.append(value_at_step - value_at_half_step)
@@ -811,21 +842,24 @@ class GradientBench:
         if self._reference_estimator == "differences" or self.reference is None:
             return None
         exact = self._exact
-        # The plan stays like this: the renderer is not used after this check.
+        # The plan is not restored, since the renderer is not used after this check.
         exact.plan = gradients.restrict_plan(
             exact.plan, self.part.group_names, self._reference_estimator
         )
         bench = gradients.Bench(exact, self._loss, self._u, seed, BIAS_CHECK_SPP)
-        probe = gradients.find_probes(bench)[0]
+        probe = gradients.find_probes(bench)[0]  # the direction of the check
         differences = gradients.measure_reference(
             bench, probe, repeats=BIAS_CHECK_REPEATS
         )
         slope = float(self.reference.value @ self.part.select(probe.direction))
-        noise = self.reference.error * abs(slope)  # the error is relative
+        # The relative error of the reference is taken for that of the slope.
+        noise = self.reference.error * abs(slope)
+        # The comparison does not use the time, which is not known here.
         estimate = gradients.GradientEstimate(
             self._reference_estimator, slope, noise, repeats=1, seconds=0.0
         )
-        if gradients.compare_with_reference(estimate, differences).status != "biased":
+        comparison = gradients.compare_with_reference(estimate, differences)
+        if comparison.status != "biased":
             return None
         return (
             f"{self.part.name}: the reference is the mean of "
@@ -853,7 +887,8 @@ def _make_row(
         quantity: "picture", "margin" or "gradient".
         name: name of the sampler or the estimator.
         value: the reference and its error.
-        spp: samples per pixel of each part.
+        spp: samples per pixel of each of the independent parts of the reference. The
+            row has those of all parts together.
         control: name of the control; empty for images.
     """
     return PrecisionReference(

@@ -82,17 +82,20 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     for remark in remarks:
         context.progress.message(remark)
     measurer = QuantityMeasurer(config, problem, context.progress)
-    measurements = context.open_measurements()  # those of a resumed run are stored
+    # sittings that are stored in the run, such as those of a resumed run
+    measurements = context.open_measurements()
     setup_seconds = time.perf_counter() - start_time
+
+    def read_or_measure(name: str, measure: Callable[[], Sitting]) -> Sitting:
+        """Return the stored sitting of a name, or measure a new one and store it."""
+        return measurements.get_or_measure_row(name, Sitting, measure)
+
+    def make_result(sittings: Sequence[Sitting]) -> PrecisionResult:
+        """Make the result of the sittings so far; called after each of them."""
+        return _make_result(context, measurer, sittings, setup_seconds)
+
     result = measurements.make_result_of_rows(
-        measurer.measure_sittings(
-            # a stored sitting is read; a new one is measured
-            lambda name, measure: measurements.get_or_measure_row(
-                name, Sitting, measure
-            )
-        ),
-        # makes the result from the sittings so far, after each of them
-        lambda sittings: _make_result(context, measurer, sittings, setup_seconds),
+        measurer.measure_sittings(read_or_measure), make_result
     )
     paths = _write_figures(context.run, result)
     return result.model_copy(update={"figures": [str(path) for path in paths]})
@@ -120,6 +123,8 @@ def _make_result(
         return [row for sitting in sittings for row in getattr(sitting, name)]
 
     points = join("points")
+    # lines of log error against log samples, and a sentence for each line that
+    # disagrees with theory
     slopes, disagreements = _fit_slopes(points, measurer.may_be_steeper)
     return context.result(
         PrecisionResult,
@@ -226,8 +231,8 @@ class QuantityMeasurer:
             self._renderer = problem.renderer.copy_with(
                 denoiser="none", transfer="linear"
             )
-            # Differences have steps over which outlines move by a pixel: the loss is
-            # smooth, but not linear in wider steps.
+            # Finite differences use steps over which outlines move by one pixel: over
+            # wider steps even this smooth loss is not linear.
             self._renderer.plan = self._renderer.plan.with_pixel_steps()
             self._loss = gradients.make_smooth_loss(
                 self._renderer.formation.resolution, config.seed
@@ -301,15 +306,16 @@ class QuantityMeasurer:
     def may_be_steeper(self, point: PrecisionPoint) -> bool | None:
         """Return whether the error may fall faster than that of independent samples.
 
-        It may with any other sampler (Owen 1997). None if theory predicts nothing
-        because the estimator has a bias: by the step (differences), by an approximation
-        (`material`), by a loss that is not linear, or by the denoiser.
+        It may with any sampler other than "independent", as its samples are stratified
+        (Owen 1997). None if theory predicts nothing because the estimator has a bias:
+        by the step (differences), by an approximation (`material`), by a loss that is
+        not linear, or by the denoiser.
         """
         if point.quantity == "gradient":
             sampler: str = self._config.pixel_sampler
             is_unbiased = self._is_linear and point.estimator == "adjoint"
         else:
-            # For images, the estimator is the name of a sampler, perhaps with `OIDN`.
+            # For images without denoiser, the estimator is the name of a sampler.
             sampler = point.estimator
             is_denoised = point.family != "none"
             is_unbiased = not is_denoised
@@ -341,25 +347,24 @@ class QuantityMeasurer:
             part: the coordinates of the gradient, such as those of one control.
             budget: time of the reference and of all measurements.
         """
-        renderer = self._renderer
         title = f"gradient of {part.name}"
         start_time = time.perf_counter()
-        bench = GradientBench(
-            renderer, self._loss, gradients.find_interior_point(renderer), part
-        )
+        # a configuration inside of the bounds, so that differences can be computed
+        u = gradients.find_interior_point(self._renderer)
+        bench = GradientBench(self._renderer, self._loss, u, part)
         # A part of the time without the reference is reserved for new measurements.
         confirm_fraction = CONFIRM_FRACTION * (1.0 - REFERENCE_FRACTION)
         sitting = self._measure_settings(
             title, bench, budget.take_fraction(1.0 - confirm_fraction)
         )
-        # Recommendations are for each quantity: the gradient is the only one here.
-        recommended = recommend_settings(
+        # one recommendation, since the gradient of this part is the only quantity here
+        (recommended,) = recommend_settings(
             sitting.points,
             confirmations=[],
             goal=self._config.error,
             round_up=self.round_up_samples,
             or_steeper=self.may_be_steeper,
-        )[0]
+        )
         warnings = []
         if budget.seconds_left > 0.0:
             bias_warning = bench.check_bias(self._seed)
@@ -384,15 +389,15 @@ class QuantityMeasurer:
     ) -> list[PrecisionPoint]:
         """Measure the recommended setting of a gradient again.
 
-        Returns:
-            A list with the point of the setting. It is empty if there was no time for
-            enough measurements, or if nothing is recommended.
-
         Args:
             title: title of the progress.
             bench: bench of the gradient.
             recommended: recommendation from the first measurements.
             budget: time of the new measurements.
+
+        Returns:
+            A list with the point of the setting. It is empty if there was no time for
+            enough measurements, or if nothing is recommended.
         """
         if recommended.estimator is None or recommended.spp is None:
             return []
@@ -481,11 +486,12 @@ def _summarize_settings(
     """Return a point for each measured setting and quantity.
 
     A measurement has numbers for each quantity: "picture" and "margin", or "gradient".
+    All measurements of a setting have the same quantities.
     """
     points = []
-    for setting, samples in measured.results_by_setting.items():
-        for quantity in samples[0]:
-            numbers = [sample[quantity] for sample in samples]
+    for setting, measurements in measured.results_by_setting.items():
+        for quantity in measurements[0]:
+            numbers = [measurement[quantity] for measurement in measurements]
             reference_error = bench.get_reference_error(setting, quantity)
             quantity_setting = replace(setting, quantity=quantity)
             points.append(summarize_samples(quantity_setting, numbers, reference_error))
@@ -547,6 +553,7 @@ def recommend_settings(
     for line in group_by_line(points).values():
         first = line[0]
         key = (first.quantity, first.control, first.family)
+        # Without any candidate the list stays empty.
         comparable = candidates.setdefault(key, [])
         candidate = recommend_spp(line, goal, round_up, or_steeper(first))
         if candidate:

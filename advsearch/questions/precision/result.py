@@ -397,14 +397,14 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     """
     # Heavy tails: a few pixels have most of the error.
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
-    # for each point with a time by the clock: whether it took over twice the processor
-    # time
+    # For each point with a time by the clock (`wall_seconds`): whether that is over
+    # twice the processor time (`seconds`).
     waited = [
         point.wall_seconds > 2.0 * point.seconds
         for point in points
         if point.wall_seconds is not None
     ]
-    is_busy = 2 * sum(waited) > len(waited)  # more than half of them
+    is_busy = sum(waited) > len(waited) / 2
     warnings = []
     if heavy:
         warnings.append(
@@ -424,8 +424,9 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
 def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
     """Make the table of errors of a quantity.
 
-    Only gradients have a control and a cosine. An unknown error is printed as an upper
-    limit with "<".
+    Only gradients have a control and a cosine. If the error of a point is not known
+    (`is_known`), its root mean square is an upper limit, which is printed with "<".
+    Columns are format strings, or functions, of a point.
 
     Args:
         quantity: "picture", "margin" or "gradient".
@@ -529,8 +530,8 @@ def _make_caption(result: PrecisionResult) -> str:
         thread = "thread" if count == 1 else "threads"
         thread_counts.append(f"{count} {name} {thread}")
     threads = ", ".join(thread_counts)
-    # Times of warm-up calls are not used, see `median_time`. With few repeats only the
-    # last one is left.
+    # `median_time` leaves out the times of warm-up calls. With few repeats it uses only
+    # the last one.
     max_repeats = max(point.repeats for point in result.points)
     max_timed_repeats = max_repeats - WARM_UP_CALLS
     if max_timed_repeats > 1:
@@ -703,9 +704,9 @@ def _draw_point(axes: Any, point: PrecisionPoint, color: str, marker: str) -> No
     x = point.seconds
     y = PERCENT * point.rms_error
     lower, upper = (PERCENT * bound for bound in point.interval or (math.nan, math.nan))
-    # An interval is not drawn if it is missing (NaN), or if its upper bound is over
-    # four times the error.
-    if upper < 4.0 * y:
+    # A very wide interval would dominate the diagram. A missing one is NaN.
+    is_narrow = upper < 4.0 * y
+    if is_narrow:
         axes.plot([x, x], [lower, upper], color=color, linewidth=0.8, alpha=0.6)
     axes.plot(
         [x],

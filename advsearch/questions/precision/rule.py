@@ -112,9 +112,10 @@ class ReferenceValue:
         Returns:
             "error": norm of the difference, divided by the norm of the reference.
             "cosine": cosine of the angle between both; NaN if one of them is zero.
-            "fourth": sum of the fourth powers of the relative errors of all n numbers;
-            NaN if there are too few numbers (`MIN_TAIL_SIZE`) to detect heavy tails, or
-            if the reference is zero.
+            "fourth": sum of the fourth powers of the differences of all n numbers, each
+            divided by the norm of the reference. `is_heavy_tailed` needs it: it is
+            large if a few numbers have most of the error. NaN if there are too few
+            numbers (`MIN_TAIL_SIZE`) for that, or if the reference is zero.
         """
         difference = value - self.value
         product_of_norms = float(np.linalg.norm(value)) * self.norm
@@ -140,11 +141,11 @@ def estimate_reference(
     """Return a function of the mean of independent parts, with its jackknife error.
 
     The jackknife (Efron 1982, chapter 3) computes the function again without each part
-    in turn. With K parts, v the value with all of them, v_i the value without part i,
-    and m the mean of the v_i, the standard error is sqrt((K - 1) / K * sum |v_i -
-    m|^2). The estimated bias, which noise causes in a nonlinear function, is (K - 1) *
-    |m - v|. It is used only as far as it exceeds the standard error. The error is the
-    root of the sum of squares of both and of the known `bias`.
+    in turn. Let v be the value with all K parts, v_i the value without part i, and m
+    the mean of the v_i. Then the standard error is sqrt((K - 1) / K * sum |v_i - m|^2).
+    Noise causes a bias in a nonlinear function; it is estimated by (K - 1) * |m - v|,
+    from which the standard error is subtracted (down to 0). The error is the root of
+    the sum of squares of the standard error, that bias, and the known `bias`.
 
     Args:
         parts: K independent estimates (n,) of the same quantity.
@@ -189,14 +190,14 @@ def summarize_samples(
 ) -> PrecisionPoint:
     """Estimate the error of a setting from repeated measurements.
 
-    A difference from the reference contains the error of the reference, too. Both
-    errors are independent, so their squares add: mean square = error^2 +
-    reference_error^2. If the root mean square is below `MIN_ERROR_RATIO` times the
-    reference's error, it may be mostly that error. Then the error of the setting is not
-    known, and the root mean square is an upper limit. The same holds if all measured
-    errors are 0, or if one is infinite. The interval is computed from the standard
-    error of the mean square. There is none for a single measurement, nor with heavy
-    tails.
+    A measured error contains the error of the reference, too. Both are independent, so
+    that their squares add: the mean square of the measured errors is error^2 +
+    reference_error^2. If its root is below `MIN_ERROR_RATIO` times the reference's
+    error, it may be mostly that error. Then the error of the setting is not known, and
+    the root is an upper limit (status "reference unusable"). The same holds if all
+    measured errors are 0, or if one is infinite. The interval is computed from the
+    standard error of the mean square. There is none for a single measurement, nor with
+    heavy tails.
 
     Args:
         setting: the setting that was measured.
@@ -215,6 +216,7 @@ def summarize_samples(
     is_heavy = is_heavy_tailed(samples)
     interval = None
     if is_known and not is_heavy and len(squares) > 1:
+        # The error has about the same relative deviation as the root mean square.
         factor = _interval_factor(squares, mean_square)
         interval = (error / factor, error * factor)
     fields: dict[str, object] = {
@@ -254,19 +256,24 @@ def _interval_factor(squares: Sequence[float], mean_square: float) -> float:
     """
     standard_error = statistics.stdev(squares) / math.sqrt(len(squares))
     quantile = float(stdtrit(len(squares) - 1, (1.0 + CONFIDENCE) / 2.0))
-    # The relative error of a root is half of that of its square.
-    relative_deviation = 0.5 * standard_error / mean_square
-    return math.exp(min(MAX_LOG_FACTOR, quantile * relative_deviation))
+    # The relative error of a root is half of that of its square. It is about the
+    # standard error of the root's logarithm.
+    log_deviation = 0.5 * standard_error / mean_square
+    return math.exp(min(MAX_LOG_FACTOR, quantile * log_deviation))
 
 
 def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
     """Return whether a few pixels have most of the error of the images.
 
-    If n pixels had equal errors and all others none, (sum of squares)^2 / (sum of
-    fourth powers) would be n. So this is the effective number of pixels, and it is
-    small if it is less than `MIN_ERROR_PIXELS`. False if the images are too small.
+    If n pixels of all images had equal errors and all others none, (sum of squares)^2 /
+    (sum of fourth powers) would be n. So this is the effective number of pixels, and it
+    is small if it is less than `MIN_ERROR_PIXELS`. False if the images are too small.
     Rare events that are in none of the images, such as a firefly in every hundredth
     image, cannot be detected.
+
+    Args:
+        samples: for each image the root of the sum of squares of its pixels' errors
+            ("error"), and the sum of their fourth powers ("fourth").
     """
     sum_of_squares = sum(numbers["error"] ** 2 for numbers in samples)
     # NaN without fourth powers, which makes the result false
@@ -304,8 +311,8 @@ def fit_line(
     counts.
 
     The slope agrees with theory if it differs from `MONTE_CARLO_SLOPE` by at most
-    `SLOPE_TOLERANCE`. It disagrees if it differs by more, and its interval excludes
-    theory as well. Otherwise `agrees` is None: not known.
+    `SLOPE_TOLERANCE`. It disagrees if it differs by more, and the predicted slope is
+    also outside of its interval. Otherwise `agrees` is None: not known.
 
     Args:
         points: points of one estimator.
@@ -350,8 +357,8 @@ def _agrees_with_theory(
     """
     if or_steeper is None:
         return None
-    # Slopes are negative: the deviation of a steeper slope is negative, and so never
-    # too large.
+    # Slopes are negative: a steeper slope has a negative deviation, which is never too
+    # large.
     deviation = slope - MONTE_CARLO_SLOPE
     if not or_steeper:
         deviation = abs(deviation)
@@ -368,9 +375,12 @@ def describe_disagreement(
 
     None if it agrees.
     """
-    if slope.agrees is not False or slope.theory is None:
+    disagrees = slope.agrees is False  # None if it is not known
+    if not disagrees or slope.theory is None:
         return None
-    if slope.slope <= slope.theory:
+    # Slopes are negative: the smaller, the steeper.
+    is_steeper = slope.slope <= slope.theory
+    if is_steeper:
         reason = "the smallest sample counts are not in the asymptotic range yet"
     elif has_leveled_off(points):
         reason = "it levels off: there is a bias, which more samples do not remove"
@@ -402,7 +412,8 @@ def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
     ]
     if len(slopes) < 2:
         return False
-    # Slopes are negative: the steepest is the smallest.
+    # Slopes are negative: the smaller, the steeper. If the error rises everywhere, 0
+    # takes the place of the steepest slope.
     steepest_before = min(*slopes[:-1], 0.0)
     return slopes[-1] > 0.5 * steepest_before
 
@@ -434,8 +445,8 @@ def recommend_spp(
         goal: relative error that has to be reached.
         round_up: rounds up to a sample count that the estimator accepts.
         or_steeper: whether the error may fall faster than that of independent samples;
-            None if theory predicts no slope. Only this matters here: whether there is a
-            slope to extrapolate with if there is no line.
+            None if theory predicts no slope. Without a line, the error is extrapolated
+            only if theory predicts a slope.
 
     Returns:
         The recommendation; None if no count is known to reach the goal.
@@ -481,9 +492,9 @@ def _explains_points(line: PrecisionSlope, ordered: Sequence[PrecisionPoint]) ->
     With only `MIN_FIT_POINTS` points a line nearly always does, which is no evidence:
     then the result is False. It is False, too, if a known point has no interval.
     """
-    has_spare_points = line.points > MIN_FIT_POINTS
-    is_falling = line.slope <= MAX_FALLING_SLOPE
-    if not has_spare_points or not is_falling:
+    has_enough_points = line.points > MIN_FIT_POINTS
+    is_falling = line.slope <= MAX_FALLING_SLOPE  # a negative number
+    if not has_enough_points or not is_falling:
         return False
     for point in ordered:
         if not point.has_known_error:
@@ -555,7 +566,8 @@ def confirm_recommendation(
     measured too small by chance. New measurements with other seeds do not have that
     bias. If their error is above the goal, the sample count is multiplied by (error /
     goal)^2, since the error of independent samples falls with the root of their number.
-    The factor is at most `MAX_EXTRAPOLATION`.
+    The factor is at most `MAX_EXTRAPOLATION`, so that the expected error ("error") may
+    still be above the goal. The time is proportional to the sample count.
 
     Args:
         recommendation: recommendation with a goal and a sample count.
@@ -586,16 +598,15 @@ def _interpolate_count(
 ) -> tuple[float | None, str]:
     """Return the number of samples from which the error stays at or below a goal.
 
-    It is interpolated between the last point above the goal and the next point, on
-    logarithmic axes.
+    It is interpolated between the last point whose error is above the goal and the next
+    point, on logarithmic axes. If there is no next point, it is extrapolated.
 
     Args:
         ordered: points by ascending samples.
         goal: the relative error.
         line: fitted line, whose slope is used beyond the last point; None if there is
             none, and the slope of theory is used.
-        or_steeper: None if theory predicts no slope: then there is no extrapolation
-            without a line. Whether it is True or False does not matter here.
+        or_steeper: see `_extrapolate_count`.
 
     Returns:
         The number of samples, or None if it cannot be extrapolated; and whether it is
@@ -644,13 +655,16 @@ def _extrapolate_count(
         slope = line.slope
     elif or_steeper is not None:
         slope = MONTE_CARLO_SLOPE
-    if slope is None or slope > MAX_FALLING_SLOPE:
+    # Slopes are negative: the larger, the flatter.
+    is_too_flat = slope is not None and slope > MAX_FALLING_SLOPE
+    if slope is None or is_too_flat:
         return None
     if not last.has_known_error or has_leveled_off(ordered):
         return None
-    # error ~ samples^slope, so samples ~ error^(1 / slope). With a slope that is
-    # steeper than the limit, the count would often be too small.
-    factor = (goal / last.rms_error) ** (1.0 / max(slope, MIN_EXTRAPOLATED_SLOPE))
+    # With a slope that is steeper than this limit, the count would often be too small.
+    used_slope = max(slope, MIN_EXTRAPOLATED_SLOPE)
+    # error ~ samples^slope, so samples ~ error^(1 / slope)
+    factor = (goal / last.rms_error) ** (1.0 / used_slope)
     return last.spp * factor if factor <= MAX_EXTRAPOLATION else None
 
 

@@ -95,8 +95,8 @@ class ReplayCondition:
         image_key: key of the image that is made of the radiance (by tone curve and
             rounding). Conditions with the same key share it; None for a condition that
             shares none.
-        change_image: function that is applied to the image before the model gets it; None if
-            there is none.
+        change_image: function that is applied to the image before the model gets it;
+            None if there is none.
         unavailable_reason: why the condition cannot be rendered here; empty if it can.
     """
 
@@ -132,16 +132,19 @@ class ReplayCondition:
 def list_conditions(
     problem: Problem, spp: int, resize: Callable[[tuple[int, int]], Problem]
 ) -> Iterator[ReplayCondition]:
-    """Yield every condition of a problem except other models.
+    """Yield every condition of a problem, except for other models and photographs.
 
     The first one is the unchanged condition, as the run verified it.
 
     Args:
         problem: the problem of the run.
         spp: samples per pixel of the run's verification.
-        resize: creates the same problem at another (height, width) in pixels.
+        resize: creates the same problem at another resolution, (height, width) in
+            pixels.
     """
-    yield make_image_condition(problem, AS_VERIFIED, AS_VERIFIED, spp)
+    yield make_image_condition(
+        problem, name=AS_VERIFIED, description=AS_VERIFIED, spp=spp
+    )
     yield from sampling_conditions(problem, spp)
     yield from resolution_conditions(problem, spp, resize)
     yield from scene_conditions(problem, spp)
@@ -164,8 +167,9 @@ def make_image_condition(
 ) -> ReplayCondition:
     """Return a condition that uses the run's images as they are, or changes them.
 
-    All such conditions share the radiance and the images of the run:
-    with the same samples per pixel, each image is rendered only once for all of them.
+    All such conditions share the radiance and the images of the run (before they are
+    changed): with the same samples per pixel, each image is rendered only once for all
+    of them.
 
     Args:
         problem: problem of the run.
@@ -216,13 +220,15 @@ def scene_conditions(problem: Problem, spp: int) -> Iterator[ReplayCondition]:
             description = f"light paths of {max_depth} segments"
             yield ReplayCondition("depth", description, make_problem, spp)
 
-    # Mitsuba's path integrator renders no volumes.
+    # Mitsuba's integrator "path" renders no volumes, so that a scene with volumes has
+    # no other integrator.
     if not scene.is_volumetric:
         integrator = "prb" if scene.integrator_name == "path" else "path"
         make_problem = partial(replace_scene_options, problem, integrator=integrator)
         description = f"Mitsuba's {integrator} in place of {scene.integrator_name}"
         yield ReplayCondition("integrator", description, make_problem, spp)
 
+    # another sampler than that of the run
     sampler = "independent"
     if problem.renderer.formation.sampler == "independent":
         sampler = "multijitter"
@@ -283,7 +289,8 @@ def apply_sensor(
         seed: seed of the sensor's noise.
     """
     control = workbench.CONTROLS["sensor"]()
-    control.choice_values["seed"] = seed  # the setting of its noise
+    # `seed` is a setting of the control, which decides its noise.
+    control.choice_values["seed"] = seed
     parameters = {
         parameter.name: torch.tensor(sensor_values.get(parameter.name, 0.0))
         for parameter in control.parameters
@@ -299,7 +306,8 @@ def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
     the reason, which the result reports.
     """
     renderer = problem.renderer
-    description, _ = renderer.scene.description_and_filter
+    description, _reconstruction_filter = renderer.scene.description_and_filter
+    # The problem is replaced below, if Cycles can render it.
     condition = ReplayCondition(
         "blender", "Cycles, Blender's renderer", lambda: problem, spp
     )
@@ -312,6 +320,7 @@ def blender_condition(problem: Problem, spp: int) -> ReplayCondition:
         )
     except BlenderError as error:
         return replace(condition, unavailable_reason=str(error))
+    # `source` is the function that renders the radiance.
     make_problem = partial(replace_renderer_options, problem, source=cycles.radiance)
     return replace(condition, make_problem=make_problem)
 
@@ -321,9 +330,9 @@ def model_condition(
 ) -> ReplayCondition:
     """Return the condition under which another model predicts the scene.
 
-    If the other model takes images of the same size, tone curve and denoiser as the
-    run's own model, it predicts the run's images, which saves time. Otherwise the scene
-    is rendered for it.
+    If the other model takes images of the same formation (size, tone curve, denoiser
+    and the like) as the run's own model, it predicts the run's images, which saves
+    time. Otherwise the scene is rendered for it.
 
     Args:
         problem: problem of the run.
@@ -368,6 +377,8 @@ def photograph_conditions(
         threads: {"threads": number of threads} for the problems; empty for the number
             of the run.
     """
+    # by name, the parts of the attack in each photograph: those that the search did not
+    # use, and those that it used
     other_photographs, used_photographs = workbench.move_to_photographs(parts, folder)
     if len(used_photographs) == 1:
         used_photographs = {}
@@ -429,7 +440,7 @@ def replay(
             )
         run = attack.run
         # Parts that exist only in Python, such as a model object, cannot be loaded from
-        # the run. The result has a function that returns them.
+        # the run. `attack.parts` is a function that returns them.
         python_only = _read_python_only_parts(Path(run))
         if attack.parts is not None:
             parts = attack.parts()
@@ -479,9 +490,10 @@ def run_replay(
     context.progress.stage(workbench.LOADING)
     attack_directory = directory.find_run(config.attack)
     attack = _load_attack(attack_directory)
+    # `RUN_MODEL` stands for the run's own model, which is always used.
     settings.check_no_duplicates((RUN_MODEL, *config.models), "model")
     parts = parts or workbench.load_parts_of_run(attack_directory)
-    # settings to change: none, if the number of threads of the run stays
+    # a change of the setting `threads`; empty to use as many as the run
     threads = {} if config.threads is None else {"threads": config.threads}
     load_problem = partial(workbench.make_problem_with_warnings, parts, **threads)
     problem, warnings = load_problem()
@@ -524,7 +536,7 @@ def run_replay(
 
 
 def _load_attack(attack_directory: Path) -> workbench.AttackSummary:
-    """Load the summary of an attack.
+    """Load the summary of an attack that has an adversarial configuration.
 
     Raises:
         InputError: the attack has no adversarial configuration.
@@ -564,9 +576,13 @@ def select_conditions(
         spp: samples per pixel of the run's verification.
         load_problem: loads the problem again, with changes to its settings.
     """
-    unchanged, *other_conditions = list_conditions(
-        problem, spp, lambda size: load_problem(resolution=size)[0]
-    )
+
+    def resize(size: tuple[int, int]) -> Problem:
+        """Load the problem at another resolution, without its warnings."""
+        resized_problem, _ = load_problem(resolution=size)
+        return resized_problem
+
+    unchanged, *other_conditions = list_conditions(problem, spp, resize)
     conditions = [unchanged]
     conditions += [
         condition
@@ -574,8 +590,8 @@ def select_conditions(
         if condition.name in config.selected_names
     ]
     for model_name in config.models:
-        # The other model replaces all models of a run with an `ensemble`.
-        other_problem = load_problem(model=model_name, ensemble=None)[0]
+        # Without `ensemble`, the other model replaces all models of the run.
+        other_problem, _ = load_problem(model=model_name, ensemble=None)
         conditions.append(model_condition(problem, other_problem, model_name, spp))
     return conditions
 
@@ -585,8 +601,9 @@ def batch_by_renders(
 ) -> list[list[ReplayCondition]]:
     """Divide conditions into batches that share their renders.
 
-    The first batch has all conditions that share the renders of the run; it is empty if
-    there are none. Every other condition is a separate batch.
+    The first batch has all conditions that share the renders of the run: those with its
+    radiance and its samples per pixel. It is empty if there are none. Every other
+    condition is a separate batch.
 
     Args:
         conditions: the conditions.
@@ -612,9 +629,12 @@ class _Table:
     Attributes:
         u: the adversarial configuration (d,).
         trials: number of trials of each scene, clean and adversarial, under a
-            condition. seed: root of the seeds of the trials. run: the run that stores
-            the trials. progress: the progress bar. rows: the results by condition.
-            renders: number of images rendered so far.
+            condition.
+        seed: root of the seeds of the trials.
+        run: the run that stores the trials.
+        progress: the progress bar.
+        rows: the results by condition.
+        renders: number of images rendered so far.
     """
 
     u: torch.Tensor
@@ -702,6 +722,8 @@ class _Table:
     ) -> None:
         """Try the clean scene under all conditions, then the adversarial scene.
 
+        Rows are added when both are known.
+
         Args:
             retrial_of_condition: each condition in the form that `Retrials` takes.
         """
@@ -719,7 +741,7 @@ class _Table:
             for condition, retrial in retrial_of_condition.items()
         }
         for condition, retrial in retrial_of_condition.items():
-            # "answer" is the kind under which rows are stored.
+            # The trials are stored as rows of the kind "answer".
             verification = retrials.try_adversarial("answer", self.u, retrial)
             self.rows[condition] = ReplayRow(
                 change=condition.name,

@@ -300,7 +300,8 @@ class Cycles:
             has_environment: whether an environment map lights the scene.
         """
         scene = self._description
-        # Blender's environment maps are rotated by a quarter turn compared to ours.
+        # Radians. Blender's environment maps are rotated by a quarter turn compared to
+        # ours.
         turn = math.pi / 2.0 - math.radians(scene.get_number("environment.rotation"))
         return {
             "width": width,
@@ -309,9 +310,10 @@ class Cycles:
             "lamps": _describe_lamps(scene, values),
             "environment": has_environment,
             "turn": turn,
+            # The exposure is in stops: one stop doubles the radiance.
             "strength": 2.0 ** scene.get_number("environment.exposure"),
-            # A path of two segments, from the light to a surface to the camera, has no
-            # bounce.
+            # The depth is the number of segments of a path. The two segments from the
+            # light to a surface and to the camera are no bounce.
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
@@ -338,6 +340,7 @@ class Cycles:
         # down. Blender's is a fraction of the longer side, and its y axis points up.
         longer_side = max(width, height)
         return {
+            # Blender's camera has other axes than ours.
             "camera": (to_world.double().numpy() @ TO_BLENDER_CAMERA).tolist(),
             "fov": math.radians(fov),
             "shift": [shift_x * width / longer_side, -shift_y * height / longer_side],
@@ -362,7 +365,7 @@ def _find_unsupported(description: SceneDescription) -> list[str]:
         part.name for part in description.parts if not isinstance(part, supported_types)
     ]
     for name, mesh in description.meshes.items():
-        if mesh.surface:
+        if mesh.surface:  # a BSDF of Mitsuba, which Blender does not have
             unsupported.append(f"a surface of Mitsuba's own on the {name}")
     if description.thin_lens or description.camera_model:
         unsupported.append("a lens")
@@ -441,7 +444,8 @@ def _make_ground(
     """
     photograph = scene.photograph
     if photograph is not None:
-        # The ground is a mesh onto which the photograph is projected.
+        # The ground is a mesh onto which the photograph is projected. Colors are linear
+        # here, and textures are in sRGB.
         base_color = photograph.base_color if reflectance is None else reflectance
         texture = color.linear_to_srgb(base_color.clamp(0.0, 1.0)).numpy()
         return [assets.Shape("ground", photograph.mesh, texture, MATT)]
@@ -457,6 +461,7 @@ def _make_ground(
     # from 0 to 1 where the corners are at -1 and 1
     texture_coordinates = corners[:, :2] * np.float32(0.5) + np.float32(0.5)
     mesh = assets.Mesh(corners * half_size, faces, normals, texture_coordinates)
+    # one texel of the color of the ground, which is in sRGB already
     texture = np.full((1, 1, 3), scene.ground_color, np.float32)
     return [assets.Shape("ground", mesh, texture, MATT)]
 

@@ -358,7 +358,7 @@ def summarize_replay(result: ReplayResult) -> str:
     """Summarize under which conditions the adversarial scene holds."""
     if all(row.ending == NOT_DONE for row in result.table):
         return "Nothing was rendered again."
-    # The first row is the unchanged condition.
+    # The first row is the unchanged condition, which is rendered if any is.
     unchanged, *other_rows = result.table
     changed = [
         row
@@ -374,6 +374,7 @@ def summarize_replay(result: ReplayResult) -> str:
     elif not has_photographs:
         text += "; no change was rendered"
     text += "."
+    # other photographs than those of the search; then those of the search
     if result.transfer is not None:
         text += f" {describe_transfer(result.transfer)}"
     if result.searched is not None:

@@ -58,8 +58,8 @@ class PlannedClaim:
         kind: kind of the claim, or "counterexample".
         config: settings with which it is tested.
         counterexample: the counterexample; None for a claim of the suite.
-        unsuitable_reason: why a counterexample cannot be tested on the model; empty if it can. If
-            it cannot, `config` has the settings with which it was found.
+        unsuitable_reason: why a counterexample cannot be tested on the model; empty if
+            it can. If it cannot, `config` has the settings with which it was found.
     """
 
     name: str
@@ -89,14 +89,14 @@ def try_suite(
     start = time.perf_counter()
     config = context.config
     context.progress.stage("reading the suite")
-    # Raises an error before the work begins if the run of twins cannot be read.
+    # A run of `twins` compares renders with photographs. If it cannot be read, the
+    # error is raised before the work begins.
     if config.twins is not None:
         workbench.read_twins(config.twins)
-    # A resumed run tests the suite with which it has started, even if the file has
-    # changed since.
-    loaded_suite = (
-        _read_noted_suite(context.resumed_directory) or suite or _read_suite(config)
-    )
+    # A resumed run has stored the suite with which it has started, and tests that, even
+    # if the file has changed since.
+    noted_suite = _read_noted_suite(context.resumed_directory)
+    loaded_suite = noted_suite or suite or _read_suite(config)
     added = None
     if config.add is not None:
         added = counterexamples.add_counterexample(config.suite, config.add)
@@ -120,6 +120,7 @@ def try_suite(
     tester = ClaimTester(context, loaded_suite, start_time=start, warnings=remarks)
     suite_run = _SuiteRun(tester, planned, counterexamples.read_expected(config.suite))
     context.ending = suite_run.run_claims()
+    # With `add`, the only result is that of the new counterexample.
     if added is not None and suite_run.results[0].verdict != FAILED:
         counterexamples.delete_counterexample(added)
         raise InputError(
@@ -174,8 +175,7 @@ def _note_settings(
         if claim.counterexample is not None
     }
     run.store.write_note(SETTINGS_NOTE, json.dumps(settings_of_examples))
-    # Stores the digests of the files in these settings, or compares them with stored
-    # ones: the files must not change before the run is resumed.
+    # The files in these settings must not change before the run is resumed.
     used_settings = list[dict[str, Any]]()
     for planned_claim in planned:
         used_settings.append(planned_claim.config.to_json())
@@ -184,6 +184,7 @@ def _note_settings(
         claim = suite.claims[planned_claim.name]
         if isinstance(claim, NoWorseClaim):
             used_settings.append({"model": claim.than})
+    # A new run stores the digests of these files, and a resumed run compares them.
     run.check_files_unchanged(used_settings)
 
 
@@ -216,8 +217,8 @@ class _SuiteRun:
                 tester.progress.message(f"{claim.name}: {last.verdict}: {last.reason}")
                 if number < len(self.planned):
                     # The summary is written after each claim, so that it can be read
-                    # even if the run is killed.
-                    so_far = self.make_result(results.INTERRUPTED, None)
+                    # even if the run is killed: then it states that it was interrupted.
+                    so_far = self.make_result(results.INTERRUPTED, added=None)
                     tester.run.write_summary(so_far)
         if tester.context.ending == results.INTERRUPTED:
             for claim in self.planned[len(self.results) :]:
@@ -243,9 +244,9 @@ class _SuiteRun:
         """
         key = f"claim {claim.name}"
         tester = self.tester
-        noted = tester.run.store.read_json_note(key)
-        if noted is not None:
-            return ClaimResult.from_values(noted)
+        stored_result = tester.run.store.read_json_note(key)
+        if stored_result is not None:
+            return ClaimResult.from_values(stored_result)
         # a result if it must not be tested, for example because the time is over
         untested = self._refuse_claim(claim)
         if untested is not None:
@@ -273,7 +274,7 @@ class _SuiteRun:
 
         There are three reasons. First, a counterexample has failed unexpectedly: then
         claims are not tested unless the setting `all` is set. Second, the time is over.
-        Third, a counterexample does not suit the model.
+        Third, a counterexample does not suit the model (`unsuitable_reason`).
         """
         counterexample_failed = any(
             result.kind == "counterexample" and not result.accepted
@@ -340,17 +341,19 @@ class _SuiteRun:
         # A new random seed would not repeat the run.
         if config.fresh:
             arguments += ["fresh=false", f"seed={self.tester.suite.seed}"]
-        # Settings that affect more than the run, except for those of the run itself.
-        for power in config.settings_with_effects:
-            if power.name not in ("run", "overwrite"):
-                arguments.append(f"{power.name}={json.dumps(power.default)}")
+        # Settings with effects outside of the run get their defaults. The directory of
+        # the run itself stays.
+        for setting in config.settings_with_effects:
+            if setting.name not in ("run", "overwrite"):
+                arguments.append(f"{setting.name}={json.dumps(setting.default)}")
+        # without the space at the end if there are no arguments
         return f"{command} {shlex.join(arguments)}".rstrip()
 
     def make_result(self, ending: str, added: Counterexample | None) -> SuiteResult:
         """Make the result of the claims so far.
 
-        With the setting `update`, the verdicts of a complete run are stored as the
-        expected verdicts.
+        With the setting `update`, the verdicts of a complete run are also stored as the
+        expected verdicts of the suite.
 
         Args:
             ending: status of the run.
@@ -360,6 +363,7 @@ class _SuiteRun:
         config = tester.config
         configs = [claim.config for claim in self.planned]
         controls = [name for config in configs for name in config.controls]
+        # claims after the last one that has a result
         not_reached = [
             self._make_untested(claim, NOT_TESTED_YET, Cause.NOT_REACHED)
             for claim in self.planned[len(self.results) :]
@@ -424,7 +428,9 @@ class _SuiteRun:
         Args:
             configs: settings of each claim.
         """
+        # the names of loaded models by the setting `model`
         model_names = self.tester.model_names
+        # A scene with a backdrop is in a photograph.
         are_all_in_photographs = all(config.backdrop is not None for config in configs)
         return workbench.find_twin_evidence(
             self.tester.config.twins,
@@ -548,19 +554,22 @@ def _plan_example(
 
 
 def _check_claims(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
-    """Load everything that claims name, and return remarks about the claims.
+    """Check that claims can be tested, and return remarks about them.
 
-    Otherwise a wrong name would be noticed only after minutes of rendering.
-    Counterexamples are not loaded here, since they are tested first anyway.
+    Everything that claims name is loaded, so that a wrong name is noticed now and not
+    after minutes of rendering. Counterexamples are not loaded here, since they are
+    tested first anyway.
 
     Raises:
-        InputError: a claim cannot be tested, or cannot be decided.
+        InputError: a claim cannot be tested, or its number of images is too small for a
+            verdict.
     """
     claims = [
         (planned_claim, suite.claims[planned_claim.name])
         for planned_claim in planned
         if planned_claim.counterexample is None
     ]
+    # remarks on numbers of images; "" for a claim without one
     remarks = [
         check_pictures(planned_claim.name, claim, suite.confidence)
         for planned_claim, claim in claims

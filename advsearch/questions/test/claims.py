@@ -81,8 +81,8 @@ class _OtherSide(NamedTuple):
 
     Attributes:
         journal: evaluates the other side, and stores its evaluations.
-        change_image: changes the image of the model under test to that of the other side;
-            None if the other side renders its own image.
+        change_image: changes the image of the model under test to that of the other
+            side; None if the other side renders its own image.
     """
 
     journal: workbench.Journal
@@ -95,8 +95,8 @@ class _PictureScore(NamedTuple):
     Attributes:
         score: from 0 (against the claim) to 1 (for it); None if the image does not
             count, because the object is out of view.
-        violation_score: rank as an example against the claim: the image with the largest value
-            is reported.
+        violation_score: rank as an example against the claim: the image with the
+            largest value is reported.
         text: description of the predictions.
     """
 
@@ -170,18 +170,18 @@ class _TrialSample:
     def is_enough(self, *, has_conditions: bool) -> bool:
         """Return whether no further trials are needed.
 
-        If a single scene was predicted right and wrong, the verdict is certain: it
-        depends on the noise. Otherwise `count_trials` trials that count are needed.
+        If a single scene was predicted right and wrong, it depends on the noise, and
+        the verdict is certain to be undecided. Otherwise `count_trials` trials that
+        count are needed.
 
         Args:
             has_conditions: whether conditions, such as the light, vary between trials.
         """
         depends_on_noise = self.n_right > 0 and self.n_wrong > 0 and not has_conditions
         n_counted = self.n_right + self.n_wrong
-        # Trials are added one at a time, so that the number is never exceeded.
-        return depends_on_noise or n_counted == count_trials(
-            has_conditions=has_conditions
-        )
+        n_needed = count_trials(has_conditions=has_conditions)
+        # Trials are added one at a time, so that their number is never exceeded.
+        return depends_on_noise or n_counted == n_needed
 
 
 @dataclass
@@ -261,14 +261,14 @@ class ClaimTester:
         summary = self.context.run_part(untested_result.name, search)
         assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
-        # with the number of steps that the search chose, if none was set
+        # If no number of steps was set, the search has chosen one.
         planned = search.model_copy(update={"steps": search.steps or summary.steps})
         evaluated = words.evaluate_search(summary, planned)
         picture = None
         if evaluated.verdict == FAILED:
             picture = self._find_search_picture(untested_result.name, summary)
-        # "products" counts images computed by matrices of light transport, without a
-        # render.
+        # "products" are images that were computed by matrices of light transport, and
+        # not rendered.
         n_pictures = sum(
             count for name, count in summary.renders.items() if name != "products"
         )
@@ -304,13 +304,14 @@ class ClaimTester:
         """Return the settings of the search, within the remaining time."""
         # at least a millisecond, as a limit has to be positive
         remaining = max(0.001, self.time_limit - self.elapsed_seconds)
-        seconds = min(remaining, config.seconds or math.inf)
+        seconds = min(remaining, config.seconds or math.inf)  # infinite without limits
         changes = {
             "workers": self.config.workers,
             "cluster": self.config.cluster,
             "seconds": seconds if math.isfinite(seconds) else None,
         }
-        # A copy of settings loses their Python objects, which are added again.
+        # Python objects in the settings, such as a model, are lost in the copy: they
+        # are added again.
         return config.model_copy(update=changes).with_python_only_parts(
             config.python_only_parts
         )
@@ -334,8 +335,8 @@ class ClaimTester:
             config: settings of the pictures.
         """
         problem = self._load_problem(config)
-        # Each verdict depends on one bound only, so that a one-sided interval is
-        # enough.
+        # A claim is held by the lower bound of the mean score, and failed by the upper
+        # bound. At most one of the two is wrong, so each may be one-sided.
         sequence = statistics.sequential.ConfidenceSequence(
             self.suite.confidence, sides=1
         )
@@ -358,6 +359,7 @@ class ClaimTester:
             reason += f"; {OUT_OF_TIME_REASON}"
         rate = None
         if sample.scores:
+            # a tuple with one converted number for each argument
             (rate,) = _to_claim_scale(claim, sequence.mean)
         return untested_result.model_copy(
             update={
@@ -392,7 +394,7 @@ class ClaimTester:
         """
         sample = _PictureSample()
         for query, evaluation, other in evaluated:
-            score, badness, text = score_picture(claim, evaluation, other)
+            score, violation_score, text = score_picture(claim, evaluation, other)
             # The object is not visible in the picture, so nothing can be predicted.
             if score is None:
                 sample.n_hidden += 1
@@ -402,10 +404,12 @@ class ClaimTester:
                 sample.wrong_payloads.append(judgement.payload)
             sequence.add(score)
             sample.scores.append(score)
-            is_worst = sample.worst is None or badness > sample.worst.violation_score
+            is_worst = (
+                sample.worst is None or violation_score > sample.worst.violation_score
+            )
             is_against_claim = score == 0.0
             if is_against_claim and is_worst:
-                sample.worst = _Example(badness, query, text)
+                sample.worst = _Example(violation_score, query, text)
             sample.verdict = _decide(sequence, compute_score_threshold(claim))
             if sample.verdict != UNDECIDED:
                 break
@@ -448,22 +452,23 @@ class ClaimTester:
             worker_config, worker_call, self.progress
         ) as executor:
             if isinstance(claim, NoWorseClaim):
-                # Workers of `claim_worker` find the model by its index, "0" or "1".
+                # Workers (`claim_worker`) load both models. A request names the model
+                # by its index: "0" is the one under test, "1" the other one.
                 evaluator = workbench.ParallelEvaluator(problem, executor, "0")
                 other_evaluator = workbench.ParallelEvaluator(
                     other_problem, executor, "1"
                 )
             else:
                 evaluator = workbench.ParallelEvaluator(problem, executor)
-                # Changed images are predicted in this process, without workers. For a
-                # `RightClaim` this is not used.
+                # Changed images are predicted in this process, without workers. (A
+                # `RightClaim` has no other side, so that this is not used.)
                 other_evaluator = workbench.ParallelEvaluator(other_problem)
             journal = workbench.Journal(self.run, evaluator)
             other = None
             if not isinstance(claim, RightClaim):
                 other_journal = workbench.Journal(self.run, other_evaluator)
                 other = _OtherSide(other_journal, change)
-            yield self._evaluate_pairs(journal, queries, other)
+            yield self._evaluate_queries(journal, queries, other)
 
     def _choose_worker(
         self, claim: ShareClaim | NoWorseClaim, config: SceneConfig
@@ -485,9 +490,10 @@ class ClaimTester:
     ) -> tuple[Problem, ChangePicture | None]:
         """Return the problem of the other side, and the function that makes its images.
 
-        The other side is what the model is compared with. The function changes an image
-        of the model under test. It is None if the other side renders its own images, or
-        if there is no other side: then the problem is that of the model under test.
+        The other side is what the model under test is compared with. The function makes
+        its image from the image of the model under test. It is None if the other side
+        renders its own images. If there is no other side, it is None, too, and the
+        problem is that of the model under test.
 
         Args:
             claim: the claim.
@@ -497,6 +503,7 @@ class ClaimTester:
         if isinstance(claim, NoWorseClaim):
             other = self._load_problem(config.model_copy(update={"model": claim.than}))
             takes_same_images = other.renderer.formation == problem.renderer.formation
+            # `_same_picture` returns an image unchanged: it is not rendered twice.
             return other, _same_picture if takes_same_images else None
         if isinstance(claim, ChangeClaim):
             # The ground truth is that of the picture before the change.
@@ -513,26 +520,28 @@ class ClaimTester:
             config: settings of the scene.
             problem: problem of the model under test.
         """
+        # `claim.when` names the change, such as "blurred".
         if claim.when != workbench.WITHOUT_OBJECT:
             return lambda query, picture: workbench.change_image(
                 picture, claim.when, problem.model.cameras
             )
-        # another scene, in which the object is always hidden
+        # The scene is loaded once more, and its object is hidden in all renders.
         without_object = self._load_problem(config)
         without_object.renderer.scene.input_assembler.is_object_hidden = True
         return lambda query, picture: without_object.picture(
             query.u, query.seed, query.spp
         )
 
-    def _evaluate_pairs(
+    def _evaluate_queries(
         self,
         journal: workbench.Journal,
         queries: Iterator[workbench.Query],
         other_side: _OtherSide | None = None,
     ) -> Iterator[Evaluated]:
-        """Yield queries with their evaluations, until the time is over.
+        """Yield queries with their evaluations by both sides, until the time is over.
 
-        Queries are evaluated in batches that keep all workers busy.
+        Queries are evaluated in batches that keep all workers busy. The evaluation by
+        the other side is None if there is none.
 
         Args:
             journal: evaluates the queries.
@@ -544,14 +553,16 @@ class ClaimTester:
         # the claim is decided.
         batch_size = 1
         if journal.evaluator.workers is not None:
-            batch_size = BATCHES_AHEAD * (self.config.workers or CLUSTER_WORKERS)
+            # The number of workers of a cluster is not known.
+            n_workers = self.config.workers or CLUSTER_WORKERS
+            batch_size = BATCHES_AHEAD * n_workers
         while batch := list(islice(queries, batch_size)):
             evaluations: Iterable[policies.Evaluation]
             others: Iterable[policies.Evaluation | None] = repeat(None)
             if other_side is None:
-                evaluations = journal.evaluate_all(
-                    batch, partial(_evaluate_with_pictures, journal, None)
-                )
+                # No images are needed for another side.
+                evaluate = partial(_evaluate_with_pictures, journal, None)
+                evaluations = journal.evaluate_all(batch, evaluate)
             else:
                 evaluations, others = _evaluate_batch(journal, other_side, batch)
             for query, evaluation, other in zip(
@@ -570,8 +581,8 @@ class ClaimTester:
     ) -> ClaimResult:
         """Test a counterexample: the model should be right on it.
 
-        If its files or its scene have changed, or if it does not suit the model, it is
-        undecided, with the reason.
+        If its files or its scene have changed, or if it does not suit the model, its
+        verdict stays undecided, as in `untested_result`, and the reason is added.
 
         Args:
             untested_result: the result without a verdict, which is filled in.
@@ -590,10 +601,11 @@ class ClaimTester:
         except InputError as error:
             reason = words.describe_unsuitable(str(error))
             return untested_result.model_copy(update={"reason": reason})
-        file = example.find_changed_file(config)
-        if file:
+        changed_file = example.find_changed_file(config)
+        if changed_file:
             reason = (
-                f"the file {file} has changed; restore it, or remove the counterexample"
+                f"the file {changed_file} has changed; restore it, or remove the "
+                "counterexample"
             )
             return untested_result.model_copy(update={"reason": reason})
         if compute_scene_digest(parts.scene.description) != example.scene_digest:
@@ -625,6 +637,7 @@ class ClaimTester:
                 the model is wrong there.
         """
         sample = self._sample_trials(example, problem, has_conditions=has_conditions)
+        # fields of the result that follow from the trials: verdict, reason, counts, ...
         update = _trials_result(
             sample, problem.task.name, has_conditions=has_conditions
         )
@@ -633,7 +646,7 @@ class ClaimTester:
         )
         if is_late:
             reasons = [OUT_OF_TIME_REASON]
-            if sample.outcomes:
+            if sample.outcomes:  # the reason states what these trials were
                 reasons = [update["reason"], OUT_OF_TIME_REASON]
             update |= {
                 "verdict": UNDECIDED,
@@ -658,15 +671,16 @@ class ClaimTester:
         """
         # Because of rounding, stored offsets may exceed the budget by a little.
         u = problem.domain.project(example.make_configuration(problem.domain.start))
-        # With `add`, trials have other seeds than in later tests of the suite.
+        # When the counterexample is added (setting `add`), trials have other seeds than
+        # in later tests of the suite.
         prefix = "added " if self.config.add is not None else ""
         kind = f"{prefix}counterexample {example.name}"
         journal = workbench.Journal(self.run, workbench.ParallelEvaluator(problem))
         max_renders = count_trials(has_conditions=has_conditions)
         if has_conditions:
             # Twice as many trials as needed may be made, since some may not count. Each
-            # also renders the clean scene.
-            max_renders *= 4
+            # has two renders, one of them of the clean scene.
+            max_renders *= 2 * 2
         self.progress.stage(example.name, max_renders, at_most=True)
         sample = _TrialSample()
         for query, trial, clean in self._run_trials(
@@ -718,7 +732,7 @@ class ClaimTester:
             queries.append(query)
             if has_conditions:
                 queries.append(replace(query, u=clean_u, kind=f"{kind}, clean"))
-        evaluated = self._evaluate_pairs(journal, iter(queries))
+        evaluated = self._evaluate_queries(journal, iter(queries))
         for query, trial, _ in evaluated:
             if not has_conditions:
                 yield query, trial.required_judgement, None
@@ -735,8 +749,8 @@ class ClaimTester:
         """Load scene, model and task, and add remarks on them to the warnings."""
         parts = workbench.load_parts(AttackConfig.from_config(config))
         _, model_warnings = parts.model_and_warnings
-        # `make_problem` appends remarks of the task to this list. The list is copied
-        # before, because the reason of each claim has these remarks already.
+        # Copied, because `make_problem` appends remarks of the task to this list. These
+        # are in the reason of each claim, and are no warnings.
         remarks = list(model_warnings)
         problem = workbench.make_problem(parts, differentiated=False)
         self.model_names[config.model] = problem.model.name
@@ -775,6 +789,7 @@ def _evaluate_with_pictures(
         queries: the queries.
     """
     with_image = pictures is not None
+    # an iterator, which evaluates a query when its evaluation is requested
     evaluations = journal.evaluator(
         [replace(query, includes_image=with_image) for query in queries]
     )
@@ -796,15 +811,16 @@ def _evaluate_batch(
         other_side: what the model is compared with.
         batch: the queries.
     """
-    # Images are stored only if the other side changes them.
+    # Images are stored, by the index of the query, only if the other side changes them.
     pictures: dict[int, Tensor | None] | None = {}
     if other_side.change_image is None:
         pictures = None
-    # A list, so that all images are stored before they are changed.
+    # Evaluations are computed when they are requested. With a list, all images are
+    # stored before the other side changes them.
     evaluations = list(
         journal.evaluate_all(batch, partial(_evaluate_with_pictures, journal, pictures))
     )
-    # The other side has different rows in the store.
+    # Another kind, so that the store has separate rows for the other side.
     other_queries = [replace(query, kind=f"{query.kind} beside") for query in batch]
     others = other_side.journal.evaluate_all(
         other_queries,
@@ -827,12 +843,11 @@ def _evaluate_other_side(
     Args:
         other_side: the evaluator and, if images are changed, the change.
         problem: problem of the model under test.
-        pictures: its images, by the index of the query; None if, and only if, there is
-            no change.
+        pictures: its images, by the index of the query; None if there is no change.
         queries: the queries.
     """
     if other_side.change_image is None or pictures is None:
-        # The other side renders its own images.
+        # Both are None: the other side renders its own images.
         yield from other_side.journal.evaluator(queries)
         return
     other_problem = other_side.journal.evaluator.problem
@@ -866,6 +881,7 @@ def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
             workbench.load_parts(config), differentiated=False
         )
 
+    # `cache` loads each model once.
     return workbench.make_worker_call(cache(load_problem))
 
 
@@ -887,13 +903,13 @@ def sample_queries(
         generator = torch.Generator().manual_seed(
             seeds.derive_seed(problem.seed, f"{kind} draw", index)
         )
-        (u,) = problem.domain.sample(generator)
+        (u,) = problem.domain.sample(generator)  # one configuration
         seed = seeds.derive_seed(problem.seed, kind, index)
         # Values of parameters are stored with the row, except for large textures.
         values = {}
         if problem.domain.dim <= MAX_STORED_VALUES:
             values = problem.describe(u, seed)
-        # A search looks for a prediction, its success. Sampled images have none.
+        # Only a search has a success, the prediction that it looks for.
         yield workbench.Query(
             u, seed, kind, index, spp=spp, values=values, has_success=False
         )
@@ -915,8 +931,8 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
 
     With that number of images, the verdict has to be "held" for a model that is always
     right, and "failed" for one that is always wrong. Otherwise the test is useless. For
-    a claim that compares two models there is a remark if the claim could not be held
-    for two models with the same predictions.
+    a claim that compares two models, the result is a remark if the claim could not be
+    held for two models with the same predictions.
 
     Raises:
         InputError: with that number of images, one of the two verdicts is impossible.
@@ -927,8 +943,12 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
         statistics.sequential.count_needed_samples, confidence=confidence
     )
     threshold = compute_score_threshold(claim)
-    # number of images to exceed the threshold, and number to fall below it
-    needed = max(count_needed(threshold), count_needed(1.0 - threshold))
+    # Images of score 1 until the lower bound exceeds the threshold; and images of score
+    # 0 until the upper bound is below it. The latter is the same as scores of 1 for the
+    # threshold 1 - t.
+    n_to_hold = count_needed(threshold)
+    n_to_fail = count_needed(1.0 - threshold)
+    needed = max(n_to_hold, n_to_fail)
     if claim.pictures < needed:
         raise InputError(
             f"claims.{name}.pictures: expected at least {needed}, since with fewer one "
@@ -972,13 +992,16 @@ def score_picture(
     if other is None:
         # The larger the score of a judgement, the more wrong is the model. The image
         # with the largest score is reported, but not one with an infinite score or NaN.
-        badness = judgement.score if math.isfinite(judgement.score) else -math.inf
+        violation_score = -math.inf
+        if math.isfinite(judgement.score):
+            violation_score = judgement.score
         text = f"most wrong where it says {prediction.label}"
         score = float(judgement.right)
-        return _PictureScore(score, badness, text)
+        return _PictureScore(score, violation_score, text)
     other_judgement = other.required_judgement
     other_prediction = other_judgement.prediction
     if isinstance(claim, ChangeClaim):
+        # No image violates such a claim more than another: the first one is reported.
         text = f"{prediction.label} before and {other_prediction.label} after"
         is_as_claimed = workbench.meets_claim(claim.claim, prediction, other_prediction)
         return _PictureScore(float(is_as_claimed), text=text)
@@ -1022,9 +1045,10 @@ def _describe_sample(
         sample: the pictures.
         interval: confidence interval of the mean score.
         example: text about the worst picture against the claim; empty if there is none.
+            It is not used for a `NoWorseClaim`.
         task: name of the task.
     """
-    n_for = sample.scores.count(1.0)
+    n_for = sample.scores.count(1.0)  # images for the claim
     if isinstance(claim, NoWorseClaim):
         lower, upper = _to_claim_scale(claim, *interval)
         reason = words.describe_difference(

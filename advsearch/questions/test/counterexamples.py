@@ -161,7 +161,7 @@ class _Block(BaseModel):
             values: the offsets.
             signs: whether to store only signs; ignored for few values.
             square: side of the squares of texels that share a value; ignored unless
-                they tile a texture (side, side, 3).
+                the values are a texture (side, side, 3) that such squares tile.
         """
         is_small = len(values) <= MAX_FINE_VALUES
         stores_signs = signs and not is_small
@@ -169,7 +169,8 @@ class _Block(BaseModel):
         if is_small:
             step = FINE_STEP
         elif stores_signs:
-            # If all offsets are 0, the step may be any positive number.
+            # With the largest offset as the step, rounding leaves only -1, 0 and 1. If
+            # all offsets are 0, the step may be any positive number.
             step = float(np.abs(values).max()) or 1.0
         # A texture has side * side texels of 3 values.
         side = isqrt(len(values) // 3)
@@ -199,7 +200,8 @@ class _Block(BaseModel):
         """
         steps = self._decompress_steps()
         if self.square > 1:
-            # Each step is repeated for all texels of its square.
+            # Only textures (side, side, 3) have squares. Each step is repeated for all
+            # texels of its square.
             n_squares = isqrt(self.numbers // 3) // self.square  # along each side
             squares = steps.reshape(n_squares, n_squares, 3)
             texels = squares.repeat(self.square, axis=0).repeat(self.square, axis=1)
@@ -210,7 +212,8 @@ class _Block(BaseModel):
     def _decompress_steps(self) -> np.ndarray[Any, Any]:
         """Return the stored integer multiples of the step (n / square^2,).
 
-        There is one multiple for each square of square^2 texels and each color channel.
+        Without squares of texels (`square` is 1), there is a multiple for each of the n
+        values. Otherwise a square of square^2 texels has one for each color channel.
 
         Raises:
             ValueError, LZMAError: the stored offsets are corrupt.
@@ -218,10 +221,11 @@ class _Block(BaseModel):
         n_steps = self.numbers // self.square**2
         n_bytes = 2 * n_steps  # 16-bit integers
         if self.signs:
-            n_bytes = math.ceil(n_steps / 3)  # three values of -1, 0 or 1 in a byte
+            n_bytes = math.ceil(n_steps / 3)  # `_pack_signs` puts three in a byte
         decompressor = lzma.LZMADecompressor(memlimit=MAX_MEMORY)
-        # The file is not trusted, so that memory and size are limited. The limit is at
-        # least one byte more than expected: longer data is detected by its length.
+        # The file is not trusted, so that memory and size are limited. This limit is
+        # more than the expected size in both formats: longer data is detected by its
+        # length.
         max_bytes = 2 * n_steps + 1
         data = decompressor.decompress(base64.b85decode(self.offsets), max_bytes)
         if len(data) != n_bytes:
@@ -314,12 +318,15 @@ class Counterexample:
     def make_config(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
         """Return the settings with which the counterexample is tested.
 
-        These are its own settings, except for two groups. Settings of how a run
-        computes (`SUITE_SETTINGS`), such as the number of threads, have their defaults.
-        Settings of the network (`MODEL_SETTINGS`) are those of the suite and the
-        command, if one of them names a model, or else its own. Settings of the command
-        come last. No other settings of the suite are used, since they describe its
-        claims.
+        They are those of the counterexample, with these exceptions:
+
+        - Settings of how a run computes (`SUITE_SETTINGS`), such as the number of
+          threads, are reset to their defaults.
+        - If the suite or the command names a model, all settings of the network
+          (`MODEL_SETTINGS`) are those of the suite and the command.
+        - Settings of the command replace all others.
+
+        Other settings of the suite are not used, since they describe its claims.
 
         Args:
             suite: the suite.
@@ -464,6 +471,7 @@ def decide_trials(n_right: int, n_wrong: int, *, has_conditions: bool) -> str:
         lower_wrong_rate, _ = statistics.intervals.clopper_pearson(n_wrong, total)
         if lower_wrong_rate >= workbench.MIN_RATE:  # 0.5
             return FAILED
+    # the rule by which attacks under varying conditions are verified
     rule = workbench.OVER_CONDITIONS
     n_required = rule.count_percent(total)  # 90 % of the trials
     if total >= rule.min_trials and n_right >= n_required:
@@ -471,7 +479,7 @@ def decide_trials(n_right: int, n_wrong: int, *, has_conditions: bool) -> str:
     return UNDECIDED
 
 
-def _is_wrong_on(
+def _fails_on_example(
     example: Counterexample, problem: Problem, trials: int, *, has_conditions: bool
 ) -> bool:
     """Return whether the run's own model fails on the stored scene, with fresh seeds.
@@ -489,6 +497,7 @@ def _is_wrong_on(
     configurations = [u, start] if has_conditions else [u]
     outcomes = list[bool | None]()
     for index in range(trials):
+        # a stream of seeds that only these trials use
         seed = seeds.derive_seed(problem.seed, "kept", index)
         judgements = []
         for configuration in configurations:
@@ -516,7 +525,8 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
         run: name or directory of the run of an attack.
 
     Raises:
-        InputError: the run found nothing, or its scene is no counterexample.
+        InputError: the run found nothing, or it searched for a scene in which the model
+            is right.
     """
     path = directory.find_run(run)
     summary = workbench.load_attack_summary(path)
@@ -525,13 +535,13 @@ def add_counterexample(suite: str, run: str) -> Counterexample:
             f"add: expected a run that ended as 'found', got {path}, "
             f"which ended with {summary.ending!r}"
         )
-    if summary.minimises:
+    if summary.minimises:  # the objective: the search made the object easier
         raise InputError(
             f"add: expected a run that makes the model wrong, got {path}, "
             "which makes the object easier"
         )
     parts = workbench.load_parts_of_run(path)
-    problem, _ = workbench.make_problem_with_warnings(parts)
+    problem, _warnings = workbench.make_problem_with_warnings(parts)
     configuration = workbench.read_stored_configuration(path, problem)
     offsets = (configuration - problem.domain.start).numpy()
     config = parts.config.make_repeatable()
@@ -566,11 +576,11 @@ def _make_values(
         for name, value in config.to_json().items()
         if name not in NOT_DECIDING
     }
-    # Digests of the files in the settings are stored, too, but not of files of the
-    # network, since the suite may replace the network.
+    # Settings whose files must not change. Those of the network are not among them,
+    # since the suite may replace the network.
     settings_with_files = make_paths_relative(select_deciding_settings(config))
     return {
-        "schema": 1,
+        "schema": 1,  # version of the form of this file
         "run": path.name,
         # the most frequent wrong prediction
         "said": next(iter(verified.labels), ""),
@@ -605,18 +615,19 @@ def _write_smallest(
     block_sizes = [block.size for block in problem.domain.blocks]
     blocks = np.split(offsets, np.cumsum(block_sizes)[:-1])
     *coarse_forms, finest_form = FORMS
-    # Small blocks are stored in the same way in all forms.
+    # All forms store a block of up to `MAX_FINE_VALUES` in the same way.
     has_large_block = max(block_sizes) > MAX_FINE_VALUES
     if not has_large_block:
         coarse_forms = []
     trials = count_trials(has_conditions=has_conditions)
     if not has_conditions:
-        # Twice as many trials as the suite makes, so that the model will most likely
-        # fail there, too.
+        # The model has to be wrong in all trials. Twice as many trials as the suite
+        # makes, so that the model will most likely fail there, too.
         trials *= 2
     for stores_signs, square in coarse_forms:
+        # This replaces the file of the form before.
         example = _write_form(base, values, blocks, stores_signs, square)
-        if _is_wrong_on(example, problem, trials, has_conditions=has_conditions):
+        if _fails_on_example(example, problem, trials, has_conditions=has_conditions):
             return example
     stores_signs, square = finest_form
     return _write_form(base, values, blocks, stores_signs, square)
@@ -630,6 +641,8 @@ def _write_form(
     square: int,
 ) -> Counterexample:
     """Write a counterexample in a form, and return it as it is read back.
+
+    Reading it back applies the quantization.
 
     Args:
         base: path of the file without suffix.
@@ -649,8 +662,9 @@ def _name_counterexample(run: Path) -> str:
 
     If the run is a part of another run, the name begins with that of the other run.
     """
-    parent = run.parent.parent
-    if run == RunDirectory.locate_part(parent, run.name):
+    parent = run.parent.parent  # parts of a run are in a folder inside of it
+    is_part = run == RunDirectory.locate_part(parent, run.name)
+    if is_part:
         return _make_name(parent.name, run.name)
     return _make_name(run.name)
 
@@ -691,7 +705,10 @@ def delete_counterexample(example: Counterexample) -> None:
 
 
 def read_counterexamples(suite: str) -> list[Counterexample]:
-    """Read the counterexamples of a suite, sorted by name."""
+    """Read the counterexamples of a suite, sorted by name.
+
+    The file with the expected verdicts (`EXPECTED_FILE`) is in the same directory.
+    """
     folder = counterexample_directory(suite)
     return [
         _read(path)

@@ -30,24 +30,25 @@ def read_noted_settings(
     """
     with Store.open_to_read(run) as store:
         suite = store.read_json_note(SUITE_NOTE)
-        examples = store.read_json_note(SETTINGS_NOTE)
+        settings_of_examples = store.read_json_note(SETTINGS_NOTE)
+    # other claims have one of these two causes
     tested = {
         claim.name
         for claim in result.claims
         if claim.cause not in (Cause.COUNTEREXAMPLE_FAILED, Cause.NOT_REACHED)
     }
     settings: dict[str, dict[str, Mapping[str, Any]]] = {}
-    # These are the errors that a corrupt suite causes.
+    # A stored suite that is corrupt causes one of these errors.
     with suppress(KeyError, AttributeError, TypeError, ValueError):
         settings["claim"] = {
             name: values
             for name, values in _settings_of_claims(suite).items()
             if name in tested
         }
-    if isinstance(examples, Mapping):
+    if isinstance(settings_of_examples, Mapping):
         settings["counterexample"] = {
             name: values
-            for name, values in examples.items()
+            for name, values in settings_of_examples.items()
             if name in tested and isinstance(values, Mapping)
         }
     return settings

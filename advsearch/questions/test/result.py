@@ -284,7 +284,7 @@ def describe_difference(
     interval: tuple[float, float],
     other_model: str,
 ) -> str:
-    """Describe why a claim about two models is held, failed or undecided.
+    """Describe the images that decide a claim about two models, or do not decide it.
 
     Args:
         verdict: HELD, FAILED or UNDECIDED.
@@ -342,7 +342,7 @@ def evaluate_search(
     verified = summary.verified
     if summary.ending == "already wrong":
         return SearchVerdict(FAILED, _describe_wrong_clean(summary))
-    # A search that has found something has verified it.
+    # The status "found" means that the scene was verified.
     if summary.ending == "found" and verified is not None:
         prediction = describe_wrong_prediction(summary.task, verified)
         interval = wording.format_interval(verified.interval)
@@ -359,6 +359,7 @@ def evaluate_search(
             f"{verified.trials} trials: it depends on the noise"
         )
         return SearchVerdict(UNDECIDED, reason)
+    # Without a time limit, a search that makes fewer steps has ended by itself.
     max_steps = config.steps
     has_time_limit = config.seconds is not None
     if has_time_limit and max_steps is not None and summary.steps < max_steps:
@@ -390,9 +391,10 @@ def describe_wrong_prediction(task: str, verified: results.VerifiedRate) -> str:
 
     For a detector, return the counts of its outcomes.
     """
-    label = next(iter(verified.labels), "")
-    if verified.outcomes:
+    if verified.outcomes:  # only a detector has these
         return f": {wording.format_outcomes(verified.outcomes, task)}"
+    # `labels` maps wrong predictions to their counts, the most frequent one first.
+    label = next(iter(verified.labels), "")
     return f", most often {wording.add_article(label)}" if label else ""
 
 
@@ -488,7 +490,7 @@ def describe_suite(result: SuiteResult) -> str:
     if result.added is not None:
         # A counterexample was added, and nothing else was tested.
         return f"Stored as {result.added}."
-    # claims whose failed or undecided verdict is no worse than expected
+    # A verdict that is not worse than the expected one is accepted.
     n_expected = sum(
         claim.verdict != HELD and claim.accepted for claim in result.claims
     )
@@ -558,14 +560,13 @@ def format_junit(result: SuiteResult) -> str:
     Failed claims are failures, and undecided claims are errors. Claims that are failed
     or undecided as expected count as skipped, so that they do not break a build.
     """
-    answers = [(claim.verdict, claim.accepted) for claim in result.claims]
+    verdicts = [(claim.verdict, claim.accepted) for claim in result.claims]
+    n_skipped = sum(accepted and verdict != HELD for verdict, accepted in verdicts)
     attributes = {
-        "tests": str(len(answers)),
-        "failures": str(answers.count((FAILED, False))),
-        "errors": str(answers.count((UNDECIDED, False))),
-        "skipped": str(
-            sum(accepted and answer != HELD for answer, accepted in answers)
-        ),
+        "tests": str(len(verdicts)),
+        "failures": str(verdicts.count((FAILED, False))),
+        "errors": str(verdicts.count((UNDECIDED, False))),
+        "skipped": str(n_skipped),
         "time": f"{result.seconds['total']:.3f}",
     }
     root = ElementTree.Element("testsuites", {"name": "advsearch", **attributes})

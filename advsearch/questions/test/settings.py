@@ -386,9 +386,10 @@ def _describe_error(error: Any) -> str:
     # pydantic adds the kind of the claim to it, which is left out.
     location = [str(part) for part in error["loc"] if part not in CLAIM_KINDS]
     got = settings.format_value(error["input"])
-    # pydantic's location of a wrong key of a mapping ends with "[key]".
-    is_number_as_name = location[-1] == "[key]"
-    if is_number_as_name:
+    # pydantic's location of a wrong key of a mapping ends with "[key]". Keys are names
+    # of claims: YAML has read a name such as 12 as a number.
+    is_wrong_key = location[-1] == "[key]"
+    if is_wrong_key:
         return (
             f"{location[0]}: expected names of small letters, digits and hyphens, got "
             f"{got}; put it in quotes"
@@ -410,7 +411,7 @@ def _describe_error(error: Any) -> str:
         got = "nothing"
     elif kind == "too_short":  # an empty mapping of claims
         got = "none"
-    # Other names are those of claims, at which a claim is expected.
+    # If the name is not that of a setting, it is the name of a claim.
     expected = EXPECTED_VALUES.get(name, CLAIM_EXAMPLE)
     return f"{where}: expected {expected}, got {got}"
 
