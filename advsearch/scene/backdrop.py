@@ -316,9 +316,7 @@ def compose_over_photograph(
     # of the photograph that is this reflection. The coat was rendered for the fraction
     # of the pixel that the object does not cover.
     uncovered_before = (1.0 - rendered_coverage).clamp_min(1e-3)
-    environment_in_coat = (
-        rendered[..., channels.ENVIRONMENT_IN_COAT] / uncovered_before
-    )
+    environment_in_coat = rendered[..., channels.ENVIRONMENT_IN_COAT] / uncovered_before
     unshaded = (uncovered - shade) * torch.minimum(environment_in_coat, behind)
     return radiance + (shade * behind + unshaded + coat_change).clamp_min(0.0)
 

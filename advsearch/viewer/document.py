@@ -117,8 +117,8 @@ def _script_digests() -> frozenset[str]:
 def has_other_scripts(page: bytes) -> bool:
     """Return whether a page has a script that is none of `SCRIPTS`.
 
-    Such a script, as of another version, does not run under `make_served_policy`. Scripts
-    that are data do not count.
+    Such a script, for example that of another version, does not run under the policy of
+    `make_security_policy`. Scripts that only hold data do not count.
     """
     return pages.has_other_scripts(page, _script_digests())
 
