@@ -272,9 +272,8 @@ FAULTS = (
     Fault(
         "report: the bleed is printed as a part of the size",
         "advsearch/report/sheets.py",
-        "(width - 2 * self.bleed[0]) * self.pixel[0], (\n            height - 2 * "
-        "self.bleed[1]\n        ) * self.pixel[1]",
-        "width * self.pixel[0], height * self.pixel[1]",
+        "return n_columns * pixel_width, n_rows * pixel_height",
+        "return width * pixel_width, height * pixel_height",
         ("tests/report/test_sheets.py",),
     ),
     Fault(
