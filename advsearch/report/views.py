@@ -324,7 +324,7 @@ def _find_plain_facts(
         values: values of its fields by name.
         tables: names of the fields that become tables.
     """
-    # `facts` returns names with spaces, such as "search renders" for `search_renders`
+    # `facts` returns names with spaces: "renders per second" for `renders_per_second`
     fact_names = [name.replace(" ", "_") for name in result.facts()]
     excluded = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
     return {
