@@ -47,7 +47,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     # color of a plain background; None if the environment is visible
     backdrop = image_inputs.get("backdrop.color")
     hazy = has_haze(renderer, scene_inputs)
-    _check_backdrop(backdrop, adversarial.folder, hazy=hazy)
+    _check_backdrop(backdrop, adversarial.folder, hazy=hazy)  # raises for photographs
     # factor from radiance to the value that the sRGB curve takes
     gain = renderer.formation.gain
     if "camera.exposure" in image_inputs:
@@ -67,7 +67,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
                 " ".join(notes),
                 hide_environment=backdrop is not None,
             )
-            # moved when all are written, so that none is left after an error
+            # Moved when all files are written: so an error leaves none of them.
             for file in sorted(Path(folder).iterdir()):
                 os.replace(file, path.parent / file.name)
         title = (
