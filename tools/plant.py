@@ -300,8 +300,8 @@ FAULTS = (
     Fault(
         "cluster: any version may work",
         "advsearch/cluster/dask_executor.py",
-        "if its_version == compute_version():",
-        "if isinstance(its_version, str):",
+        "if version == compute_version():",
+        "if isinstance(version, str):",
         ("tests/cluster/test_executors.py",),
     ),
     Fault(
@@ -314,7 +314,7 @@ FAULTS = (
     Fault(
         "cli: an interrupted command says that all is well",
         "advsearch/cli/output.py",
-        "return INTERRUPTED if stopped else OK",
+        "return INTERRUPTED if was_interrupted else OK",
         "return OK",
         ("tests/cli/test_cli.py",),
     ),

@@ -220,7 +220,7 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{file_stem}-pixels.png")
             patch_size = size * _get_relative_patch_size(control, config, summary)
-            pixel_size = patch_size / len(pixels)  # a patch is a square
+            pixel_size = patch_size / len(pixels)  # as many rows as columns
             name = f"{control.name}, {patch_size:.1f} mm a side"
             pieces.append(
                 _make_piece(name, pixels, (pixel_size, pixel_size), inside=None)
@@ -383,7 +383,8 @@ def _measure_texel_size(
         is_inside = np.delete(inside, -1, axis)  # all but the last texel
         is_next_inside = np.delete(inside, 0, axis)  # all but the first texel
         distances_by_axis.append(distances[is_inside & is_next_inside])
-    if not all(len(distances) for distances in distances_by_axis):
+    has_both = all(len(distances) > 0 for distances in distances_by_axis)
+    if not has_both:  # the texels are a line or a point
         return None
     width, height = (float(np.mean(distances)) for distances in distances_by_axis)
     if min(width, height) <= 0.0:
@@ -414,9 +415,10 @@ def _make_piece(
         fine = enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
     else:
         fine = torch.from_numpy(image)
-    fine_size = pixel_size[0] / subdivisions, pixel_size[1] / subdivisions
-    bleed_columns = math.ceil(BLEED / fine_size[0])
-    bleed_rows = math.ceil(BLEED / fine_size[1])
+    fine_width = pixel_size[0] / subdivisions
+    fine_height = pixel_size[1] / subdivisions
+    bleed_columns = math.ceil(BLEED / fine_width)
+    bleed_rows = math.ceil(BLEED / fine_height)
     padding = ((bleed_rows, bleed_rows), (bleed_columns, bleed_columns))
     # the edge is repeated into the bleed
     levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
@@ -427,7 +429,7 @@ def _make_piece(
     return Piece(
         name=name,
         picture=levels,
-        pixel_size_mm=fine_size,
+        pixel_size_mm=(fine_width, fine_height),
         bleed=(bleed_columns, bleed_rows),
         cut_mask=mask,
     )

@@ -151,7 +151,8 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
         setting_lines = []
         for setting in settings(config):
             name = setting.field.removesuffix("_")  # the field of `set` is `set_`
-            if name in declared_signature.parameters or setting.required:
+            is_declared = name in declared_signature.parameters
+            if is_declared or setting.required:
                 continue
             parameters.append(_make_parameter(config, setting, name))
             line = f"{name}: {setting.text}"

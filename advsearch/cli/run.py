@@ -159,8 +159,8 @@ def resume(args: argparse.Namespace) -> int:
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
     command = read_command(path / CONFIG)
-    # Two cases add something to a finished run: a sweep gets a map of the surface, and
-    # a recipe makes its figures again, with photographs that were taken since.
+    # Two commands can add something to a finished run: a sweep gets a map of the
+    # surface, and a recipe makes its figures again, with photographs taken since.
     adds_surface = changes.get("surface") is True and command == "sweep"
     adds_to_finished_run = command == "recipe" or adds_surface
     if is_finished(path) and not adds_to_finished_run:

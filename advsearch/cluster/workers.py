@@ -151,8 +151,7 @@ class PoolWorkers:
             return
         if not isinstance(error, WorkerDiedError):
             raise error
-        # Before any batch has finished, this counts as a failed start. Too many of them
-        # raise an error.
+        # It raises an error if too many workers die before any batch has finished.
         self._count_dead_start()
         if len(items) > 1:
             queued.put_back_singly(items)

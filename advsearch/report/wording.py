@@ -739,20 +739,20 @@ def format_twin_evidence(evidence: TwinEvidence) -> str:
             f"How far this holds for photographs was not measured: "
             f"{_TWIN_MISMATCHES[evidence.match].format(run=name)}."
         )
-    of_objects = row.object or "all objects together"
+    objects = row.object or "all objects together"
     if not evidence.same_object:
-        of_objects += ", not of this object"
+        objects += ", not of this object"
     surroundings = f"in the environment {row.surroundings}"
     if row.surroundings == IN_PHOTOGRAPH:
         surroundings = "composed over their photographs"
     if not evidence.same_surroundings:
         surroundings += ", not in these surroundings"
     agreement = (
-        f"Photographs ({name}; {of_objects}; renders {surroundings}): this model was "
+        f"Photographs ({name}; {objects}; renders {surroundings}): this model was "
         f"right or wrong on both in {format_estimate(row.agreement)} of "
         f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}."
     )
-    failing = f"{row.both_wrong} of {row.wrong_twins}"
+    failing = f"{row.both_wrong} of {row.wrong_twins}"  # of the wrong renders
     if row.wrong_where_twin_wrong is None:
         return (
             f"{agreement} Too few renders failed to state how often a failing render "

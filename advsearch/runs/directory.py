@@ -173,7 +173,7 @@ class RunDirectory:
                 if config is not None:
                     run_directory._note_start(config)
             except BaseException:
-                with suppress(OSError):
+                with suppress(OSError):  # the first error is raised in any case
                     _clear(path)
                 raise
             undo.pop_all()  # nothing failed: the caller closes it
@@ -514,7 +514,8 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
         stays until the new one has something to store.
     """
     location, overwrite = config.run_location
-    if overwrite and location is not None and is_run(locate_run(location)):
+    replaces_run = overwrite and location is not None and is_run(locate_run(location))
+    if replaces_run:
         yield None
         return
     home = HOME if location is None else locate_run(location).parent
@@ -527,6 +528,7 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
     try:
         yield path
     except BaseException:
+        # The directory cannot be opened if it was removed meanwhile, for instance.
         with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
             if run.is_empty:
                 run.discard()
@@ -666,7 +668,7 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
         is_free = not path.exists() or all(
             _is_leftover(entry) for entry in path.iterdir()
         )
-    if is_free:
+    if is_free:  # nothing is there, or leftovers of a run that was killed at its start
         return
     if not is_run(path):
         raise RunExistsError(

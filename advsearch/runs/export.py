@@ -370,7 +370,7 @@ def _parse_line(
     row = Row(
         "sweep",
         number,
-        # 3DB writes a bool or the text of one
+        # 3DB writes true, or the text "True"
         correct=str(record.get("is_correct")) == "True",
         # A loss is large if the model is wrong, a margin if it is right, so the sign
         # changes. It is 0.0 - loss and not -loss, which would be -0.0 for 0.

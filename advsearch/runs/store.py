@@ -198,11 +198,11 @@ class Store:
         start_time = time.monotonic()
         timestamp = time.time()  # monotonic time has no date
         must_sync = start_time >= self._next_sync
+        # With FULL, SQLite waits until the disk has the rows.
+        mode = "FULL" if must_sync else "NORMAL"
         with storage_errors(self.path):
-            self._db.execute(
-                f"PRAGMA synchronous = {'FULL' if must_sync else 'NORMAL'}"
-            )
-            with self._db:
+            self._db.execute(f"PRAGMA synchronous = {mode}")
+            with self._db:  # one transaction
                 self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
                 if cached is not None:
                     row = rows[-1]

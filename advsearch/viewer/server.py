@@ -232,14 +232,15 @@ def make_progress_page(name: str, run: Path) -> str:
         run: directory of the run.
     """
     listed = listing.read_listed_run(run)
-    facts = (listed.command, listed.object, " and ".join(listed.controls))
-    state = f"It was stopped: advsearch resume {name} goes on."
+    subjects = (listed.command, listed.object, " and ".join(listed.controls))
     if listed.state == "running":
         state = "A process is working on it."
+    else:
+        state = f"It was stopped: advsearch resume {name} goes on."
     counts = [f"{count} of {kind}" for kind, count in listed.kinds.items()]
     header = make_element(
         "header",
-        make_element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
+        make_element("p", ", ".join(filter(None, subjects)), class_="eyebrow"),
         make_element("h1", f"{name} has not ended"),
     )
     # The script requests rows after a row from this address, relative to the page.
@@ -248,7 +249,7 @@ def make_progress_page(name: str, run: Path) -> str:
     main = make_element(
         "main",
         make_element("p", state_text, id="state"),
-        make_element("div", id="follow"),
+        make_element("div", id="follow"),  # filled by the script follow.js
         _attack_list_html(run),
     )
     return make_document(
@@ -293,7 +294,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
     # The state is read before the rows. If the run ends in between, it counts as
     # running, so that the page requests its last rows once more.
     running = is_held(run)  # a process works on it
-    ended = not is_unfinished(run)  # not running, and cannot be resumed
+    ended = not is_unfinished(run)  # it has its final page
     last_id = after
     rows = list[dict[str, object]]()
     pictures = list[dict[str, object]]()
@@ -301,7 +302,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
         with store.Store(run / store.NAME, read_only=True) as results:
             for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
-                last_id = row.id or after
+                last_id = row.id or after  # stored rows have an id
             # Only images of the search, since the page displays no others. The index of
             # an evaluation in its search is its step.
             for step, picture in results.iterate_images("search", after, last_id):
@@ -446,8 +447,9 @@ class Dashboard(HTTPServer):
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret = secrets.token_bytes(32)  # from which `make_key` makes keys
         self.photographs = photographs
-        # Held while the list of runs is read. Other requests then find cached entries.
-        self._listing = threading.Lock()
+        # The lock is held while the list of runs is read, so that a request at the same
+        # time waits, and finds cached entries.
+        self._list_lock = threading.Lock()
         self.host_name = host
         self.fingerprint = None
         self._context: ssl.SSLContext | None = None
@@ -531,7 +533,7 @@ class Dashboard(HTTPServer):
 
     def make_list_page(self) -> str:
         """Return the page that lists the runs."""
-        with self._listing:  # one thread reads, the others find its cached entries
+        with self._list_lock:
             return make_list_page(self.list_runs())
 
     def serve_forever(self, poll_interval: float = CHECK_INTERVAL) -> None:

@@ -212,7 +212,8 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
     adversarial = exports.AdversarialRun.load(run)
-    # the object as the scene describes it, and in its adversarial pose and texture
+    # the object as the scene describes it, and its mesh in its adversarial pose and
+    # texture
     described_object, posed_asset = adversarial.posed_object()
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.size_in_metres
