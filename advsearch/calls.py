@@ -88,8 +88,15 @@ def make_unexpected_error(
 
 
 def suggest_keyword(name: str, known: Sequence[str]) -> tuple[list[str], str]:
-    """Return the known keyword that the literature gives this name, in a list, and why
-    there is no such keyword here, if there is a reason.
+    """Return the keyword that is meant by a term of the literature or other libraries.
+
+    Args:
+        name: the term, such as "eot".
+        known: names of the keywords that exist.
+
+    Returns:
+        The keyword in a list, which is empty if none is meant; and the reason why there
+        is no such keyword here, "" if there is none.
     """
     term = OTHER_TERMS.get(name.lower())
     suggestions = [term] if term is not None and term in known else []
@@ -125,8 +132,9 @@ def check_types(
                 TYPE_WORDS.get(kind, f"a {kind.rpartition('.')[2]}")
                 for kind in type_names
             ]
+            expected = join_alternatives(words)
             raise InputError(
-                f"{name}: expected {join_alternatives(words)}, got {describe_value(value)}"
+                f"{name}: expected {expected}, got {describe_value(value)}"
             )
         if name == "run" and isinstance(value, str) and not value.strip():
             raise InputError(
@@ -141,10 +149,11 @@ def _parse_annotation(annotation: str) -> list[str]:
     ``"Sequence[str] | None"`` gives ``["Sequence", "None"]``. The list is empty if the
     annotation allows anything, or has an alias whose types are not known here.
     """
+    # Remove [...]: the elements of a Sequence or Mapping are not checked. The innermost
+    # brackets are removed first, until there are none.
     without_parameters = annotation
-    # Remove [...]: the elements of a Sequence or Mapping are not checked.
     n_replaced = 1
-    while n_replaced:  # from the innermost brackets outwards
+    while n_replaced:
         without_parameters, n_replaced = re.subn(r"\[[^][]*\]", "", without_parameters)
     names = [
         name.strip().replace("os.PathLike", "Path")
@@ -168,6 +177,7 @@ def _has_type(kind: str, value: object) -> bool:
     is_text = isinstance(value, (str, bytes))
     fits = {
         "None": value is None,
+        # false for numbers with a fraction, NaN and infinity
         "int": is_number and value == value // 1,  # type: ignore[operator]
         "float": is_number,
         "Path": hasattr(value, "__fspath__"),

@@ -544,7 +544,8 @@ def is_module_installed(module: str) -> bool:
         spec = _find_spec(".".join(names[:depth]), path)
         if spec is None:
             return False
-        # the next name is looked for inside of this package; a module has nothing inside
+        # The next name is looked for inside of this package. A plain module contains no
+        # other modules.
         path = spec.submodule_search_locations or ()
     return True
 

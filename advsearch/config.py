@@ -74,9 +74,12 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
         setting: name of the setting, for messages.
         default_name: name for a mapping that has none.
     """
-    # Split at each + that is not inside of braces.
-    entries = re.split(r"\+(?![^{]*\})", value) if isinstance(value, str) else value
-    if not isinstance(entries, (list, tuple)) or len(entries) < 2:
+    entries = value
+    if isinstance(value, str):
+        # Split at each + that is not inside of braces.
+        entries = re.split(r"\+(?![^{]*\})", value)
+    has_several_names = isinstance(entries, (list, tuple)) and len(entries) > 1
+    if not has_several_names:
         return parse_name_with_options(value, setting, default_name)
     names = []
     options: dict[str, dict[str, Any]] = {}
@@ -86,7 +89,7 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
         mapping = dict(named) if isinstance(named, Mapping) else {"name": named}
         name = mapping.pop("name", None)
         if not isinstance(name, str) or not name:
-            return value
+            return value  # it has another form, and is rejected later
         names.append(name)
         if mapping:
             options[name] = mapping
@@ -99,7 +102,10 @@ def parse_joined_names(value: Any, setting: str, default_name: str) -> Any:
     if is_keyed_by_names:
         options[last_name] = {}
         options.update(last_options)
-    options = {name: value for name, value in options.items() if value}
+    # names without options are left out
+    options = {
+        name: name_options for name, name_options in options.items() if name_options
+    }
     return parse_name_with_options(
         {**options, "name": TASK_SEPARATOR.join(names)}, setting, default_name
     )
@@ -112,12 +118,13 @@ def has_model_url(model: str) -> bool:
 
 
 def get_name_without_options(name_with_options: str | Mapping[str, object]) -> str:
-    """Return the name in a setting in the form that `parse_name_with_options` returns."""
-    return (
-        name_with_options
-        if isinstance(name_with_options, str)
-        else str(name_with_options["name"])
-    )
+    """Return the name in a setting that is a name, or a mapping with a name and options.
+
+    This is the form that `parse_name_with_options` returns.
+    """
+    if isinstance(name_with_options, str):
+        return name_with_options
+    return str(name_with_options["name"])
 
 
 DEFAULT_ENVIRONMENT = "studio"
@@ -170,12 +177,12 @@ class SceneConfig(Config):
     clashes: ClassVar[tuple[Clash, ...]] = (
         Clash(
             "threads",
-            lambda one: one.deterministic and one.threads != 1,
+            lambda config: config.deterministic and config.threads != 1,
             "`deterministic` uses one thread; leave one of them out",
         ),
         Clash(
             "overwrite",
-            lambda one: one.run is None,
+            lambda config: config.run is None,
             "replaces the run that `run` names, but `run` is not set; set it, or leave "
             "`overwrite` out",
         ),
@@ -587,9 +594,11 @@ class SceneConfig(Config):
     @classmethod
     def _resolution_from_text(cls, value: Any) -> Any:
         """Read ``HEIGHTxWIDTH``, or ``SIDE`` for a square."""
-        sides = value.lower().split("x") if isinstance(value, str) else value
-        if isinstance(sides, int):
-            sides = [sides]
+        sides = value
+        if isinstance(value, str):
+            sides = value.lower().split("x")
+        elif isinstance(value, int):
+            sides = [value]
         is_square = isinstance(sides, (list, tuple)) and len(sides) == 1
         return [*sides, *sides] if is_square else sides
 
@@ -794,12 +803,13 @@ class DerivativeConfig(SceneConfig):
             values = list(value)
         else:
             values = [value]
+        # raises for values out of range
         numbers = [_parse_positive(number) for number in values]
         if isinstance(value, (list, tuple)):
             written.check_no_duplicates(
                 (f"{number:g}" for number in numbers), "epsilon"
             )
-        if not numbers:
+        if not numbers:  # an empty list or mapping
             raise ValueError("nothing is named")
         return value
 
@@ -852,6 +862,7 @@ class _Configs(Mapping[str, type[Config]]):
 
     def __iter__(self) -> Iterator[str]:
         return iter(
+            # by name, after the first commands
             sorted(
                 registry.EXPERIMENTS,
                 key=lambda name: (name not in FIRST_COMMANDS, name),

@@ -20,9 +20,9 @@ def copy_value(value: Value) -> Value:
     """Copy a value together with the tensors and arrays inside of it.
 
     Lists, tuples, mappings, namespaces and dataclasses are copied with their contents.
-    A copy of a tensor stays attached to its graph. Any other value is returned as it
-    is. So is a dataclass that hands out copies itself (its `gives_copies` is true, as
-    for `Facts`), and a mapping that is not mutable and makes its values on demand.
+    A copy of a tensor stays attached to its graph. Any other value is returned
+    unchanged. So is a dataclass whose fields already return copies (its `gives_copies`
+    is true, as for `Facts`), and an immutable mapping that makes its values on demand.
     """
     original: Any = value
     copied: Any = original
@@ -80,8 +80,8 @@ def copy_method_arguments(user_class: type, **argument_slices: slice) -> None:
     So code of users may change its arguments in place without harm to the search.
 
     Args:
-        user_class: the class, whose methods are replaced. A class of this package is not
-            changed.
+        user_class: the class, whose methods are replaced. A class of this package is
+            not changed.
         argument_slices: by name of the method, which positional arguments after `self`
             are copied. All keyword arguments are copied.
     """
@@ -103,9 +103,9 @@ def _wrap_with_copies(method: Callable[..., Any], which: slice) -> Callable[...,
     """
 
     @wraps(method)
-    def handed(self: Any, *args: Any, **named: Any) -> Any:
-        copied_args = [*args]
-        copied_args[which] = map(copy_value, copied_args[which])
-        return method(self, *copied_args, **copy_value(named))
+    def wrapper(self: Any, *args: Any, **keywords: Any) -> Any:
+        passed_args = [*args]
+        passed_args[which] = map(copy_value, passed_args[which])
+        return method(self, *passed_args, **copy_value(keywords))
 
-    return handed
+    return wrapper

@@ -57,7 +57,9 @@ class UnknownNameError(InputError):
         """
         names = sorted(known)
         near = find_similar_names(name, names)[:3]
-        guess = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+        guess = ""
+        if near:
+            guess = f" Did you mean {' or '.join(map(repr, near))}?"
         all_names = ", ".join(names) or "none"
         ending = f" {hint}" if hint else ""
         super().__init__(f"unknown {kind} {name!r}.{guess} Known: {all_names}.{ending}")
@@ -112,18 +114,20 @@ def find_similar_names(name: str, known: Iterable[str]) -> list[str]:
     in this way, names with a similar spelling are returned, such as "mug" for "mgu".
     """
     query_words = _split_words(name)
-    names = list(dict.fromkeys(known))
-    ranks = {
-        known: rank
-        for known in names
-        if (rank := _rank(query_words, _split_words(known))) is not None
-    }
+    names = list(dict.fromkeys(known))  # without duplicates
+    ranks = {}
+    for known_name in names:
+        rank = _rank(query_words, _split_words(known_name))
+        if rank is not None:  # the words are similar
+            ranks[known_name] = rank
     if ranks:
         return sorted(ranks, key=ranks.__getitem__)
     matcher = difflib.SequenceMatcher(None, "", name.casefold())
-    similarities = {known: _compute_similarity(matcher, known) for known in names}
-    similar = [known for known in names if similarities[known] > 0.0]
-    return sorted(similar, key=lambda known: -similarities[known])
+    similarity_by_name = {
+        known_name: _compute_similarity(matcher, known_name) for known_name in names
+    }
+    similar = [name for name, value in similarity_by_name.items() if value > 0.0]
+    return sorted(similar, key=similarity_by_name.__getitem__, reverse=True)
 
 
 def _split_words(name: str) -> list[str]:
@@ -154,7 +158,10 @@ def _rank(query: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] |
     has_other_end = words[-1] != query[-1]
     if set(query) <= set(words):
         return 0, n_more_words, has_other_end
-    if all(any(word.startswith(query_word) for word in words) for query_word in query):
+    begin_words = all(
+        any(word.startswith(query_word) for word in words) for query_word in query
+    )
+    if begin_words:
         return 1, n_more_words, has_other_end
     if "".join(query) in "".join(words):
         return 2, n_more_words, has_other_end
@@ -176,11 +183,12 @@ def _compute_similarity(matcher: difflib.SequenceMatcher[str], name: str) -> flo
     best_ratio = 0.0
     for text, threshold in candidates:
         matcher.set_seq1(text)
-        if (
-            # The first two are upper bounds of the ratio that take less time.
+        # The first two are upper bounds of the ratio, and take less time.
+        is_similar = (
             matcher.real_quick_ratio() >= threshold
             and matcher.quick_ratio() >= threshold
             and matcher.ratio() >= threshold
-        ):
+        )
+        if is_similar:
             best_ratio = max(best_ratio, matcher.ratio())
     return best_ratio

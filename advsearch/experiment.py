@@ -15,7 +15,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -213,7 +213,8 @@ def run_and_save(
         if not context.has_run:
             return result
         images = context.run.path / "images"
-        for suffix, data in render_result_figure(get_view(result)).items():
+        figure_files = render_result_figure(get_view(result))
+        for suffix, data in figure_files.items():
             write_bytes(images / f"{context.config.command}.{suffix}", data)
         return write_result(context.run, result)
 
@@ -236,7 +237,7 @@ def run_experiment(
     """
     from advsearch.api.names import check_names  # imports scipy
 
-    # If the caller passed Python objects, their names in the settings may be any text.
+    # If the caller passed Python objects, settings have names that need not exist.
     if not config.python_only_parts:
         check_names(dict(config))
     # An experiment with `out` writes a file or folder of its own, and no run.
@@ -244,19 +245,18 @@ def run_experiment(
     # The folder of a new run is created before slow imports, so that a run that is
     # stopped early can be listed. Then the experiment continues in it as in a resumed
     # run.
-    with (
-        create_before_work(config)
-        if creates_run
-        else nullcontext(resumed_directory) as folder
-    ):
+    folder_context: AbstractContextManager[Path | None] = nullcontext(resumed_directory)
+    if creates_run:
+        folder_context = create_before_work(config)
+    with folder_context as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed_directory=folder)
 
 
 def find_stopped_run(config: Config) -> Path | None:
-    """Return the folder of the run to resume: the one that the setting `run` names.
+    """Return the folder of the run that the setting `run` names, to resume it.
 
-    Returns None if the setting is not set, or names no run yet: then a new run is
+    The result is None if the setting is not set, or names no run yet: then a new run is
     started. Whether the run has ended already is checked when it is resumed.
     """
     run, _overwrite = config.run_location
@@ -284,20 +284,17 @@ def run_part(
         run: function that runs an experiment with settings; None for `run_experiment`.
     """
     run = run or run_experiment
+    # A folder without stored settings was left by a start that failed.
     is_started = is_run(folder) and (folder / CONFIG).is_file()
     if not is_started:
-        return run(
-            # A folder without stored settings was left by a start that failed.
-            config.model_copy(update={"run": str(folder), "overwrite": True}),
-            progress=progress,
+        config_of_part = config.model_copy(
+            update={"run": str(folder), "overwrite": True}
         )
+        return run(config_of_part, progress=progress)
     if is_finished(folder):
         return read_result(folder)
-    return run(
-        type(config).from_yaml(folder / CONFIG, config.session_settings),
-        progress=progress,
-        resumed_directory=folder,
-    )
+    stored_config = type(config).from_yaml(folder / CONFIG, config.session_settings)
+    return run(stored_config, progress=progress, resumed_directory=folder)
 
 
 class PositionalArgument(NamedTuple):
@@ -539,9 +536,10 @@ def experiment(
         first_parameter = next(iter(inspect.signature(function).parameters))
         # RunContext[NameConfig] has the class of the settings in brackets
         (settings,) = get_args(hints[first_parameter])
-        returned = hints["return"]
-        union_members = get_args(returned)
-        result = union_members[0] if union_members else returned
+        result = hints["return"]
+        union_members = get_args(result)  # empty if it is a single class
+        if union_members:
+            result = union_members[0]
         return Experiment(function, settings, result, examples, **attributes)
 
     return decorate

@@ -3,8 +3,8 @@
 The KeyboardInterrupt of a signal handler is lost inside a destructor, a callback or
 native code, and a module that is being imported may turn it into another error. So the
 handler counts the interrupts. Code that renders, calls a model, waits for workers or
-reports progress calls `INTERRUPTS.look`, which raises an interrupt again that was not
-handled.
+reports progress calls `INTERRUPTS.raise_pending`, which raises an interrupt again that
+was not handled.
 """
 
 from __future__ import annotations
@@ -34,23 +34,25 @@ class Interrupts:
     """
 
     def __init__(self) -> None:
-        self.n_received = self.n_handled = 0
+        self.n_received = 0
+        self.n_handled = 0
         self.is_work_done = False
-        self._last = -DUPLICATE_SECONDS
+        # time of the last signal; at first so early that no signal is a duplicate
+        self._last_signal = -DUPLICATE_SECONDS
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Count an interrupt, and raise KeyboardInterrupt.
 
-        Nothing is raised once all work is done (`is_work_done`). A signal soon after another
-        one comes from the same Ctrl-C, and is ignored.
+        Nothing is raised once all work is done (`is_work_done`). A signal soon after
+        another one comes from the same Ctrl-C, and is ignored.
 
         Args:
             number: number of the signal.
             frame: frame that was interrupted; both are what Python passes to handlers.
         """
-        previous = self._last
-        self._last = time.monotonic()
-        if self._last - previous < DUPLICATE_SECONDS:
+        previous_signal = self._last_signal
+        self._last_signal = time.monotonic()
+        if self._last_signal - previous_signal < DUPLICATE_SECONDS:
             return
         self.n_received += 1
         if not self.is_work_done:
@@ -156,7 +158,8 @@ def _wait_for_second(reading_end: socket.socket, writing_end: socket.socket) -> 
         # one Ctrl-C may come as two signals in a short time
         is_duplicate = now - first_time < DUPLICATE_SECONDS
         if not is_duplicate and not INTERRUPTS.is_work_done:
-            show_cursor = b"\x1b[?25h" if os.isatty(2) else b""  # bars hide it
+            # progress bars hide the cursor of the terminal
+            show_cursor = b"\x1b[?25h" if os.isatty(2) else b""
             with suppress(OSError):
                 os.write(2, show_cursor + b"advsearch: interrupted\n")
             os._exit(128 + signal.SIGINT)
@@ -165,7 +168,8 @@ def _wait_for_second(reading_end: socket.socket, writing_end: socket.socket) -> 
 def report_unraisable_error(unraisable: sys.UnraisableHookArgs) -> None:
     """Print an exception that a destructor or a callback could not raise.
 
-    An interrupt is not printed: it was counted, and `INTERRUPTS.look` raises it again.
+    An interrupt is not printed: it was counted, and `INTERRUPTS.raise_pending` raises it
+    again.
     """
     if not issubclass(unraisable.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)

@@ -65,12 +65,17 @@ class _MaiteNetwork(nn.Module):
 
 
 def _to_detections(target: Any) -> dict[str, Tensor]:
-    """Convert an `ObjectDetectionTarget` to boxes (n, 4), labels (n,) and scores (n,)."""
+    """Convert an `ObjectDetectionTarget` to a mapping of torchvision's detectors.
+
+    It has boxes (n, 4), labels (n,) and scores (n,).
+    """
     scores = torch.as_tensor(target.scores).float()
     if scores.ndim == 2:  # (n, classes); `labels` has the class with the best score
-        n_classes = scores.shape[1]
-        # `amax` fails without a class
-        scores = scores.amax(dim=1) if n_classes else scores.new_zeros(len(scores))
+        has_classes = scores.shape[1] > 0
+        if has_classes:
+            scores = scores.amax(dim=1)
+        else:  # `amax` would fail
+            scores = scores.new_zeros(len(scores))
     boxes = torch.as_tensor(target.boxes).float().reshape(-1, 4)
     return {
         "boxes": boxes,
@@ -114,12 +119,11 @@ def load_model(
     metadata = getattr(model, "metadata", {})
     index2label = metadata.get("index2label")
     if labels is None and index2label:
-        # indices without a label in between get a placeholder
-        labels = [
-            index2label.get(index, f"class {index}")
-            for index in range(max(index2label) + 1)
-        ]
-    name = options.pop("name", str(metadata.get("id", type(model).__name__)))
+        # indices without a label get a placeholder
+        n_labels = max(index2label) + 1
+        labels = [index2label.get(index, f"class {index}") for index in range(n_labels)]
+    default_name = str(metadata.get("id", type(model).__name__))
+    name = options.pop("name", default_name)
     return models.load_model(
         _MaiteNetwork(model, task),
         task=make_task(task),
@@ -207,10 +211,9 @@ class Scenes:
         self.spp = spp
         self.seed = seed
         description, _filter = self.renderer.scene.description_and_filter
+        object_label = description.object.label or description.object_name
         # the classes that count as right for the object
-        self.right = find_label_set(
-            label or description.object.label or description.object_name, self.labels
-        )
+        self.right = find_label_set(label or object_label, self.labels)
         self.space = cast("Any", self.renderer.space)
         # The domain has the ranges of all parameters; a configuration is a point in it.
         domain = make_domain(self.space.controls)
@@ -236,7 +239,8 @@ class Scenes:
             The image (3, H, W) in [0, 1], its target, and metadata: its id and the
             values of the parameters.
         """
-        # a range raises IndexError, which ends a loop over the images
+        # A range handles negative numbers, and raises IndexError after the last image,
+        # which ends a loop over the images.
         index = range(len(self))[number]
         u = self.configurations[index]
         with torch.no_grad():
@@ -264,7 +268,7 @@ class Scenes:
         classes = []
         for thing in find_visible_meshes(self.renderer, u):
             class_id: int | None = right_class
-            if thing.name != "object":  # another object in the scene
+            if thing.name != "object":  # an additional object of the scene
                 name = description.meshes[thing.name].label or thing.name
                 class_id = _find_class(name, self.labels)
             if class_id is not None:

@@ -76,10 +76,9 @@ def _with_parameter(name: str, options: object) -> object:
     is_class = ":" in name  # "package.module:Class", whose dot is of another kind
     if not dot or is_class or options is None:
         return options
-    # a range may be a mapping, too
-    is_range = not isinstance(options, Mapping) or bool(
-        options.keys() & {"distribution", "choices", "range"}
-    )
+    # A range may be a mapping, too. Then it has one of these keys.
+    range_keys = {"distribution", "choices", "range"}
+    is_range = not isinstance(options, Mapping) or bool(options.keys() & range_keys)
     return {parameter: options} if is_range else options
 
 
@@ -95,10 +94,12 @@ def format_things(things: object) -> str | None:
     Raises:
         InputError: the value has another type.
     """
-    if isinstance(things, (list, tuple)):
+    if things is None:
+        items: Iterable[object] = []
+    elif isinstance(things, (list, tuple)):
         items = things
     else:
-        items = [] if things is None else [things]
+        items = [things]
     if not all(isinstance(item, (str, Mapping)) for item in items):
         raise InputError(
             "things: expected a text such as 'car@12,3.5', a mapping or a list of "
@@ -121,7 +122,7 @@ def _make_thing_absolute(thing: str) -> str:
     object_name, at, options = thing.strip().rpartition("@")
     object_name = object_name.strip()
     file, mark, node = object_name.partition("#")
-    # Names of bundled objects have no suffix; such a name is not taken for a file.
+    # Names of bundled objects have no suffix: a file of such a name is not used.
     if "." in file and Path(file).is_file():
         object_name = f"{Path(file).resolve()}{mark}{node}"
     return f"{object_name}{at}{options}"
@@ -142,6 +143,7 @@ def _format_thing(thing: Mapping[str, Any]) -> str:
             "things: expected an object, x and y, such as {'object': 'car', 'x': 12, "
             f"'y': 3.5}}, got {dict(thing)!r:.80}"
         )
+    # joined with a comma: OBJECT@X,Y
     position = [f"{thing['object']}@{thing['x']}", f"{thing['y']}"]
     options = [f"{name}={thing[name]}" for name in thing if name not in required]
     return ",".join([*position, *options])
@@ -199,9 +201,11 @@ def _find_expected(option_type: str, value: object) -> str:
         and not isinstance(value, bool)
         and abs(value) <= MAX_OPTION  # false for NaN
     )
+    # a float without a fraction, such as 2.0, counts as an int
+    is_integral = is_number and value % 1 == 0  # type: ignore[operator]
     if option_type == "float" and not is_number:
         return f"a finite number from {-MAX_OPTION} to {MAX_OPTION}"
-    if option_type == "int" and not (is_number and value % 1 == 0):  # type: ignore[operator]
+    if option_type == "int" and not is_integral:
         return f"a whole number from {-MAX_OPTION} to {MAX_OPTION}"
     if option_type == "bool" and not isinstance(value, bool):
         return "true or false"
@@ -219,7 +223,9 @@ def get_option_default(option: Field[Any]) -> Any:
     """Return the default of an option; None if it has none."""
     if option.default is not MISSING:
         return option.default
-    return None if option.default_factory is MISSING else option.default_factory()
+    if option.default_factory is not MISSING:
+        return option.default_factory()
+    return None
 
 
 def _to_json(value: object) -> JsonValue:
@@ -345,8 +351,10 @@ def get_outcome(payload: object) -> Outcome | None:
 
 
 def count_outcomes(payloads: Iterable[object]) -> dict[str, int] | None:
-    """Count the outcomes of predictions that are not right, by value; None if no
-    payload states one.
+    """Count the outcomes of predictions by value; None if no payload states one.
+
+    Args:
+        payloads: payloads of the predictions, such as those that are wrong.
     """
     counts = Counter(get_outcome(payload) for payload in payloads)
     named = {outcome.value: counts[outcome] for outcome in Outcome if counts[outcome]}

@@ -38,8 +38,10 @@ MAX_SCANS = 64
 
 @contextlib.contextmanager
 def without_pillows_limit() -> Iterator[None]:
-    """Inside the block, let Pillow open pictures of any size; before one is decoded,
-    `check_pixels` rejects images that are too large.
+    """Let Pillow open images of any size inside the block.
+
+    The caller rejects images that are too large by `check_pixels` before they are
+    decoded.
     """
     pixel_limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
@@ -104,7 +106,7 @@ def open_image(path: Path, limit: int) -> Iterator[Image.Image]:
     try:
         data = stored_files.read_bytes(path, "a picture file such as PNG", limit)
         with warnings.catch_warnings(), without_pillows_limit():
-            warnings.simplefilter("ignore")  # of odd metadata
+            warnings.simplefilter("ignore")  # Pillow warns of unusual metadata
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                 yield image
     except (OSError, ValueError, SyntaxError, EOFError) as error:

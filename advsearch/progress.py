@@ -88,9 +88,9 @@ class Stages:
             name: name under which its seconds are stored. Stages of the same name add
                 up.
             title: name of the stage for the user, such as "searching".
-            total_seconds: number of its steps; None if they are not counted.
+            total: number of its steps; None if they are not counted.
             hint: what the stage consists of, and the setting that makes it shorter.
-            at_most: whether `total_seconds` is an upper bound.
+            at_most: whether `total` is an upper bound.
         """
         self.end()
         self._name = name
@@ -146,8 +146,8 @@ def open_progress(
         requested: True for a display in a notebook, a terminal or a stream of lines;
             None for bars in a terminal only; False for no display; or an object with
             the methods of `Progress`, which is returned.
-        format_names: function that replaces settings in a text, such as "`steps`", by the
-            form in which the reader writes them, such as "--steps".
+        format_names: function that replaces settings in a text, such as "`steps`", by
+            the form in which the reader writes them, such as "--steps".
 
     Raises:
         InputError: `requested` is something else.
@@ -160,7 +160,8 @@ def open_progress(
         return nullcontext(requested)  # type: ignore[arg-type]
     if requested is False:
         return nullcontext(NullProgress())
-    # From here on, None differs from True: it only displays bars in a terminal.
+    # Left are True and None. None only displays bars in a terminal: no line in a
+    # notebook, and no lines of text.
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     is_notebook = getattr(shell, "kernel", None) is not None
     if requested and is_notebook:
@@ -208,8 +209,8 @@ class LineProgress:
 
         Args:
             stream: stream to which the lines are written.
-            format_names: function that replaces settings in a text, such as "`steps`", by
-                the form in which the reader writes them, such as "--steps".
+            format_names: function that replaces settings in a text, such as "`steps`",
+                by the form in which the reader writes them, such as "--steps".
             clock: function that returns the time in seconds; tests pass another one.
         """
         self._stream = stream
@@ -264,7 +265,9 @@ class LineProgress:
         with self._lock:
             now = self._clock()
             elapsed = now - self._stage_started
-            if self._printed_at is None:  # not announced yet
+            is_announced = self._printed_at is not None
+            if not is_announced:
+                # the name is empty before the first stage
                 if self._name and elapsed >= ANNOUNCE_SECONDS:
                     self._printed_at = now
                     self._print(self._stage_title)
@@ -293,8 +296,9 @@ class LineProgress:
             # Most stages with an upper bound end long before it. So the remaining time
             # is only printed after a tenth of the steps.
             is_unsure = self._at_most and 10 * done < total
+            seconds_left = elapsed / done * (total - done)
             if not is_unsure:
-                times += f", {limit}{_seconds(elapsed / done * (total - done))} left"
+                times += f", {limit}{_seconds(seconds_left)} left"
         return ", ".join(filter(None, [*texts, times, self._info]))
 
     def _print(self, text: str) -> None:
@@ -324,8 +328,8 @@ class NotebookProgress(LineProgress):
     The line disappears at the end of the `with` block. Messages remain.
     """
 
-    def __init__(self, written: Callable[[str], str] = str) -> None:
-        super().__init__(sys.stdout, written)
+    def __init__(self, format_names: Callable[[str], str] = str) -> None:
+        super().__init__(sys.stdout, format_names)
         self._updated = 0.0
         display = sys.modules["IPython"].display.display
         self._handle = display({"text/plain": ""}, raw=True, display_id=True)
@@ -359,8 +363,8 @@ class BarProgress:
 
         Args:
             terminal: stream of the terminal.
-            format_names: function that replaces settings in a text, such as "`steps`", by
-                the form in which the reader writes them, such as "--steps".
+            format_names: function that replaces settings in a text, such as "`steps`",
+                by the form in which the reader writes them, such as "--steps".
         """
         # imported late, so that --help answers at once
         from rich import progress as bars
@@ -398,7 +402,7 @@ class BarProgress:
             hint: what the stage consists of, printed above the bars.
             at_most: whether `total` is an upper bound.
         """
-        if self.bars.tasks:
+        if self.bars.tasks:  # the last bar becomes full, whatever its number of steps
             last_bar = self.bars.tasks[-1]
             steps = max(last_bar.completed, 1)
             self.bars.update(last_bar.id, total=steps, completed=steps)
@@ -413,7 +417,7 @@ class BarProgress:
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         """See `Progress.advance`. Before the first stage nothing is displayed."""
-        for bar in self.bars.tasks[-1:]:
+        for bar in self.bars.tasks[-1:]:  # the last one, or none
             text = escape_text(format_info(info)) if info else bar.fields["info"]
             self.bars.update(bar.id, advance=n, info=text)
 
@@ -434,6 +438,7 @@ class BarProgress:
 
 
 def _seconds(seconds: float) -> str:
+    """Return ``25 s`` for times below 99.5 seconds, and ``3 min 5 s`` for longer ones."""
     # late, so that --help answers at once
     from advsearch.report.wording import format_seconds
 

@@ -131,9 +131,9 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def is_class_path(self, name: str) -> bool:
         """Return whether a name stands for a class to import.
 
-        "package.module:Class" does, if this registry allows it (`imports_user_classes`).
-        "light:Key"
-        does not if "light" is an entry: then it names an instance of that entry.
+        "package.module:Class" does, if this registry allows it
+        (`imports_user_classes`). "light:Key" does not if "light" is an entry: then it
+        names an instance of that entry.
         """
         module, _, attribute = name.partition(":")
         is_class_name = attribute[:1].isupper() and attribute.isidentifier()

@@ -57,10 +57,16 @@ def assert_right(
             decide it.
         InputError: a setting is wrong.
     """
-    __tracebackhide__ = True
+    __tracebackhide__ = True  # pytest leaves this function out of tracebacks
     claim = {"claim": "right", "at_least": at_least, "pictures": pictures}
     return _assert_claim(
-        claim, object, {"model": model}, settings, confidence, seed, run
+        claim,
+        object,
+        models={"model": model},
+        settings=settings,
+        confidence=confidence,
+        seed=seed,
+        run=run,
     )
 
 
@@ -90,10 +96,14 @@ def assert_not_broken(
         InputError: a setting is wrong.
     """
     __tracebackhide__ = True
-    claim = {"claim": "not_broken"}
-    confidence = 0.95  # the default of a suite; a search makes no use of it
     return _assert_claim(
-        claim, object, {"model": model}, settings, confidence, seed, run
+        {"claim": "not_broken"},
+        object,
+        models={"model": model},
+        settings=settings,
+        confidence=0.95,  # the default of a suite; this claim does not use it
+        seed=seed,
+        run=run,
     )
 
 
@@ -207,7 +217,7 @@ def _assert_claim(
         AssertionError: the claim is shown to be wrong, or undecided.
     """
     __tracebackhide__ = True
-    # torch takes long to import
+    # late: torch takes long to import
     from advsearch.extend import workbench
 
     experiment = workbench.get_experiment("test")
@@ -228,8 +238,8 @@ def _assert_claim(
                 claim_settings[key] = model_name
             if not isinstance(model, (str, Path)):
                 objects["model", model_name] = model
-        # The stored run lists what no file can name, so that nobody expects to repeat
-        # it from the file: the call itself, and models that exist in this session only.
+        # The stored run lists everything that its file cannot name, since it cannot be
+        # repeated from the file: the call itself, and models of this session only.
         python_only = [
             workbench.PythonOnly("call", f"of {title}"),
             *(
@@ -251,7 +261,7 @@ def _assert_claim(
             .with_python_objects(objects)
         )
         result: SuiteResult = experiment.run(config, suite=suite)
-    (claim_result,) = result.claims
+    (claim_result,) = result.claims  # the suite has a single claim
     if claim_result.verdict != "held":
         raise AssertionError(_format_report(result, claim_result, _describe_repeat()))
     return result
@@ -281,7 +291,7 @@ def _name_objects(
         The settings with names; and the objects (scene and controls) by (role, name),
         as `Config.with_python_objects` takes them.
     """
-    # heavy, and pytest imports this module before it collects
+    # late: it imports torch, and pytest imports this module before it collects tests
     from advsearch.extend import workbench
 
     loading = workbench.loading

@@ -28,8 +28,8 @@ OPENMP_DEFAULTS = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 """
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 _CPU_INFO = Path("/proc/cpuinfo")
-# The number of threads that the user has set; empty if there is none. `configure`
-# changes the variable later.
+# The number of threads that the user has set; empty if there is none. It is read here,
+# since `configure` changes the variable later.
 _USERS_COUNT = os.environ.get("OMP_NUM_THREADS", "")
 
 # A user who has set this variable has chosen how threads wait.
@@ -106,8 +106,10 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")
     requested = threads if threads is not None else _get_default()
     _chosen = min(requested, MAX_THREADS_PER_CORE * count_cores())
-    # Dr.Jit's workers still hold their cores for a while after a render
-    for_torch = max(1, _chosen // 2) if rendering else _chosen
+    # Dr.Jit's workers still occupy their cores for a while after a render.
+    for_torch = _chosen
+    if rendering:
+        for_torch = max(1, _chosen // 2)
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)
     else:
@@ -149,7 +151,7 @@ def restore_threads() -> Iterator[None]:
 def all_for_torch() -> Iterator[None]:
     """Give torch all threads inside of the block, in which nothing is rendered.
 
-    Training then takes half of the time.
+    Training then takes half the time.
     """
     configure(_chosen, rendering=False)
     try:

@@ -237,7 +237,7 @@ def test_an_interrupt_that_an_import_swallows_is_not_lost(where: dict[str, str],
 
 def test_an_interrupted_process_ends_without_the_interpreters_own_end() -> None:
     """What an interrupt inside native code leaves behind aborts there: status 134 and a dump of threads."""
-    code = "import atexit, os; from advsearch.cli import main; main._status = lambda given: print('answer') or 130; "
+    code = "import atexit, os; from advsearch.cli import main; main._run_to_status = lambda given: print('answer') or 130; "
     code += "atexit.register(os.abort); from advsearch.__main__ import start; start()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stdout, done.stderr) == (130, "answer\n", "")

@@ -272,9 +272,8 @@ FAULTS = (
     Fault(
         "report: the bleed is printed as a part of the size",
         "advsearch/report/sheets.py",
-        "(width - 2 * self.bleed[0]) * self.pixel_size_mm[0], (\n            height - 2 * "
-        "self.bleed[1]\n        ) * self.pixel_size_mm[1]",
-        "width * self.pixel_size_mm[0], height * self.pixel_size_mm[1]",
+        "return n_columns * pixel_width, n_rows * pixel_height",
+        "return width * pixel_width, height * pixel_height",
         ("tests/report/test_sheets.py",),
     ),
     Fault(
@@ -301,8 +300,8 @@ FAULTS = (
     Fault(
         "cluster: any version may work",
         "advsearch/cluster/dask_executor.py",
-        "if its_version == compute_version():",
-        "if isinstance(its_version, str):",
+        "if version == compute_version():",
+        "if isinstance(version, str):",
         ("tests/cluster/test_executors.py",),
     ),
     Fault(
@@ -315,7 +314,7 @@ FAULTS = (
     Fault(
         "cli: an interrupted command says that all is well",
         "advsearch/cli/output.py",
-        "return INTERRUPTED if stopped else OK",
+        "return INTERRUPTED if was_interrupted else OK",
         "return OK",
         ("tests/cli/test_cli.py",),
     ),

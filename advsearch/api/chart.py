@@ -128,7 +128,7 @@ def measured_palette(photograph: str | Path) -> Tensor:
     homography = _compute_homography(CORNER_CENTERS, corner_pixels)
 
     def measure_light(points: Floats) -> Floats:
-        """Return the median light (3,) at points (N, 2) of the chart, in millimetres."""
+        """Return the median light (3,) at points (N, 2) of the chart in millimetres."""
         median: Floats = np.median(_sample(light, homography, points), axis=0)
         return median
 
@@ -183,16 +183,18 @@ def _find_corners(light: Floats, photograph: str | Path) -> Floats:
     if len(squares) < 4:
         raise not_found
     x, y, area = np.array(squares).T
-    # the square nearest to each corner of the image: upper left (smallest x + y), upper
-    # right, lower left, lower right
+    # Indices of the square nearest to each corner of the image, in reading order: the
+    # upper left one has the smallest x + y, the upper right one the smallest y - x.
     outermost = [
         int(np.argmin(x_sign * x + y_sign * y))
         for y_sign, x_sign in itertools.product((1, -1), repeat=2)
     ]
+    are_four = len({*outermost}) == 4
     # The squares have the same size on paper. In perspective their areas may differ,
     # but by no more than a factor of 3.
     areas = area[outermost]
-    if len({*outermost}) < 4 or areas.max() > 3.0 * areas.min():
+    are_similar = areas.max() <= 3.0 * areas.min()
+    if not are_four or not are_similar:
         raise not_found
     return np.stack([x, y], axis=1)[outermost]
 
@@ -206,8 +208,9 @@ def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:
     brightness = light.mean(axis=2)
     # paper is nearly the brightest in the photograph
     paper_brightness = np.percentile(brightness, 95)
-    # the limit is display-referred, and made linear by the power
+    # The limit is display-referred. The power of 2.2 converts it to linear light.
     is_dark = brightness < MAX_DARK_BRIGHTNESS**2.2 * paper_brightness
+    # connected dark regions: the number of the region of each pixel, 0 for none
     labels, count = ndimage.label(is_dark)
     squares = []
     boxes = ndimage.find_objects(labels) if count else []
@@ -220,18 +223,28 @@ def _find_dark_squares(light: Floats) -> list[tuple[float, float, int]]:
 
 
 def _is_filled_square(inside: npt.NDArray[np.bool_]) -> bool:
-    """Return whether a region (H, W) bool fills its box, which is about a square."""
+    """Return whether a region (H, W) bool fills its box, which is about a square.
+
+    In perspective a square is distorted, so that it fills only a part of its box.
+    """
     height, width = inside.shape
+    is_large_enough = min(height, width) >= 5  # in pixels
     is_square = 0.5 < width / height < 2.0
-    return min(height, width) >= 5 and is_square and bool(inside.mean() > 0.7)
+    is_filled = bool(inside.mean() > 0.7)
+    return is_large_enough and is_square and is_filled
 
 
 def _compute_homography(points: Floats, pixels: Floats) -> Floats:
-    """Compute the (3, 3) homography that maps four points (4, 2) to pixels (4, 2)."""
+    """Compute the (3, 3) homography that maps four points (4, 2) to pixels (4, 2).
+
+    The last of its nine entries is 1. The others solve two linear equations for each
+    point, one for u and one for v.
+    """
     rows = []
     for (x, y), (u, v) in zip(points, pixels, strict=True):
         rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y], [0, 0, 0, x, y, 1, -v * x, -v * y]]
-    return np.append(np.linalg.solve(np.array(rows), pixels.ravel()), 1.0).reshape(3, 3)
+    entries = np.linalg.solve(np.array(rows), pixels.ravel())
+    return np.append(entries, 1.0).reshape(3, 3)
 
 
 def _sample(light: Floats, homography: Floats, points: Floats) -> Floats:

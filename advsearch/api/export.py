@@ -91,9 +91,14 @@ class AdversarialRun:
         """Return the inputs of the scene inside Mitsuba, and those applied to its
         image.
         """
-        inputs = self.inputs
-        on_image = {name: inputs.pop(name) for name in IMAGE_INPUTS if name in inputs}
-        return inputs, on_image
+        scene_inputs = {}
+        image_inputs = {}
+        for name, value in self.inputs.items():
+            if name in IMAGE_INPUTS:
+                image_inputs[name] = value
+            else:
+                scene_inputs[name] = value
+        return scene_inputs, image_inputs
 
     def posed_object(self) -> tuple[MeshPart, Shape]:
         """Return the object as the scene describes it, and its mesh as it is in the
@@ -116,15 +121,15 @@ class AdversarialRun:
             The image (H, W, 3), sRGB in [0, 1].
         """
         renderer = self.problem.renderer
-        # the renderer takes no inputs of the finished image
-        traced = {
+        # inputs that are applied to the image after rendering are left out
+        scene_inputs = {
             name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
         }
         with torch.no_grad():
             rendered = renderer.render_radiance(
-                traced, seed, spp, hide_environment="backdrop.color" in inputs
+                scene_inputs, seed, spp, hide_environment="backdrop.color" in inputs
             )
-            # `u` is for controls that change the finished image: it has their values
+            # `u` has the values of controls that change the finished image
             return renderer.finish_image(rendered, inputs, self.u)
 
     @property
@@ -215,7 +220,7 @@ def make_printable_pieces(run: str | Path, size: float) -> list[Piece]:
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{file_stem}-pixels.png")
             patch_size = size * _get_relative_patch_size(control, config, summary)
-            pixel_size = patch_size / len(pixels)  # a patch is a square
+            pixel_size = patch_size / len(pixels)  # as many rows as columns
             name = f"{control.name}, {patch_size:.1f} mm a side"
             pieces.append(
                 _make_piece(name, pixels, (pixel_size, pixel_size), inside=None)
@@ -273,10 +278,10 @@ def _get_relative_patch_size(
         config: settings of the run.
         summary: result of the run.
     """
-    found = (summary.configuration or {}).get(f"{control.name}.size")
+    searched_size = (summary.configuration or {}).get(f"{control.name}.size")
     size: Any
-    if found is not None:
-        size = found.value
+    if searched_size is not None:
+        size = searched_size.value
     else:
         size = config.controls.get(control.name, {}).get("size")
     if isinstance(size, (int, float)):
@@ -314,10 +319,10 @@ def _find_charts(
         is_printed = is_printed & np.isin(raster.face_index, faces)
     charts = _label_charts(is_printed)
     for number, (box, inside) in enumerate(charts, 1):
-        measured = _measure_texel_size(positions[box] * scale, inside)
-        if measured is None:
+        size_and_distortion = _measure_texel_size(positions[box] * scale, inside)
+        if size_and_distortion is None:  # a line or a point, which cannot be printed
             continue
-        texel_size, distortion = measured
+        texel_size, distortion = size_and_distortion
         image = _extend_inside(texture[box], inside)
         # A chart whose texture coordinates are mirrored has a negative signed area.
         is_mirrored = uv_areas[np.unique(raster.face_index[box][inside])].sum() < 0.0
@@ -335,10 +340,16 @@ def _label_charts(is_printed: Mask) -> list[tuple[tuple[slice, slice], Mask]]:
     of each (rows, columns), and its mask inside the box.
     """
     labels, _ = ndimage.label(is_printed)
-    # the label 0 is what is outside of all parts
+    # Labels of parts begin at 1; 0 is what is outside of all parts.
     boxes = ndimage.find_objects(labels)
     charts = [(box, labels[box] == label) for label, box in enumerate(boxes, 1)]
-    return sorted(charts, key=lambda chart: -int(chart[1].sum()))
+
+    def count_texels(chart: tuple[tuple[slice, slice], Mask]) -> int:
+        _box, inside = chart
+        return int(inside.sum())
+
+    # `reverse` keeps the order of charts of equal size
+    return sorted(charts, key=count_texels, reverse=True)
 
 
 def _extend_inside(image: Float32Array, inside: Mask) -> Float32Array:
@@ -372,7 +383,8 @@ def _measure_texel_size(
         is_inside = np.delete(inside, -1, axis)  # all but the last texel
         is_next_inside = np.delete(inside, 0, axis)  # all but the first texel
         distances_by_axis.append(distances[is_inside & is_next_inside])
-    if not all(len(distances) for distances in distances_by_axis):
+    has_both = all(len(distances) > 0 for distances in distances_by_axis)
+    if not has_both:  # the texels are a line or a point
         return None
     width, height = (float(np.mean(distances)) for distances in distances_by_axis)
     if min(width, height) <= 0.0:
@@ -403,9 +415,10 @@ def _make_piece(
         fine = enlarge(torch.from_numpy(np.ascontiguousarray(image)), subdivisions)
     else:
         fine = torch.from_numpy(image)
-    fine_size = pixel_size[0] / subdivisions, pixel_size[1] / subdivisions
-    bleed_columns = math.ceil(BLEED / fine_size[0])
-    bleed_rows = math.ceil(BLEED / fine_size[1])
+    fine_width = pixel_size[0] / subdivisions
+    fine_height = pixel_size[1] / subdivisions
+    bleed_columns = math.ceil(BLEED / fine_width)
+    bleed_rows = math.ceil(BLEED / fine_height)
     padding = ((bleed_rows, bleed_rows), (bleed_columns, bleed_columns))
     # the edge is repeated into the bleed
     levels = np.pad(to_8bit(fine.numpy()), (*padding, (0, 0)), mode="edge")
@@ -416,7 +429,7 @@ def _make_piece(
     return Piece(
         name=name,
         picture=levels,
-        pixel_size_mm=fine_size,
+        pixel_size_mm=(fine_width, fine_height),
         bleed=(bleed_columns, bleed_rows),
         cut_mask=mask,
     )

@@ -151,7 +151,8 @@ def with_settings_signature(config: type[Config]) -> Callable[[Function], Functi
         setting_lines = []
         for setting in settings(config):
             name = setting.field.removesuffix("_")  # the field of `set` is `set_`
-            if name in declared_signature.parameters or setting.required:
+            is_declared = name in declared_signature.parameters
+            if is_declared or setting.required:
                 continue
             parameters.append(_make_parameter(config, setting, name))
             line = f"{name}: {setting.text}"
@@ -198,12 +199,10 @@ def _wrap_call(function: Function, signature: _Signature) -> Function:
     def wrapper(*args: Any, **keywords: Any) -> Any:
         _check_call(function.__name__, signature, args, keywords)
         # Values that are nested too deeply are not converted: the settings reject them.
-        plain_keywords = {
-            key: value
-            if key in UNCONVERTED_ARGUMENTS or not is_shallow(value)
-            else to_python(value)
-            for key, value in keywords.items()
-        }
+        plain_keywords = {}
+        for key, value in keywords.items():
+            is_converted = key not in UNCONVERTED_ARGUMENTS and is_shallow(value)
+            plain_keywords[key] = to_python(value) if is_converted else value
         with ExitStack() as stack:
             stack.enter_context(hold_process_lock())
             if "progress" in declared_parameters:
@@ -316,8 +315,8 @@ def make_hint(field: str, kind: Any) -> str:
     # Leave out constraints: "Annotated[int, FieldInfo(..., metadata=[Ge(ge=1)])]"
     # becomes "int".
     text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)
-    # The label of a recipe may also be a mapping from objects to labels, which the hint
-    # in `PYTHON_HINTS` does not allow.
+    # In a recipe, the setting `label` may also be a mapping from objects to labels. The
+    # hint in `PYTHON_HINTS` does not allow it.
     may_be_mapping = field == "label" and "dict" in text
     if field in PYTHON_HINTS and not may_be_mapping:
         return PYTHON_HINTS[field]
@@ -354,10 +353,9 @@ def _make_docstring(
         setting_lines: a line for each setting.
     """
     summary, _, argument_text = inspect.cleandoc(text).partition("\n\nArgs:\n")
-    # Some docstrings have this sentence already, with details of their own.
-    mentions_settings = "other arguments are the settings of" in " ".join(
-        summary.split()
-    )
+    # Some docstrings have the sentence below already, with details of their own.
+    summary_on_one_line = " ".join(summary.split())
+    mentions_settings = "other arguments are the settings of" in summary_on_one_line
     if not mentions_settings:
         summary += (
             "\n\nAll other arguments are the settings of `advsearch "
@@ -383,8 +381,8 @@ def make_config(config: type[ConfigType], **keywords: Any) -> ConfigType:
 
     A scene, a model and controls may be Python objects. Since a configuration is stored
     in a file, its settings have the names of these objects. The objects themselves are
-    attached to it (`Config.get_python_object`), with a list of those that only this Python
-    session has, and that no file can name.
+    attached to it (`Config.get_python_object`), with a list of those that only this
+    Python session has, and that no file can name.
 
     Args:
         config: class of the configuration.

@@ -53,16 +53,21 @@ def check_names(values: Mapping[str, Any]) -> None:
     """
     _check_scene(values)
     _check_controls(values)
-    for setting, group in (("policy", "policies"), ("task", "tasks")):
-        value = values.get(setting) or ""
-        name = str(value.get("name", "") if isinstance(value, Mapping) else value)
-        names = name.split("+") if setting == "task" else [name]
-        _check_entries(setting, names, group)
+    _check_entries("policy", [_get_name(values.get("policy"))], "policies")
+    # several tasks are joined with +
+    _check_entries("task", _get_name(values.get("task")).split("+"), "tasks")
     _check_models(values)
     _check_labels(values)
     _check_runs(values)
     if values.get("suite"):
         _check_suite(values["suite"])
+
+
+def _get_name(value: Any) -> str:
+    """Return the name in a setting that is a name or a mapping; "" if it has none."""
+    if isinstance(value, Mapping):
+        return str(value.get("name", ""))
+    return str(value or "")
 
 
 def _check_models(values: Mapping[str, Any]) -> None:
@@ -98,7 +103,8 @@ def _check_labels(values: Mapping[str, Any]) -> None:
 
 def _check_runs(values: Mapping[str, Any]) -> None:
     """Check that the runs exist that are to be compared."""
-    compares_models = bool(values.get("object"))  # then the settings name models
+    # With an object, models are compared on new images, and the settings name models.
+    compares_models = bool(values.get("object"))
     for setting in ("sweeps", "compared"):
         if values.get(setting) and not compares_models:
             for run in split_names(values[setting]):
@@ -160,8 +166,8 @@ def _check_judge(judge: str, things: Iterable[str], objects: Iterable[str]) -> N
     """
     names = []
     for thing, object_name in zip(things, objects, strict=True):
-        match = re.search(r"name=([^,]+)", thing)
-        names.append(match[1].strip() if match else object_name)
+        name_option = re.search(r"name=([^,]+)", thing)
+        names.append(name_option[1].strip() if name_option else object_name)
     judge_without_number = re.sub(r"-\d+$", "", judge)
     if judge_without_number not in (*names, "object", "all"):
         raise UnknownNameError(
@@ -187,8 +193,9 @@ def _check_controls(values: Mapping[str, Any]) -> None:
         kind = str((options or {}).get("kind") or name)
         is_class = re.search(r":[A-Z]", kind)  # "package.module:Class"
         if not is_class:
-            # "light" of "light:Key", and "pose" of "pose.yaw"
-            names.append(re.split(r"[:.]", kind)[0])
+            # "light" of "light:key", and "pose" of "pose.yaw"
+            name_of_control = re.split(r"[:.]", kind)[0]
+            names.append(name_of_control)
     built_in_controls = list_built_ins("control")
     # The name of a parameter passes here: later the registry reports it in a message
     # that also names the control with this parameter.
@@ -208,16 +215,18 @@ def _check_suite(suite: str) -> None:
     """
     if Path(suite).exists():
         return
+    # YAML files in the stated folder, and in the folder with our suites
     files = [
         file
         for folder in {Path(suite).parent, Path("suites")}
         for file in sorted(folder.glob("*.y*ml"))
     ]
-    similar = find_similar_names(Path(suite).stem, [file.stem for file in files])
+    similar_names = find_similar_names(Path(suite).stem, [file.stem for file in files])
     hint = ""
-    if similar:
-        best = next(file for file in files if file.stem == similar[0])
-        hint = f"; did you mean {best}?"
+    if similar_names:
+        best_name = similar_names[0]
+        best_file = next(file for file in files if file.stem == best_name)
+        hint = f"; did you mean {best_file}?"
     raise InputError(f"suite: there is no file {suite}{hint}")
 
 
@@ -236,7 +245,7 @@ def _check_entries(kind: str, names: Iterable[str], group: str) -> None:
         UnknownNameError: a name is unknown.
     """
     words = [name for name in names if _is_word(name)]
-    if not words:  # then no other packages are looked for
+    if not words:  # so that entry points are not listed without need
         return
     installed = entry_points(group=f"advsearch.{group}")
     known = [*list_built_ins(kind), *(point.name for point in installed)]

@@ -92,9 +92,8 @@ def _load_attack(summary: AttackSummary, path: Path) -> AttackResult:
         summary: stored result of the attack.
         path: folder of the run.
     """
-    clean, adversarial = (
-        read_png(path / IMAGES / f"{name}.png") for name in ("clean", "adversarial")
-    )
+    clean = read_png(path / IMAGES / "clean.png")
+    adversarial = read_png(path / IMAGES / "adversarial.png")
     artifacts = dict[str, Tensor]()
     for file in sorted((path / ARTIFACTS).glob("*.exr")):
         planes, _ = read_exr(file, read_bytes(file, "a picture of a run", LARGEST_FILE))
@@ -205,7 +204,7 @@ def render_picture_file(
     warnings = [*rendering.warnings, *model_warnings]
     for text in warnings:
         progress.message(text)
-    if aovs:
+    if aovs:  # layers of ground truth per pixel
         rendering.save_aov(out, aovs)
     image_size = rendering.save(out)
     prediction_path = rendering.save_predictions(out)

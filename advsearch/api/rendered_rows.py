@@ -154,7 +154,7 @@ def _render_sweep(
     scenes = load_scenes_of_sweep(config.model_copy(update={"metrics": {}}))
     job = scenes.job
     rows_of_image = _read_sweep_rows(folder, len(job.models))
-    # An image without a judgement (`correct` is None) is rendered, too.
+    # An image that was not judged (`correct` is None) counts as wrong.
     images = sorted(
         image
         for image, rows in rows_of_image.items()
@@ -190,11 +190,12 @@ def _render_sweep_image(
     query = queries[0]  # all models get the same image
     scene = job.scenes[loaded_scene.number]
     picture = loaded_scene.render_image(query)
-    # the steps of an image are in the order of the models
-    correct_of_first_model = [
-        row.correct for row in rows if row.step % len(job.models) == 0
-    ]
-    stored = correct_of_first_model[0] if correct_of_first_model else None
+    # whether the first model was right in the run; None if that is not stored
+    was_right = next(
+        # the steps of an image are in the order of the models
+        (row.correct for row in rows if row.step % len(job.models) == 0),
+        None,
+    )
     problem_of_first_model = loaded_scene.problems[0]
     is_right = problem_of_first_model.judge(picture, query.u).right
     return RenderedRow(
@@ -206,8 +207,7 @@ def _render_sweep_image(
         u=query.u,
         rows=rows,
         values=rows[0].values,
-        # without a stored row nothing contradicts it
-        is_reproduced=stored in (None, is_right),
+        is_reproduced=was_right in (None, is_right),
     )
 
 
@@ -248,12 +248,15 @@ def _render_attack(
     rows = list[Row]()
     for kind in configuration_of_kind:
         trials = _read_trials(folder, kind, every)
-        rows += trials if problem.conditions else trials[:1]
+        if not problem.conditions:
+            trials = trials[:1]  # they differ in noise only
+        rows += trials
     progress.stage("rendering pictures", len(rows))
     for row in rows:
         u = configuration_of_kind[row.kind]
         seed = max(0, row.seed or 0)  # a row may lack its seed
-        picture = problem.picture(u, seed, row.spp or problem.search_spp)
+        spp = row.spp or problem.search_spp  # a row may lack it, too
+        picture = problem.picture(u, seed, spp)
         # `u` followed by the conditions that the seed samples
         full_u = problem.make_full_configuration(u, seed)
         is_right = problem.judge(picture, full_u).right

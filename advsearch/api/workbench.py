@@ -4,11 +4,11 @@ attacks, and workers.
     from advsearch.extend import workbench
 
     # Load what the settings of an attack name.
-    parts = workbench.parts_of(config)
+    parts = workbench.load_parts(config)
     # Renders and judges a configuration.
-    problem = workbench.problem_on(parts, differentiated=False)
+    problem = workbench.make_problem(parts, differentiated=False)
     # Stores each evaluation, and reads it back.
-    journal = workbench.Journal(run, workbench.Shared(problem))
+    journal = workbench.Journal(run, workbench.ParallelEvaluator(problem))
     query = workbench.Query(u, seed, "trial", 0, spp=16)
     (evaluation,) = journal.evaluate_all([query])
 

@@ -87,10 +87,11 @@ def completion(args: argparse.Namespace) -> int:
             if names and flag not in NAME_OR_FILE_FLAGS:
                 action.choices = names
                 continue
-            completer: dict[str, Any] = shtab.FILE
+            completer: dict[str, Any] = shtab.FILE  # completes names of files
             if names:
                 completer = _complete_name_or_file(flag, names)
-            action.complete = completer  # type: ignore[attr-defined]  # where shtab looks for it
+            # shtab reads this attribute
+            action.complete = completer  # type: ignore[attr-defined]
     script = shtab.complete(parser, shell=args.shell)
     return output.print_answer(
         args.json,

@@ -76,7 +76,7 @@ def dashboard(args: argparse.Namespace) -> int:
     """
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
-    # corrupt runs are allowed: the page with the list has an error for each
+    # Corrupt runs are allowed: the list of runs states the fault of each.
     runs = [find_run(name, checked=False) for name in args.runs]
     # PHOTOGRAPH_PAGES is "module:function"; an installation may lack the module
     has_photographs = is_module_installed(PHOTOGRAPH_PAGES.partition(":")[0])
@@ -101,11 +101,9 @@ def dashboard(args: argparse.Namespace) -> int:
         )
     if server.token:  # others in the network can reach it
         print(PRIVACY_NOTE, file=sys.stderr)
-        print(
-            format_qr_code(server.address)
-            or f"For a code to point a phone at: {NO_QR}",
-            file=sys.stderr,
-        )
+        qr_code = format_qr_code(server.address)
+        advice = f"For a code to point a phone at: {NO_QR}"
+        print(qr_code or advice, file=sys.stderr)
     print("Ctrl-C ends it.", file=sys.stderr)
     try:
         server.serve_forever()

@@ -42,8 +42,8 @@ COLOURS = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
 GIB = 2**30
 # With less, there is a warning. The disk holds the images of runs and the kernel cache.
 # A search needs up to 2.5 GiB of memory, and other programs run as well.
-DISK_WANTED = 1 * GIB
-MEMORY_WANTED = 3 * GIB
+MIN_FREE_DISK = 1 * GIB
+MIN_MEMORY = 3 * GIB
 
 SECONDS_ALLOWED = 300  # maximum run time of the probe
 OPTIONAL = {"pyarrow": "advsearch export does not write Parquet"}
@@ -257,7 +257,7 @@ def check_packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         elif name not in tried:
             # The process of the trials crashed before or at this one, usually because
             # libLLVM is too old.
-            _, process_ending = tried[PROBE_PROCESS]
+            _ended_well, process_ending = tried[PROBE_PROCESS]
             detail = f"not reached: {process_ending}"
             yield Component(name, version, BROKEN, detail, "see libLLVM below")
         else:
@@ -295,10 +295,10 @@ def check_other_packages(requirements: Sequence[str] | None = None) -> Component
     if requirements is None:
         requirements = metadata.requires("advsearch") or []
     names = {
-        # the name: all before a version or a condition
+        # "rich>=13" and 'tomli; python_version < "3.11"' begin with the name
         re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
         for requirement in requirements
-        if "extra ==" not in requirement  # not of an optional extra
+        if "extra ==" not in requirement  # the package belongs to no optional extra
     }
     untried_names = sorted(
         names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES},
@@ -355,8 +355,9 @@ def check_llvm() -> Component:
             )
         status = BROKEN if libraries or library_setting else MISSING
         return Component("libLLVM", "", status, str(error), fix)
+    # the text of a library has the reason for which it is refused
     refused = [str(library) for library in libraries if library.refusal]
-    usable = [
+    other_usable = [
         str(library)
         for library in libraries
         if not library.refusal and library.path != chosen.path.resolve()
@@ -364,8 +365,8 @@ def check_llvm() -> Component:
     detail = f"chosen: {chosen.path}"
     if library_setting:
         detail += f", named by {llvm.ENVIRONMENT_VARIABLE}"
-    if usable:
-        detail += f"; also usable: {', '.join(usable)}"
+    if other_usable:
+        detail += f"; also usable: {', '.join(other_usable)}"
     if refused:
         detail += f"; refused: {', '.join(refused)}"
     return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
@@ -432,7 +433,7 @@ def check_kernel_cache(folder: Path) -> Component:
 def check_disk(folder: Path) -> Component:
     """Check the space that is left where runs are written by default."""
     free = shutil.disk_usage(folder).free
-    if free < DISK_WANTED:
+    if free < MIN_FREE_DISK:
         fix = "free some space, or --run elsewhere"
         return Component(
             "disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", fix
@@ -450,7 +451,7 @@ def check_hardware() -> Component:
     detail = f"{platform.system()} {platform.machine()}, {cores_text}"
     if memory:
         detail += f", {memory / GIB:.1f} GiB of memory"
-    if memory and memory < MEMORY_WANTED:
+    if memory and memory < MIN_MEMORY:
         return Component(
             "machine",
             "",

@@ -54,7 +54,9 @@ def probe_renderer() -> str:
     dr.backward(dr.mean(image, axis=None))
     brightness = float(image.numpy().mean())
     slope = float(dr.sum(dr.grad(parameters[key])).numpy().sum())
-    if not (abs(brightness - 0.5) < NOISE and abs(slope - 1.0) < 2 * NOISE):
+    is_brightness_right = abs(brightness - 0.5) < NOISE
+    is_slope_right = abs(slope - 1.0) < 2 * NOISE
+    if not (is_brightness_right and is_slope_right):
         raise ArithmeticError(
             f"expected brightness 0.5 and slope 1, got {brightness:.4f} and {slope:.4f}"
         )

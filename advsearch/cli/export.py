@@ -34,6 +34,7 @@ def _add_format(parser: argparse.ArgumentParser) -> None:
 
 
 def _begin_lower(sentence: str) -> str:
+    """Return a sentence as a clause: with a small first letter, and without a period."""
     return f"{sentence[:1].lower()}{sentence[1:].rstrip('.')}"
 
 
@@ -99,7 +100,8 @@ def export(args: argparse.Namespace) -> int:
     format = _choose_format(args, file_suffix, usable)
     _reject_other_options(args, format, usable)
     # If the suffix of the file is that of no format, a table is written.
-    if format in FORMATS or format not in EXPORTERS:
+    is_table = format in FORMATS or format not in EXPORTERS
+    if is_table:
         return _write_table(args, out, file_suffix)
     exporter = EXPORTERS[format]()
     if out is None:  # all but tables are files or folders, which nothing can print
@@ -208,9 +210,9 @@ def _write_table(args: argparse.Namespace, out: Path | None, file_suffix: str) -
         print(buffer.getvalue().decode("utf-8", "replace"), end="")
     if out is None:
         return output.OK
-    text = f"{count} rows in {out}" + (
-        "" if file_suffix == format else f", as {format}"
-    )
+    text = f"{count} rows in {out}"
+    if file_suffix != format:
+        text += f", as {format}"
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
     return output.print_answer(args.json, facts, text, sys.stderr)
 

@@ -63,7 +63,7 @@ def add_settings(
         add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
             # --scene is a flag but no setting: with it, the values of --object are
-            # names in the scene file. In the help it stands before --object.
+            # names in the scene file. The help lists it before --object.
             add("--scene", metavar="FILE", help=SCENE_HELP)
         options: dict[str, Any] = {
             "action": "append" if setting.repeats else "store",
@@ -188,8 +188,8 @@ def format_as_flags(message: str) -> str:
             return flags[name]
         return f"{flags[name]} {value}"
 
-    # A pattern for any known setting. One name may begin with another, since in each
-    # use something has to follow the name: "=", a backtick or ": ".
+    # A pattern for any known setting. If one name begins with another, both still match
+    # correctly: in each use "=", a backtick or ": " has to follow the name.
     names = f"(?P<name>{'|'.join(flags)})"
     # in backticks, perhaps with a value
     message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", write_flag, message)
@@ -202,8 +202,8 @@ def format_as_flags(message: str) -> str:
 
 
 def format_help(setting: Setting) -> str:
-    """Return the help text of a setting; for a switch, the text of what its flag does."""
+    """Return the help text of a setting; for a switch, what its flag does."""
     text = setting.text
     if setting.is_switch:
         text = setting.switched or setting.description
-    return text.replace("%", "%%")  # argparse takes a single one for a field
+    return text.replace("%", "%%")  # for argparse, "%" begins a field

@@ -166,7 +166,9 @@ def _list_motions(rig: Any) -> tuple[list[str], list[str], list[str]]:
 
 
 def _explain_slow_features(mesh_object: Any) -> list[str]:
-    """Return a sentence about features that make gradients slow; none without them."""
+    """Return a sentence about features that make gradients slow, in a list; an empty
+    list without such features.
+    """
     features = {
         "what it lets light through": mesh_object.opacity,
         "its normal map": mesh_object.normal_map,
@@ -176,10 +178,9 @@ def _explain_slow_features(mesh_object: Any) -> list[str]:
     if not names:
         return []
     return [
-        f"slow: for {join_alternatives(names, 'and')}, controls that move outlines (pose, camera, "
-        "geometry) are differentiated by "
-        "differences, which takes several renders a step; textures and light are not "
-        "slower"
+        f"slow: for {join_alternatives(names, 'and')}, controls that move outlines "
+        "(pose, camera, geometry) are differentiated by differences, which takes "
+        "several renders a step; textures and light are not slower"
     ]
 
 
@@ -246,6 +247,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     unchanged_shapes = dict(contents.unchanged)
     names_by_kind = {
         "objects": list(contents.objects),
+        # for the text; for JSON it is a mapping, see below
         "kept": [f"{name} ({reason})" for name, reason in unchanged_shapes.items()],
         "lights": list(contents.lights),
         "cameras": list(contents.cameras),
@@ -259,7 +261,7 @@ def _describe_mitsuba_file(file: str, out: Path | None) -> Understood:
     lines += [f"Note: {warning}" for warning in warnings]
     facts = {
         **names_by_kind,
-        "kept": unchanged_shapes,  # for JSON as a mapping from shape to reason
+        "kept": unchanged_shapes,  # from shape to reason
         "warnings": list(warnings),
     }
     return facts, lines
@@ -289,7 +291,6 @@ def threedb(args: argparse.Namespace) -> int:
     if args.json:
         output.print_json(read_result(path).to_dict())
     else:
-        print(
-            f"{path}: {read_result(path).outcome_summary}; {path / 'report.html'} shows it"
-        )
+        outcome = read_result(path).outcome_summary
+        print(f"{path}: {outcome}; {path / 'report.html'} shows it")
     return 0

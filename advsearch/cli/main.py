@@ -81,8 +81,8 @@ class PlainCommand:
     examples: tuple[str, ...] = ()  # command lines for the help, without `advsearch`
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        for add in self.arguments:
-            add(parser)
+        for add_to in self.arguments:
+            add_to(parser)
 
 
 def command(
@@ -163,7 +163,7 @@ class ExperimentCommand:
                 f"{command}: expected {self.experiment.positional.expected}; see "
                 f"{command} --help"
             )
-        # several words on the command line are one setting, with commas
+        # A repeatable subject is a list of words. As a setting it is one text with commas.
         if isinstance(subject, list):
             setattr(args, subject_setting, ",".join(subject))
         return self.run_config(
@@ -205,7 +205,8 @@ class ExperimentCommand:
             run_name = getattr(args, subject_setting)
             positional = self.experiment.positional
             if positional and positional.is_repeatable:
-                # the first run; an empty text is passed on, to be rejected as a name
+                # the first of several runs; a text without any name is left as it is,
+                # and rejected by `find_run`
                 run_name = next(iter(split_names(run_name)), run_name)
             defaults = read_defaults(find_run(run_name) / CONFIG, vars(args))
             return make_config(args, config_type, **defaults)
@@ -387,8 +388,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             streams and the handling of Ctrl-C are set up, too, since the process does
             nothing else.
     """
-    owns_process = argv is None
-    if owns_process:
+    if argv is None:
         open_descriptors()
     with escape_output(), restrict_allowed_code():
         if argv is None:
@@ -397,7 +397,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             # runs then knows no handler of ours.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         else:
-            status = _status(list(argv))
+            status = _run_to_status(list(argv))
         end_output()
     return status
 
@@ -417,15 +417,15 @@ def _run_interruptibly(words: list[str]) -> int:
         # the process, by a thread of its own, even while native code runs.
         signal.signal(signal.SIGINT, INTERRUPTS)
         end_process_at_second_interrupt()
-        status = _status(words)
+        status = _run_to_status(words)
         INTERRUPTS.is_work_done = True
         return status
-    except KeyboardInterrupt:  # another one, while `_status` handled the first
+    except KeyboardInterrupt:  # a second one, while the first was being reported
         INTERRUPTS.is_work_done = True
         return INTERRUPTED
 
 
-def _status(words: list[str]) -> int:
+def _run_to_status(words: list[str]) -> int:
     """Run a command and return its exit status.
 
     If there was an interrupt, the status is `INTERRUPTED`, even if the command ended
@@ -600,14 +600,16 @@ def add_command(
     command = get_command(name)
     text = get_command_help(name)
     examples = "".join(f"  advsearch {line}\n" for line in command.examples)
+    # the examples keep their line breaks
+    formatter: type[argparse.HelpFormatter] = argparse.HelpFormatter
+    if examples:
+        formatter = argparse.RawDescriptionHelpFormatter
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,
         help=text,
         description=f"{text[0].upper()}{text[1:]}{command.more}.",
         epilog=f"examples:\n{examples}" if examples else None,
-        formatter_class=argparse.RawDescriptionHelpFormatter
-        if examples
-        else argparse.HelpFormatter,
+        formatter_class=formatter,
         allow_abbrev=False,
     )
     command.add_arguments(parser)
@@ -640,26 +642,29 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
         return InputError(
             f"expected flags, got {argument!r}{hint}; see {parser.prog} --help"
         )
-    owners = [
-        owner
-        for owner, config in CONFIGS.items()
+    commands_with_flag = [
+        command
+        for command, config in CONFIGS.items()
         if name in (setting.flag for setting in settings(config))
     ]
-    if owners:
+    if commands_with_flag:
         return InputError(
             f"{parser.prog} has no {name}, a flag of advsearch "
-            f"{', '.join(owners)}; leave it out"
+            f"{', '.join(commands_with_flag)}; leave it out"
         )
-    meant, reason = suggest_keyword(
-        name[2:].replace("-", "_"), [flag[2:] for flag in known]
+    # the flag for what other libraries call by this name, or why there is none
+    keyword = name.removeprefix("--").replace("-", "_")
+    suggestions, reason = suggest_keyword(
+        keyword, [flag.removeprefix("--") for flag in known]
     )
     text = f"{parser.prog} has no {name}"
-    if meant:
-        text += f"; did you mean {' or '.join(f'--{flag}' for flag in meant)}?"
+    if suggestions:
+        text += f"; did you mean {' or '.join(f'--{flag}' for flag in suggestions)}?"
     if reason:
         text += f" ({reason})"
-    if meant or reason:
+    if suggestions or reason:
         return InputError(text)
+    # a flag with a similar spelling is suggested
     return UnknownNameError("flag", name, set(known))
 
 

@@ -116,17 +116,17 @@ def escape_output() -> Iterator[None]:
 
 
 def get_raw_stream(stream: IO[str]) -> IO[str]:
-    """Return the stream behind a `Screen`, for what draws on a terminal and escapes
-    names itself.
+    """Return the stream behind a `Screen`, for code that draws on a terminal, and that
+    escapes names itself.
     """
     return stream.stream if isinstance(stream, Screen) else stream
 
 
 def open_descriptors() -> None:
-    """Point standard streams that are closed at nothing.
+    """Open standard streams that are closed, so that they lead to nothing.
 
-    Else the next file that is opened would get the number of one of them, and be
-    written to by `print`.
+    Otherwise the next file that is opened would get the descriptor of one of them, and
+    `print` would write to it.
     """
     for descriptor in (0, 1, 2):
         try:
@@ -169,7 +169,7 @@ def add_json_flag(parser: argparse.ArgumentParser) -> None:
 
 
 def add_code_flag(parser: argparse.ArgumentParser) -> None:
-    """Add ``--code``, for commands that carry out the settings of a file."""
+    """Add ``--code``, for commands that follow the settings of a file."""
     text = (
         "Python code that a file or a run names and that may be imported, as it "
         "stands there; may be repeated"
@@ -198,7 +198,7 @@ def print_answer(
     """Print the answer of a command, and return the exit status of success.
 
     Args:
-        as_json: print the facts as JSON on standard output, else the text.
+        as_json: print `json_fields` as JSON on standard output; otherwise the text.
         json_fields: the answer for programs.
         text: the answer for people.
         stream: stream for the text; None is standard output.
@@ -235,8 +235,8 @@ def print_result(result: Result, *, as_json: bool) -> int:
         print_json(result)
     else:
         print(format_result(result) + explain_resume(result))
-    stopped = getattr(result, "ending", None) == "interrupted"
-    return INTERRUPTED if stopped else OK
+    was_interrupted = getattr(result, "ending", None) == "interrupted"
+    return INTERRUPTED if was_interrupted else OK
 
 
 def explain_resume(result: Result) -> str:
@@ -297,7 +297,7 @@ def redirect_output() -> Iterator[None]:
     """
     sys.stdout.flush()
     stdout_descriptor: int | None = None
-    with suppress(OSError):  # where one of them is closed
+    with suppress(OSError):  # a descriptor may be closed
         stdout_descriptor = os.dup(1)
         # native libraries write to descriptor 1
         os.dup2(2, 1)
@@ -343,9 +343,10 @@ def _format_part(part: ResultPart) -> str:
     # late, so that --help answers at once
     from advsearch.cli.flags import format_as_flags
 
-    table = align_columns(
-        [part.column_heads, *part.rows] if part.column_heads else part.rows
-    )
+    rows = list(part.rows)
+    if part.column_heads:
+        rows.insert(0, part.column_heads)
+    table = align_columns(rows)
     picture_rows = [
         [picture.file, picture.caption] for group in part.pictures for picture in group
     ]

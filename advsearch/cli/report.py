@@ -18,7 +18,7 @@ from advsearch.extend import InputError
 NAME = "evidence"
 # The file with the camera poses of photographs, and its maximum size in bytes.
 POSES = "poses.csv"
-LARGEST_POSES = 1 << 20
+MAX_POSES_BYTES = 1 << 20
 
 
 @command(
@@ -172,15 +172,14 @@ def _add_photographs(folder: str, name: str) -> None:
         name: name of the run.
 
     Raises:
-        InputError: there are none, or one does not name its rendering.
+        InputError: there are no photographs, or the rendering of one is not stated.
     """
-    from advsearch.extend import directory, settings, workbench  # the last brings torch
+    from advsearch.extend import directory, settings, workbench  # imports torch
 
     run = directory.find_run(name)
-    # the task decides which files can be photographs
-    task: Any = (
-        settings.read_yaml(run / directory.CONFIG).get("task") or "classification"
-    )
+    # the task determines which files can be photographs
+    run_settings = settings.read_yaml(run / directory.CONFIG)
+    task: Any = run_settings.get("task") or "classification"
     with tempfile.TemporaryDirectory() as temporary_folder:
         photograph_folder = Path(folder)
         if (photograph_folder / POSES).is_file():
@@ -239,11 +238,12 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     from advsearch.extend import Store, stored_files
 
     with Store.open_to_read(run) as store:
-        rows = [
+        # the number of each rendering, and its values by parameter
+        renderings = [
             (row.step, {name: value["value"] for name, value in row.values.items()})
             for row in store.rows("sweep")
         ]
-    table = stored_files.read_text(folder / POSES, "poses", LARGEST_POSES)
+    table = stored_files.read_text(folder / POSES, "poses", MAX_POSES_BYTES)
     # line 1 has the heads, so that poses begin on line 2
     for line, pose in enumerate(csv.DictReader(table.splitlines()), 2):
         location = f"photographs: {folder / POSES}, line {line}"
@@ -255,7 +255,7 @@ def _copy_named_by_pose(folder: Path, run: Path, out: Path) -> Path:
                 f"{location}: expected the name of a photograph in the same folder "
                 f"under `file`, got {file.name!r}"
             )
-        steps = [step for step, values in rows if _has_pose(values, pose)]
+        steps = [step for step, values in renderings if _has_pose(values, pose)]
         _check_single_rendering(steps, location, run, pose)
         shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")
     return out

@@ -45,6 +45,7 @@ from advsearch.viewer.pages import write_page
     output.add_quiet_flags,
 )
 def run(args: argparse.Namespace) -> int:
+    """Run the experiment that a YAML file describes, and return the exit status."""
     changes = parse_changes(args.change)
     if args.run is not None:
         changes["run"] = args.run
@@ -68,7 +69,8 @@ def parse_changes(words: Sequence[str]) -> dict[str, object]:
         InputError: a word is no such assignment.
     """
     changes = dict(parse_assignment(text, f"change {text!r}") for text in words)
-    # `allow_code_in_settings` expects settings in nested form: {"controls": {"pose": {"yaw": 3}}}
+    # `allow_code_in_settings` expects settings in nested form:
+    # {"controls": {"pose": {"yaw": 3}}}
     nested_changes = dict[str, object]()
     for name, value in changes.items():
         set_dotted(nested_changes, name, value)
@@ -88,8 +90,8 @@ def run_file(
         file: file with settings.
         changes: values by name that replace those of the file.
         args: has `json` and `quiet`.
-        resumed_directory: folder of the run to go on with, if the file is its own; None for a new
-            run.
+        resumed_directory: folder of the run to resume, if the file is its `run.yaml`;
+            None for a new run.
 
     Raises:
         UnknownNameError: there is no such command.
@@ -97,10 +99,10 @@ def run_file(
             as one that connects to other machines.
     """
     config = read_file_config(read_command(file), file, changes)
-    # `left_out` has the settings of the file that count only when a person types them,
-    # such as an address to connect to. The configuration lacks them. A new run would
-    # silently differ from the file, so it is an error. A run that is resumed was
-    # started with them; it goes on if they do not change its numbers.
+    # `omitted_settings` are settings of the file that count only if a person types
+    # them, such as an address to connect to. `config` has their defaults instead. A new
+    # run would silently differ from the file, so it is an error. A run that is resumed
+    # was started with them; it goes on if they do not change its numbers.
     for setting in config.omitted_settings:
         decides_numbers = setting.name not in config.changeable_settings
         if resumed_directory is None or decides_numbers:
@@ -114,8 +116,8 @@ def run_file(
                 f"{setting.advice}",
                 file=sys.stderr,
             )
-    command = main.ExperimentCommand(get_experiment(config.command))
-    return command.run_config(
+    experiment_command = main.ExperimentCommand(get_experiment(config.command))
+    return experiment_command.run_config(
         config, as_json=args.json, quiet=args.quiet, resumed_directory=resumed_directory
     )
 
@@ -157,8 +159,8 @@ def resume(args: argparse.Namespace) -> int:
             f"{path}: expected a run with its {CONFIG}, got none; start it again"
         )
     command = read_command(path / CONFIG)
-    # Two cases add something to a finished run: a sweep gets a map of the surface, and
-    # a recipe makes its figures again, with photographs that were taken since.
+    # Two commands can add something to a finished run: a sweep gets a map of the
+    # surface, and a recipe makes its figures again, with photographs taken since.
     adds_surface = changes.get("surface") is True and command == "sweep"
     adds_to_finished_run = command == "recipe" or adds_surface
     if is_finished(path) and not adds_to_finished_run:
@@ -178,7 +180,7 @@ def resume(args: argparse.Namespace) -> int:
     return run_file(path / CONFIG, changes, args, resumed_directory=path)
 
 
-MOST_NAMES = 4  # maximum number of controls of a run that the table names
+MAX_CONTROL_NAMES = 4  # maximum number of controls of a run that the table names
 
 
 @command(
@@ -204,9 +206,9 @@ def runs(args: argparse.Namespace) -> int:
     rows = [["run", "command", "object", "controls", "rows", "state", "result"]]
     for run in listed_runs:
         names = ",".join(run.controls)
-        n_omitted = len(run.controls) - MOST_NAMES
+        n_omitted = len(run.controls) - MAX_CONTROL_NAMES
         if n_omitted > 1:  # a single name is as short as "1 more"
-            names = f"{','.join(run.controls[:MOST_NAMES])} and {n_omitted} more"
+            names = f"{','.join(run.controls[:MAX_CONTROL_NAMES])} and {n_omitted} more"
         rows.append(
             [
                 run.name,

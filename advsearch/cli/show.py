@@ -225,8 +225,9 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
     """
     with open_answer_progress():
         registry = _registry(PLURALS[kind])  # takes seconds
-    # a control may be named as "module:name", code that a person typed and that may run
-    allow_code_in_settings({"controls": name} if kind == "control" else {})
+    # A control may be named as "module:name". This code may run, since a person typed it.
+    if kind == "control":
+        allow_code_in_settings({"controls": name})
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
     entry = registry[name]
@@ -299,13 +300,16 @@ def _describe_options(
 
 def _make_parameter_row(parameter: Parameter) -> dict[str, str]:
     """Return the row of a parameter in the table of its control, by column."""
-    count = " x ".join("any" if side is None else str(side) for side in parameter.shape)
+    unit = parameter.unit
+    if parameter.shape:  # such as "(any x 3)"; a single number has no shape
+        sides = ["any" if side is None else str(side) for side in parameter.shape]
+        unit += f" ({' x '.join(sides)})"
     allowed = ", ".join(parameter.options)
-    if not allowed:
+    if not allowed:  # a range of numbers
         allowed = f"{parameter.low:g} to {parameter.high:g}"
     return {
         "name": parameter.name,
-        "unit": parameter.unit + (f" ({count})" if count else ""),
+        "unit": unit,
         "allowed": allowed,
         "searched": _format_searched(parameter),
         "default": _format_cell(parameter.default),
@@ -384,7 +388,8 @@ def show_pictures(files: Sequence[Path]) -> None:
     if not files:
         print("\nThis run has no pictures.")
         return
-    draw, drawing_refusal = _find_drawing()
+    # the function that draws, or why there is none
+    draw, refusal = _find_drawing_function()
     print()
     for file in files:
         if draw is not None:
@@ -393,23 +398,23 @@ def show_pictures(files: Sequence[Path]) -> None:
             # whatever a terminal answers, the paths of the pictures are printed
             except Exception as error:
                 draw = None
-                drawing_refusal = (
+                refusal = (
                     f"The pictures could not be drawn here: {type(error).__name__}: "
                     f"{error}"
                 )
         print(f"  picture   {file}")
-    if drawing_refusal:
-        print(f"\n{drawing_refusal}")
+    if refusal:
+        print(f"\n{refusal}")
 
 
-def _find_drawing() -> tuple[Callable[[Path], None] | None, str]:
+def _find_drawing_function() -> tuple[Callable[[Path], None] | None, str]:
     """Find the function that draws a picture in this terminal.
 
     Returns:
-        The function of a picture's path, None if nothing can be drawn; and a sentence
-        with the reason, which is empty otherwise.
+        The function, which takes the path of a picture; None if nothing can be drawn.
+        And a sentence with the reason, which may be empty.
     """
-    if not sys.stdout.isatty():
+    if not sys.stdout.isatty():  # nobody expects pictures in a file
         return None, ""
     try:
         from textual_image import renderable  # asks the terminal when it is imported
@@ -460,9 +465,7 @@ MODELS = {
 
 
 def list_names(kind: str) -> dict[str, str]:
-    """Return the names of one kind, each with a line about it, which is empty where
-    nothing is known.
-    """
+    """Return the names of one kind, each with a line of help, which may be empty."""
     entries = _registry(kind)
     if isinstance(entries, Registry):
         return {name: entries.get_help(name) for name in entries}
@@ -531,7 +534,8 @@ def labels(args: argparse.Namespace) -> int:
     """Print index and name of the classes that are like a word, the most similar first.
 
     Raises:
-        InputError: no class is like the word, or the model has no names for its classes.
+        InputError: no class is like the word, or the classes of the model have no
+            names.
     """
     with open_answer_progress():
         names = _load_labels(args)

@@ -91,7 +91,7 @@ class WorkerStats:
 
     @property
     def progress_counts(self) -> dict[str, float | str]:
-        """Counts to show next to a progress bar."""
+        """Counts to display next to a progress bar."""
         counts: dict[str, float | str] = {"workers": self.workers}
         if self.lost:
             counts["lost"] = self.lost
@@ -128,7 +128,7 @@ class InProcess:
         self._call = call
 
     def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
-        """Compute batches in order; see `Workers.results`."""
+        """Compute batches in order; see `Workers.compute`."""
         for items in batches:
             yield BatchResult(items, self._call(items))
 

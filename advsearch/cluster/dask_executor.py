@@ -158,7 +158,7 @@ class DaskExecutor(WorkerExecutor):
         self._client: Any = None
         self._cluster: Any = None
         self._connection: Any = None
-        # ends when the files were sent; None before that is begun
+        # the sending of the files; None before it begins
         self._sending: asyncio.Future[Any] | None = None
         self._calls: set[Future[Any]] = set()
         # addresses of workers that get calls
@@ -189,7 +189,7 @@ class DaskExecutor(WorkerExecutor):
         import dask
         import distributed
 
-        untyped: Any = distributed
+        untyped: Any = distributed  # the package has no types
         security = None
         if self._site.security:
             security = untyped.Security(**self._site.security)
@@ -201,8 +201,8 @@ class DaskExecutor(WorkerExecutor):
             try:
                 self._client = self._connect(security, deadline)
                 break
-            # Dask raises these if nothing answers at the address, or something else
-            # does
+            # Dask raises these if nothing answers at the address, or if something other
+            # than a scheduler answers.
             except (
                 OSError,
                 TimeoutError,
@@ -282,7 +282,7 @@ class DaskExecutor(WorkerExecutor):
         was_long_ago = now - self._counted_at > LESS_PATIENCE
         if self._usable_addresses or was_long_ago:
             self._alone_since = now
-        self._check_hope(now)
+        self._check_waiting_time(now)
         self._counted_at = time.monotonic()
         return len(self._usable_addresses)
 
@@ -294,6 +294,7 @@ class DaskExecutor(WorkerExecutor):
         reason is stored.
         """
         client = self._client
+        # the keys: `ncores` returns the number of cores of each worker by its address
         connected = frozenset(
             client.sync(client.scheduler.ncores, callback_timeout=RESPONSE_SECONDS)
         )
@@ -310,11 +311,11 @@ class DaskExecutor(WorkerExecutor):
             versions = client.sync(
                 self._versions, sorted(new), callback_timeout=RESPONSE_SECONDS
             )
-        for address, its_version in versions.items():
-            if its_version == compute_version():
+        for address, version in versions.items():
+            if version == compute_version():
                 fit |= {address}
             else:
-                self._refuse_version(address, its_version)
+                self._refuse_version(address, version)
         # A call that ran during these queries may have refused a worker that was fit.
         self._usable_addresses = fit - set(self._refusal_by_address)
 
@@ -357,7 +358,7 @@ class DaskExecutor(WorkerExecutor):
             self.stats.refused += 1
             self._tell(f"{address} is given nothing: {reason}")
 
-    def _check_hope(self, now: float) -> None:
+    def _check_waiting_time(self, now: float) -> None:
         """Raise ClusterError if there has been no fit worker for too long.
 
         The wait is shorter if workers are connected and were refused, since these will
@@ -420,7 +421,7 @@ class DaskExecutor(WorkerExecutor):
             args: its positional arguments.
 
         Raises:
-            WorkerDiedError: too many workers died of it.
+            WorkerDiedError: too many workers died during the call.
             ClusterError: workers cannot even begin it.
             BrokenExecutor: the connection to the scheduler is gone.
         """
@@ -561,10 +562,10 @@ class DaskExecutor(WorkerExecutor):
                     self._forget_files, client, callback_timeout=RESPONSE_SECONDS
                 )
         self._client = self._cluster = None
-        for opened in (client, cluster):
-            if opened is not None:
-                with suppress(Exception):  # its other end may have gone
-                    opened.close(timeout=RESPONSE_SECONDS)
+        for connection in (client, cluster):
+            if connection is not None:
+                with suppress(Exception):  # the other end may have gone
+                    connection.close(timeout=RESPONSE_SECONDS)
 
 
 ADDRESS_SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
@@ -592,7 +593,7 @@ def open_dask(
 ) -> tuple[DaskExecutor, WorkerTask]:
     """Return an executor on a cluster, and the task with the digests of its files.
 
-    By the digests a worker checks that it has the same files.
+    A worker compares the digests to check that it has the same files.
 
     Args:
         task: function and settings that the workers load.

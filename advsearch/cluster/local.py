@@ -85,12 +85,13 @@ class WorkerProcess:
             raise WorkerDiedError from error
 
     def kill(self) -> None:
-        """End it; who waits for its answer hears that it died."""
+        """End the process; a `call` that waits for its result raises WorkerDiedError."""
         with suppress(OSError):
             self._popen.kill()
 
     def close(self) -> None:
-        """End it and release its pipes, which may have no reader."""
+        """End the process, and close its pipes."""
+        # An OSError of closing a pipe is ignored: the process may have died before.
         with suppress(OSError), self._popen:
             self._popen.kill()
 
@@ -145,7 +146,7 @@ class LocalExecutor(WorkerExecutor):
         in another one.
 
         Raises:
-            WorkerDiedError: `MAX_DEATHS` processes died of it.
+            WorkerDiedError: `MAX_DEATHS` processes died during the call.
         """
         for _ in range(MAX_DEATHS):
             process = self._take_process()
@@ -154,7 +155,7 @@ class LocalExecutor(WorkerExecutor):
             except WorkerDiedError:
                 self._count_death(process)  # removes it from the busy ones
                 continue
-            with self._lock:
+            with self._lock:  # the next call may use the process
                 self._busy.discard(process)
                 self._idle.append(process)
             return value

@@ -126,7 +126,7 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
     may refer, such as the textures of a mesh.
 
     Args:
-        task: the task; `task.files` are the settings that name files.
+        task: the task; `task.path_setting_names` are the settings that name files.
 
     Returns:
         Contents by absolute path.
@@ -137,6 +137,7 @@ def read_files(task: WorkerTask) -> dict[str, bytes]:
     contents: dict[str, bytes] = {}
     for name in task.path_setting_names:
         value = task.settings.get(name)
+        # paths, and the text between them, which is no absolute path of a file
         parts = _split_paths(value) if isinstance(value, str) else ()
         for part in parts:
             path = Path(part)
@@ -378,7 +379,7 @@ def load_task(task: WorkerTask) -> BatchFunction:
     if "DRJIT_CACHE_DIR" not in os.environ:
         (folder / KERNELS).mkdir(exist_ok=True)
         os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
-    # Only called for its error on a machine without libLLVM, before anything is loaded.
+    # Called for its error only: without libLLVM it raises before anything is loaded.
     describe_machine()
     # The user allowed this code to run in the main process.
     allow_code(*task.allowed_modules)
@@ -443,6 +444,7 @@ def serve() -> None:
     received: SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]] = SimpleQueue()
 
     def listen() -> None:
+        """Receive calls, and end the process when the parent has ended."""
         try:
             while True:
                 received.put(pickle.load(calls))

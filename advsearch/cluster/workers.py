@@ -101,6 +101,7 @@ class PoolWorkers:
                 self.stats.workers = n_workers
                 self.stats.alive += n_workers * (now - counted_at)
                 counted_at = now
+                # each worker that is free gets a batch
                 while len(running) < n_workers and queued.has_next():
                     items = queued.take()
                     deadline = self._deadline(len(items), item_seconds)
@@ -150,8 +151,7 @@ class PoolWorkers:
             return
         if not isinstance(error, WorkerDiedError):
             raise error
-        # Before any batch has finished, this counts as a failed start. Too many of them
-        # raise an error.
+        # It raises an error if too many workers die before any batch has finished.
         self._count_dead_start()
         if len(items) > 1:
             queued.put_back_singly(items)
@@ -159,28 +159,19 @@ class PoolWorkers:
             yield BatchResult(items, None, failure_reason=str(error))
 
     def _wait(self, ended: queue.SimpleQueue[Future[Reply]]) -> Future[Reply] | None:
-        """Return a future that has ended, None if none ends for a moment."""
+        """Return a future that has ended; None if none ends within `POLL_SECONDS`."""
         try:
             return ended.get(timeout=POLL_SECONDS)
         except queue.Empty:
             return None
-
-    @staticmethod
-    def _take_next(
-        waiting: deque[Sequence[Any]], source: Iterator[Sequence[Any]]
-    ) -> bool:
-        """Move a batch to those that wait, if none waits; return whether one waits."""
-        if not waiting:
-            waiting.extend(islice(source, 1))
-        return bool(waiting)
 
     def _deadline(self, n_items: int, item_seconds: Sequence[float]) -> float:
         """Return the seconds after which a batch counts as hanging.
 
         Its worker ends itself then. The deadline is a multiple of the time that the
         items would take at the median speed of the last batches. Before there are
-        `MIN_BATCHES` of them, it is `LOAD_DEADLINE`. It is at least `task.seconds`, if
-        the task states that time.
+        `MIN_BATCHES` of them, it is `LOAD_DEADLINE`. It is at least
+        `task.min_timeout_seconds`, if the task states that time.
 
         Args:
             n_items: number of items of the batch.
@@ -213,11 +204,11 @@ class PoolWorkers:
         self.stats.batches += 1
         self.stats.busy += reply.seconds
         self.stats.loading += reply.loading_seconds
-        # `compute` counts all seconds that workers are connected. The seconds of
-        # loading are subtracted, since they do not belong to `alive`.
+        # `compute` adds all seconds for which workers are connected to `alive`. The
+        # seconds of loading are subtracted again.
         self.stats.alive -= reply.loading_seconds
         machine: str | None = digest_machine(reply.machine)
-        if machine == self._this_machine:  # then it needs no name
+        if machine == self._this_machine:  # rows of this machine name no machine
             machine = None
         elif machine is not None:
             self._note_machine(machine, reply)
@@ -290,9 +281,8 @@ class _BatchQueue:
 
 
 def _get_error(future: Future[Reply]) -> BaseException | None:
-    """Return the error of a future that has ended, None without one; a future is only
-    cancelled when the executor is lost.
-    """
+    """Return the error of a future that has ended; None if it has a result."""
+    # a future is only cancelled if the connection of the executor is lost
     if future.cancelled():
         return BrokenExecutor()
     return future.exception()

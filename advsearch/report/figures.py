@@ -110,12 +110,14 @@ def draw_fractions(
 
     Args:
         axes: axes of matplotlib, on which it is drawn.
-        rows: rows by their labels, from the top; of each series a fraction in [0, 1]
-            and both bounds of its interval, or None, which is left out.
-        series: their names, for the legend.
+        rows: rows by their labels, from the top. A row has an entry for each series: a
+            fraction in [0, 1] and the two bounds of its interval, or None to draw
+            nothing.
+        series: names of the series, for the legend.
         colours: colours of the series; they repeat.
     """
-    # the dots of a row are spread over at most 0.8 of its height
+    # Rows are 1 apart. The dots of a row are spread over at most 0.8 of that, around its
+    # center.
     spacing = min(0.22, 0.8 / len(series))
     for index, label in enumerate(series):
         colour = colours[index % len(colours)]
@@ -176,7 +178,7 @@ def draw_searches(
     axes.set(
         xlabel="evaluations",
         ylabel=meaning,
-        # an axis of a single evaluation would have no width
+        # up to 2 at least: an axis for a single evaluation would have no width
         xlim=(1, max(2, *map(len, objectives.values()))),
     )
     axes.locator_params("x", integer=True)
@@ -196,9 +198,10 @@ def _draw_search(
         colour: colour of dots and line.
         dashes: matplotlib's style of the line.
     """
-    objective = np.array(values, dtype=float)  # None is NaN
-    # the best so far; `fmax` ignores NaN
-    best = np.fmax.accumulate(objective) if len(objective) else objective
+    objective = np.array(values, dtype=float)  # None becomes NaN
+    best_so_far = objective
+    if len(objective):
+        best_so_far = np.fmax.accumulate(objective)  # `fmax` ignores NaN
     # of a long search only some points are drawn
     indices = _select_points(len(objective))
     # Each dot is drawn as a line of length 0 with round ends. So all dots are a single
@@ -213,7 +216,7 @@ def _draw_search(
     )
     axes.plot(
         indices + 1,
-        best[indices],
+        best_so_far[indices],
         linestyle=dashes,
         linewidth=2,
         color=colour,
@@ -260,14 +263,24 @@ def draw_heat_map(
         x_label: the name of the horizontal axis.
         y_label: the name of the vertical axis.
     """
-    finite = [abs(value) for row in values for value in row if math.isfinite(value)]
+    magnitudes = [abs(value) for row in values for value in row if math.isfinite(value)]
     if meaning == ACCURACY:
-        colours: dict[str, str | float] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
+        lower = 0.0
+        upper = 1.0
     else:
-        # the same limit on both sides, so that 0 has the middle colour
-        limit = max([*finite, 1e-6])
-        colours = {"cmap": "RdBu", "vmin": -limit, "vmax": limit}
-    image = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
+        # The same limit on both sides, so that 0 has the middle colour. 1e-6: the range
+        # must not be empty.
+        upper = max([*magnitudes, 1e-6])
+        lower = -upper
+    image = axes.imshow(
+        values,
+        origin="lower",
+        extent=extent,
+        aspect="auto",
+        cmap="RdBu",
+        vmin=lower,
+        vmax=upper,
+    )
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.figure.colorbar(image, ax=axes, label=meaning)
 
@@ -317,11 +330,12 @@ def draw_marks(picture: Any, shapes: Sequence[Shape]) -> Floats:
         The drawing (h, w, 3), float32 in [0, 1].
     """
     levels = to_8bit(picture)
+    height, width = levels.shape[:2]
     # rounded up, so that the longest side has MIN_IMAGE_SIDE pixels at least
-    factor = max(1, -(-MIN_IMAGE_SIDE // max(levels.shape[:2])))
-    size = levels.shape[1] * factor, levels.shape[0] * factor
+    factor = max(1, math.ceil(MIN_IMAGE_SIDE / max(height, width)))
+    size = (width * factor, height * factor)
     image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
-    # False comes before True, so that true masks are drawn last and stay visible
+    # True masks are drawn last, so that they stay visible (False sorts before True).
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
             _draw_mask(image, shape)
@@ -413,8 +427,7 @@ def _make_map_panels(
     """
     maps = sorted(
         (shape for shape in shapes if shape.map is not None),
-        # false comes before true
-        key=lambda shape: not shape.true,
+        key=lambda shape: not shape.true,  # False, of the true map, sorts first
     )
     if not maps:
         return []
@@ -423,8 +436,8 @@ def _make_map_panels(
     panels = []
     for shape in maps:
         values = np.asarray(shape.map, dtype=np.float64)
-        # 1e-12: a constant map must not be divided by 0
-        greys = np.clip((values - lower) / max(upper - lower, 1e-12), 0.0, 1.0)
+        value_range = max(upper - lower, 1e-12)  # not 0, for a constant map
+        greys = np.clip((values - lower) / value_range, 0.0, 1.0)
         levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
         grey_image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
         panel = grey_image.convert("RGB")
@@ -482,19 +495,26 @@ def _write_label(
         text_boxes: the boxes of texts written before.
     """
     text = f"true: {shape.text}" if shape.true else shape.text
-    left, top, right, bottom = map(round, draw.textbbox((0, 0), text, font=font))
-    width = right - left + 2 * LABEL_MARGIN
-    height = bottom - top + 2 * LABEL_MARGIN
-    x = max(0, min(corners[0], size[0] - width))
-    max_y = max(size[1] - height, 0)
-    preferred_y = corners[3] if shape.true else corners[1] - height
+    # (left, top, right, bottom) of the letters, if the text were drawn at (0, 0)
+    letters = [round(side) for side in draw.textbbox((0, 0), text, font=font)]
+    width = letters[2] - letters[0] + 2 * LABEL_MARGIN
+    height = letters[3] - letters[1] + 2 * LABEL_MARGIN
+    left, top, _, bottom = corners
+    # the text begins at the left side of the shape, but stays inside of the image
+    x = max(0, min(left, size[0] - width))
+    max_y = max(0, size[1] - height)
+    preferred_y = bottom if shape.true else top - height
     preferred_y = max(0, min(preferred_y, size[1] - height))
     y = _find_free_height(x, preferred_y, max_y, (width, height), text_boxes)
     background = TRUE_COLOR if shape.true else PREDICTED_COLOR
     draw.rectangle((x, y, x + width, y + height), fill=background)
-    # A font may begin a little right of and below the position that it is drawn at.
-    position = (x + LABEL_MARGIN - left, y + LABEL_MARGIN - top)
-    draw.text(position, text, fill=(0, 0, 0), font=font)
+    # The letters begin a little to the right of and below the position of the text.
+    draw.text(
+        (x + LABEL_MARGIN - letters[0], y + LABEL_MARGIN - letters[1]),
+        text,
+        fill=(0, 0, 0),
+        font=font,
+    )
     return x, y, x + width, y + height
 
 
@@ -521,12 +541,13 @@ def _find_free_height(
 
     def is_free(y: int) -> bool:
         """Return whether the text would cover no other one at this height."""
-        # it lies to the right or left of each, or below or above it
+        # it lies to the right or left of each other text, or below or above it
         return all(
             x > x1 or x0 > x + width or y > y1 or y0 > y + height
             for x0, y0, x1, y1 in text_boxes
         )
 
+    # by distance from the preferred height; of two at the same distance, the upper one
     nearest_first = sorted(range(max_y + 1), key=lambda y: (abs(y - preferred_y), y))
     return next(filter(is_free, nearest_first), preferred_y)
 
@@ -543,26 +564,31 @@ MIN_TILE_WIDTH = 160
 def make_contact_sheet(
     pictures: Sequence[Floats], captions: Sequence[Sequence[str]]
 ) -> Floats:
-    """Return pictures in rows on a white sheet (h, w, 3), float32, each above its lines
-    of text.
+    """Return pictures in rows on a white sheet, each above its lines of text.
 
     Args:
         pictures: (H, W, 3), display-referred sRGB in [0, 1], all of one size; small
             ones are magnified.
         captions: the lines of each picture; what is too long for the tile is cut.
+
+    Returns:
+        The sheet (h, w, 3), float32 in [0, 1].
     """
     factor = math.ceil(MIN_TILE_WIDTH / pictures[0].shape[1])
     height, width = (factor * side for side in pictures[0].shape[:2])
-    # all captions get the room of the longest
-    cell = width + GAP, height + LINE * max(map(len, captions)) + GAP
+    # A cell includes the gap to its right and below. All captions get the room of the
+    # longest.
+    cell_width = width + GAP
+    cell_height = height + LINE * max(map(len, captions)) + GAP
     n_columns = choose_column_count(len(pictures))
     n_rows = math.ceil(len(pictures) / n_columns)
-    # each cell has its gap at the right and below, so one more is at the left and above
-    sheet_size = GAP + n_columns * cell[0], GAP + n_rows * cell[1]
-    sheet = Image.new("RGB", sheet_size, "white")
+    # one more gap is at the left and above
+    sheet = Image.new(
+        "RGB", (GAP + n_columns * cell_width, GAP + n_rows * cell_height), "white"
+    )
     for index, picture in enumerate(pictures):
         row, column = divmod(index, n_columns)
-        corner = GAP + column * cell[0], GAP + row * cell[1]
+        corner = (GAP + column * cell_width, GAP + row * cell_height)
         _paste_tile(sheet, picture, captions[index], corner, (width, height))
     return np.asarray(np.asarray(sheet, dtype=np.float32) / np.float32(255.0))
 
@@ -610,8 +636,8 @@ def _write_caption(
     """
     left, top = corner
     for index, line in enumerate(lines):
-        # No tile has room for 200 letters. The loop below cuts one at a time, and would
-        # be slow for a very long line.
+        # The loop below cuts one letter at a time, which is slow for a very long line.
+        # No tile has room for 200 letters, so more are cut at once.
         text = " ".join(line[:200].split())
         start = text
         while start and draw.textlength(text, font=font) > width:

@@ -77,19 +77,20 @@ class Piece:
 
     @property
     def size(self) -> tuple[float, float]:
+        """Width and height without bleed, in millimetres."""
         height, width = self.picture.shape[:2]
-        return (width - 2 * self.bleed[0]) * self.pixel_size_mm[0], (
-            height - 2 * self.bleed[1]
-        ) * self.pixel_size_mm[1]
+        pixel_width, pixel_height = self.pixel_size_mm
+        n_columns = width - 2 * self.bleed[0]
+        n_rows = height - 2 * self.bleed[1]
+        return n_columns * pixel_width, n_rows * pixel_height
 
     @property
     def frame_size_mm(self) -> tuple[float, float]:
         """Width of bleed and marks on each side, in millimetres: (x, y)."""
-        return self.bleed[0] * self.pixel_size_mm[
-            0
-        ] + MARK_GAP + MARK_LENGTH, self.bleed[1] * self.pixel_size_mm[
-            1
-        ] + MARK_GAP + MARK_LENGTH
+        pixel_width, pixel_height = self.pixel_size_mm
+        bleed_x = self.bleed[0] * pixel_width
+        bleed_y = self.bleed[1] * pixel_height
+        return bleed_x + MARK_GAP + MARK_LENGTH, bleed_y + MARK_GAP + MARK_LENGTH
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +100,8 @@ class PlacedPart:
     Attributes:
         piece: the piece.
         name: name that is printed next to the part.
-        pixel_bounds: columns and rows of the part in the picture of the piece: (x0, x1, y0,
-            y1), of which x1 and y1 are excluded.
+        pixel_bounds: columns and rows of the part in the picture of the piece: (x0, x1,
+            y0, y1), of which x1 and y1 are excluded.
         x: position of its left edge on the page in millimetres.
         y: position of its upper edge.
     """
@@ -114,10 +115,13 @@ class PlacedPart:
     @property
     def outer_size_mm(self) -> tuple[float, float]:
         """Width and height with bleed and marks, in millimetres."""
-        (x0, x1, y0, y1) = self.pixel_bounds
-        frame = self.piece.frame_size_mm
-        pixel = self.piece.pixel_size_mm
-        return (x1 - x0) * pixel[0] + 2 * frame[0], (y1 - y0) * pixel[1] + 2 * frame[1]
+        x0, x1, y0, y1 = self.pixel_bounds
+        frame_x, frame_y = self.piece.frame_size_mm
+        pixel_width, pixel_height = self.piece.pixel_size_mm
+        return (
+            (x1 - x0) * pixel_width + 2 * frame_x,
+            (y1 - y0) * pixel_height + 2 * frame_y,
+        )
 
 
 def write_sheets(
@@ -142,10 +146,10 @@ def write_sheets(
         paper: a name in `PAPERS`.
         profile: the ICC profile of an RGB printer, to which colours are converted; None
             leaves them sRGB.
-        max_sheets: how many sheets there may be between the first and the last page, 1
+        max_sheets: maximum number of sheets between the first and the last page, from 1
             to `MAX_SHEETS`.
-        make_last_page: makes one more page from the title, the size of the paper in
-            millimetres and the colour conversion (None without a profile).
+        make_last_page: function that makes one more page from the title, the size of
+            the paper in millimetres and the colour conversion (None without a profile).
 
     Raises:
         InputError: there is no such paper, or more sheets would be needed.
@@ -172,8 +176,9 @@ def write_sheets(
             file.savefig(_make_sheet(page, heading, PAPERS[paper], convert))
         if make_last_page is not None:
             file.savefig(make_last_page(title, PAPERS[paper], convert))
-    has_last_page = make_last_page is not None
-    return 1 + len(pages) + has_last_page
+    n_cover_pages = 1
+    n_last_pages = 0 if make_last_page is None else 1
+    return n_cover_pages + len(pages) + n_last_pages
 
 
 def _load_color_conversion(profile: Path) -> Any:
@@ -197,10 +202,10 @@ def _load_color_conversion(profile: Path) -> Any:
 def _make_sheet(
     parts: Sequence[PlacedPart], heading: str, paper: tuple[float, float], convert: Any
 ) -> Figure:
-    """Return a page with parts of pieces, a ruler, and a text at its lower right corner.
+    """Return a page with parts of pieces, a ruler, and a text at the lower right.
 
     Args:
-        parts: parts with their places on the page.
+        parts: parts with their positions on the page.
         heading: the text.
         paper: (width, height) in millimetres.
         convert: converts colours from sRGB to those of the printer; None leaves them.
@@ -217,7 +222,7 @@ def _make_sheet(
 def arrange_pages(
     pieces: Sequence[Piece], paper: tuple[float, float]
 ) -> Iterator[list[PlacedPart]]:
-    """Yield the parts on each page, with their places.
+    """Yield the parts on each page, with their positions.
 
     Pieces are cut into parts that fit on a page. Parts are sorted by height, the
     highest first, so that the parts of a row have about the same height. They fill a
@@ -277,17 +282,7 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
     Raises:
         InputError: it would take more than `MAX_SHEETS` parts.
     """
-    left, top = piece.bleed
-    n_rows, n_columns = piece.picture.shape[:2]
-    # The first argument is a length in pixels without bleed. The second one is the page
-    # in pixels, without the frame of a part, which is its bleed and its marks.
-    columns = _cut_evenly(
-        n_columns - 2 * left,
-        (width - 2 * piece.frame_size_mm[0]) / piece.pixel_size_mm[0],
-    )
-    rows = _cut_evenly(
-        n_rows - 2 * top, (height - 2 * piece.frame_size_mm[1]) / piece.pixel_size_mm[1]
-    )
+    columns, rows = _find_cuts(piece, width, height)
     n_parts = len(columns) * len(rows)
     if n_parts > MAX_SHEETS:
         raise InputError(
@@ -298,7 +293,38 @@ def _cut_piece(piece: Piece, width: float, height: float) -> Iterator[PlacedPart
             name = piece.name
             if n_parts > 1:
                 name += f", row {row} of {len(rows)}, column {column} of {len(columns)}"
-            yield PlacedPart(piece, name, (left + x0, left + x1, top + y0, top + y1))
+            yield PlacedPart(piece, name, pixel_bounds=(x0, x1, y0, y1))
+
+
+Bounds = list[tuple[int, int]]  # (begin, end) of consecutive intervals
+
+
+def _find_cuts(piece: Piece, width: float, height: float) -> tuple[Bounds, Bounds]:
+    """Return where the picture of a piece is cut, without its bleed.
+
+    Args:
+        piece: piece to print.
+        width: width of a page inside its margins, millimetres.
+        height: height of a page inside its margins, millimetres.
+
+    Returns:
+        (begin, end) of each column of parts, and of each row of parts, in pixels of the
+        picture.
+    """
+    bleed_x, bleed_y = piece.bleed
+    n_rows, n_columns = piece.picture.shape[:2]
+    frame_x, frame_y = piece.frame_size_mm  # bleed and marks on each side
+    pixel_width, pixel_height = piece.pixel_size_mm
+    # the largest part that fits on a page with its frame, in pixels
+    max_columns = (width - 2 * frame_x) / pixel_width
+    max_rows = (height - 2 * frame_y) / pixel_height
+    columns = _cut_evenly(n_columns - 2 * bleed_x, max_columns)
+    rows = _cut_evenly(n_rows - 2 * bleed_y, max_rows)
+    # the picture begins with the bleed
+    return (
+        [(bleed_x + begin, bleed_x + end) for begin, end in columns],
+        [(bleed_y + begin, bleed_y + end) for begin, end in rows],
+    )
 
 
 def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
@@ -327,8 +353,12 @@ def _cut_evenly(length: int, max_length: float) -> list[tuple[int, int]]:
 
 
 def make_blank_page(paper: tuple[float, float]) -> tuple[Figure, Axes]:
-    """Return an empty figure of a size (width, height) in millimetres, and axes over all
-    of it, whose coordinates are millimetres from the upper left corner.
+    """Return an empty figure for a page, and axes that cover it.
+
+    The coordinates of the axes are millimetres from the upper left corner.
+
+    Args:
+        paper: (width, height) of the page in millimetres.
     """
     figure = Figure(figsize=(paper[0] / INCH, paper[1] / INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -382,10 +412,10 @@ def _make_cover(
     n_unlisted = len(pieces) - MAX_LISTED_PIECES
     if n_unlisted > 0:
         lines.append(f"and {n_unlisted} more")
+    # the square to measure, below the title
     top = y + 15.0
     right = x + SQUARE
     bottom = y + 15.0 + SQUARE
-    # the square to measure
     _draw_line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
     axes.text(x, bottom + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
     _draw_ruler(axes, paper)
@@ -461,8 +491,10 @@ def _draw_cut_marks(
         outer_x: left and right edge with bleed.
         outer_y: top and bottom edge with bleed.
     """
-    for x, edge_x, sign_x in zip(trim_x, outer_x, (-1.0, 1.0), strict=True):
-        for y, edge_y, sign_y in zip(trim_y, outer_y, (-1.0, 1.0), strict=True):
+    outwards = (-1.0, 1.0)  # direction away from the part at its first and last edge
+    for x, edge_x, sign_x in zip(trim_x, outer_x, outwards, strict=True):
+        for y, edge_y, sign_y in zip(trim_y, outer_y, outwards, strict=True):
+            # begin and end of the horizontal and of the vertical mark
             mark_x = [
                 edge_x + sign_x * MARK_GAP,
                 edge_x + sign_x * (MARK_GAP + MARK_LENGTH),
@@ -486,7 +518,7 @@ def _draw_cut_line(axes: Axes, part: PlacedPart, inside: Mask) -> None:
     """
     n_rows, n_columns = inside.shape
     pixel_width, pixel_height = part.piece.pixel_size_mm
-    # one pixel of outside around all, or the outline would stay open at the edges
+    # A border of zeros, one pixel wide, closes the outline at the edges of the part.
     padded = np.pad(inside.astype(float), 1)
     # the centre of each pixel, in millimetres
     xs = part.x + (np.arange(-1, n_columns + 1) + 0.5) * pixel_width

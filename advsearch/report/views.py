@@ -111,8 +111,8 @@ class ResultPart:
         size: (width, height) in inches of the figure file of the chart; None to use the
             height of the chart.
         parts: for each row, the name of its run among the parts of the run.
-        cell_fractions: fractions in [0, 1], by row and column. The larger one is, the stronger
-            is the color of the cell.
+        cell_fractions: fractions in [0, 1], by row and column. The larger one is, the
+            stronger is the color of the cell.
         bars: for each row a bar on a page, as (begin, end, mark) in [0, 1]; None for no
             bar.
         layout: layout of the pictures on a page: `pair`, `small`, `large` or `rows`;
@@ -120,8 +120,8 @@ class ResultPart:
         live: name of the part for the script of the page that fills it. Without the
             script the part is hidden.
         folded: whether a page displays it only on request.
-        only_medium: `page`, `text` or `notebook` if only this one displays the part; empty for
-            all three.
+        only_medium: `page`, `text` or `notebook` if only this one displays the part;
+            empty for all three.
     """
 
     title: str = ""
@@ -165,7 +165,7 @@ class ResultPart:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to show."""
+        """Whether there is nothing to display."""
         return not (
             any(self.text) or self.rows or self.pictures or self.draw or self.live
         )
@@ -224,7 +224,7 @@ def list_remarks(result: Result, view: ShownResult) -> list[str]:
     """
     ending = getattr(result, "ending", "")
     remarks = []
-    # otherwise the statement of the view says it
+    # Some views have a statement that says so already.
     if ending == INTERRUPTED and not view.says_interrupted:
         remarks.append("Not finished: these are the results so far.")
     if ending == RUNNING:
@@ -263,7 +263,8 @@ def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
     seconds = getattr(result, "seconds", None)
     n_renders = sum(renders.values()) if isinstance(renders, Mapping) else renders
     environment = getattr(result, "environment", "")
-    if "environments" in view.facts:  # which has this one among them
+    # The view lists several environments, and this one is among them.
+    if "environments" in view.facts:
         environment = ""
     common_facts = {
         "environment": environment,
@@ -273,7 +274,8 @@ def collect_facts(result: Result, view: ShownResult) -> dict[str, str]:
         "seed": str(getattr(result, "seed", "")),
         **result.facts(),
     }
-    # the first one sets the order, the last one the texts: both are the view's
+    # The first mapping determines the order, the last one the texts of facts that
+    # several have: so facts of the view come first, and with its texts.
     facts = {**view.facts, **common_facts, **view.facts}
     return {name: text for name, text in facts.items() if text}
 
@@ -299,13 +301,14 @@ def make_default_view(result: Result) -> ShownResult:
         sections.append(table)
         objects_with_words.append((rows[0], set(table.column_heads)))
     sections.append(_explain_words(objects_with_words))
+    # a result without a summary in words has its status as the statement
     brief = result.outcome_summary or str(values.get("ending", "done"))
     statement = f"{brief[:1].upper()}{brief[1:]}."
     return ShownResult(statement, sections, facts)
 
 
 def _is_table(value: object) -> bool:
-    """Return whether a value is a list of results' rows that has any."""
+    """Return whether a value is a list of rows (`Fields`), and not empty."""
     if not isinstance(value, (list, tuple)) or not value:
         return False
     return all(isinstance(row, Fields) for row in value)
@@ -321,7 +324,7 @@ def _find_plain_facts(
         values: values of its fields by name.
         tables: names of the fields that become tables.
     """
-    # facts are named as a page shows them, fields as Python does
+    # `facts` returns names with spaces: "renders per second" for `renders_per_second`
     fact_names = [name.replace(" ", "_") for name in result.facts()]
     excluded = {*_FIELDS_ELSEWHERE, *tables, *fact_names}
     return {
@@ -348,10 +351,9 @@ def _make_table(name: str, rows: Sequence[Fields]) -> ResultPart:
         [_format_value(getattr(row, column, None)) for column in columns]
         for row in rows
     ]
-    heads = list(map(_format_name, columns))
     return ResultPart(
-        _format_name(name),
-        column_heads=heads,
+        title=_format_name(name),
+        column_heads=list(map(_format_name, columns)),
         rows=cells,
         folded=len(rows) > MAX_UNFOLDED_ROWS,
     )
@@ -362,7 +364,7 @@ def _explain_words(
 ) -> ResultPart:
     """Return a table that explains the names on a page by the descriptions of fields.
 
-    Where two fields have one name, the first one's description is taken.
+    If several fields have the same name, the description of the first one is used.
 
     Args:
         objects_with_words: objects with fields, each with the names of its fields that
@@ -479,6 +481,7 @@ def make_case_claim(
         spent: the effort of the search as text; None for a known scene that was only
             rendered again.
     """
+    # the count behind the claim
     extent = make_rate_extent("fresh renders that count as a success", rate)
     reason = REASON_OF_ENDING.get(ending, f"it ended as {ending!r}")
     no_claim = make_no_claim(reason, f"This is about {name}.")
@@ -541,19 +544,16 @@ def format_searches(renders: Mapping[str, int], policy: str, random: bool) -> st
 
 
 def make_rate_extent(what: str, rate: VerifiedRate | None) -> Extent | None:
-    return (
-        None
-        if rate is None
-        else Extent.from_count(what, rate.successes, rate.trials, rate.interval)
-    )
+    if rate is None:
+        return None
+    return Extent.from_count(what, rate.successes, rate.trials, rate.interval)
 
 
 def make_no_claim(reason: str, more: str = "") -> Claim:
-    return make_claim(
-        "nothing claimed",
-        f"{NOTHING_CLAIMED}: {reason}.{' ' + more if more else ''}",
-        None,
-    )
+    statement = f"{NOTHING_CLAIMED}: {reason}."
+    if more:
+        statement += f" {more}"
+    return make_claim("nothing claimed", statement, extent=None)
 
 
 def make_claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
@@ -563,9 +563,9 @@ def make_claim(kind: Kind, text: str, extent: Extent | None) -> Claim:
 # --------------------------------------------------------------------------------
 # HTML that is escaped by construction: text becomes markup only through `make_element`.
 #
-# And results as a notebook shows them (what is said, pictures or a figure, and tables,
-# without styles), and charts that stand inline in a page; their colours come from its
-# style sheet, so that they follow its scheme.
+# Also the display of results in a notebook (statement, pictures or a figure, and tables,
+# without styles), and charts inside of a page. The colors of these charts come from the
+# style sheet of the page, so that they follow its light or dark scheme.
 
 _VOID = frozenset({"meta", "img", "br", "hr", "input", "link"})
 
@@ -620,8 +620,9 @@ class InNotebook:
     """The name of the field with the table."""
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw the figure of the result and return the matplotlib axes; nothing is
-        drawn where it has none.
+        """Draw the first chart of the result, and return the matplotlib axes.
+
+        Nothing is drawn if the result has no chart.
 
         Args:
             axes: axes to draw on; None makes new ones.
@@ -632,12 +633,13 @@ class InNotebook:
         for part in view.sections:
             if part.draw is not None:
                 part.draw(axes)
-                break  # the first is the figure of the result
+                break
         return axes
 
     def to_pandas(self) -> Any:
-        """Return the rows of its table as a `pandas.DataFrame`; columns are called as
-        in `summary.json`.
+        """Return the rows of the result's table as a `pandas.DataFrame`.
+
+        The columns have the names of fields in `summary.json`.
 
         Raises:
             InputError: it has no table.
@@ -715,9 +717,8 @@ def render_result_figure(view: ShownResult) -> Figures:
     """Return the files of the first chart of a result; none if it has no chart."""
     for part in view.sections:
         if part.draw is not None:
-            return render_axes(
-                part.draw, part.size or (FIGURE_WIDTH, part.height / PIXELS_PER_INCH)
-            )
+            default_size = (FIGURE_WIDTH, part.height / PIXELS_PER_INCH)
+            return render_axes(part.draw, part.size or default_size)
     return {}
 
 
@@ -817,7 +818,8 @@ def make_chart_svg(
             loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"]
         )
 
-    size_in_inches = (width / 72, height / 72)  # 72 pixels each
+    # matplotlib writes SVG files with 72 pixels for an inch
+    size_in_inches = (width / 72, height / 72)
     files = render_figure(on_figure, size_in_inches, kinds=("svg",), style=STYLE)
     return make_element(
         "svg",

@@ -59,7 +59,7 @@ _MARKS = {
     "right. Beside it is the inverse of "
     "the true distance, and of the model's: light is near.",
 }
-_WANTED = {
+_GOALS = {
     "mislabel": "makes the model take {} for something else",
     "displace": "makes the model see {} elsewhere or in a loose box",
     "create": "makes the model see beside {} what is not there",
@@ -67,7 +67,7 @@ _WANTED = {
     "farther": "makes the model judge {} farther than it is",
     "gone": "makes the model judge {} to be as far as what is behind it",
 }
-SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
+SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_GOALS)
 """Objectives that are positive exactly if the prediction is a success of the search."""
 
 _UNITS = {
@@ -138,28 +138,29 @@ def format_percent_number(fraction: float, max_decimals: int = MAX_DECIMALS) -> 
     if distance >= 5.0 or distance <= 0.0:
         return f"{value:.0f}"
     # the position of the first decimal of the distance that is not 0
+    # (0 or less if the distance is 1 or more)
     first_nonzero_decimal = -math.floor(math.log10(distance))
     decimals = min(max(1, first_nonzero_decimal), max_decimals)
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     if text not in ("0", "100"):
         return text
     # Even with `max_decimals` it was rounded to 0 or 100.
-    smallest = 10.0**-decimals
+    last_digit = 10.0**-decimals  # such as 0.0001 for four decimals
     if text == "0":
-        return f"under {smallest:.{decimals}f}"
-    return f"over {100.0 - smallest:.{decimals}f}"
+        return f"under {last_digit:.{decimals}f}"
+    return f"over {100.0 - last_digit:.{decimals}f}"
 
 
 def format_fraction_of(
     count: int, total: int, interval: tuple[float, float], share: float | None = None
 ) -> str:
-    """Return a share with its interval and its total: ``12 % (9 to 16) of 340``.
+    """Return a fraction with its interval and its total: ``12 % (9 to 16) of 340``.
 
     Args:
-        count: how many are counted.
-        total: how many there are.
-        interval: lower and upper bound of the share.
-        share: the share, if it is not count / total, such as a weighted one.
+        count: number of cases that are counted.
+        total: number of all cases.
+        interval: lower and upper bound of the fraction.
+        share: the fraction, if it is not count / total, such as a weighted one.
     """
     if not total:
         return "none of 0"
@@ -207,12 +208,8 @@ def format_paired_rates(run: str, pair: Any) -> str:
         pair: `PairedRates` of the clean scene and the adversarial one (`answer`). Its
             difference is adversarial minus clean, as a fraction.
     """
-    clean, adversarial = (
-        f"{arm.correct} of {arm.configurations} ({percent(arm.accuracy)}, 95 % "
-        "interval "
-        f"{format_interval(arm.interval)})"
-        for arm in (pair.clean, pair.adversarial)
-    )
+    clean = _format_accuracy(pair.clean)
+    adversarial = _format_accuracy(pair.adversarial)
     lower, upper = (100.0 * bound for bound in pair.interval)
     if pair.difference < 0:
         # The word "fewer" states the sign. The bounds are negated, and so swap places.
@@ -222,7 +219,8 @@ def format_paired_rates(run: str, pair: Any) -> str:
         interval = f"{lower:.0f} to {upper:.0f}"
         direction = "more"
     doubt = ""
-    if not (lower > 0.0 or upper < 0.0):
+    contains_zero = not (lower > 0.0 or upper < 0.0)
+    if contains_zero:
         doubt = "; that there is a difference is not shown"
     return (
         f"{pair.model} is right in {clean} of the clean scene, and in {adversarial} "
@@ -234,17 +232,26 @@ def format_paired_rates(run: str, pair: Any) -> str:
     )
 
 
+def _format_accuracy(predictions: Any) -> str:
+    """Return ``12 of 20 (60 %, 95 % interval 36-81 %)`` for `CountedPredictions`."""
+    return (
+        f"{predictions.correct} of {predictions.configurations} "
+        f"({percent(predictions.accuracy)}, 95 % interval "
+        f"{format_interval(predictions.interval)})"
+    )
+
+
 def get_margin_meaning(task: str) -> str:
     return _MARGINS.get(task, "below 0 where the prediction is wrong")
 
 
 def format_objective(objective: str) -> str:
     """Return an objective with its unit, for an axis: ``margin loss [logits]``."""
-    named = get_objective_name(objective)
-    return next(
-        (f"{named} [{unit}]" for unit, names in _UNITS.items() if objective in names),
-        named,
-    )
+    name = get_objective_name(objective)
+    for unit, objectives in _UNITS.items():
+        if objective in objectives:
+            return f"{name} [{unit}]"
+    return name
 
 
 def get_objective_name(objective: str) -> str:
@@ -268,7 +275,7 @@ def format_goal(objective: str, thing: str) -> str:
     """Return the goal of a search with an objective, as a clause: "makes the model
     miss this mug".
     """
-    return _WANTED.get(objective, "makes the model miss {}").format(thing)
+    return _GOALS.get(objective, "makes the model miss {}").format(thing)
 
 
 def format_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
@@ -373,11 +380,11 @@ VISIBLE_HEADS = ("seen", "box", "distance")
 
 
 def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
-    """Return a table of the visible objects: name, visible fraction, box,
+    """Return the rows of a table of visible objects: name, visible fraction, box and
     distance.
 
     Args:
-        things: things by name, each a `runs.results.ThingSeen` as a mapping.
+        things: the fields of a `runs.results.VisibleThing` by the name of the object.
     """
     rows = []
     for name, thing in things.items():
@@ -394,8 +401,10 @@ def format_thing_rows(things: Mapping[str, Any]) -> list[list[str]]:
 
 
 def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[str]:
-    """Return one of the predictions for a picture, for a table: ``["cup", "score
-    0.77"]``, ``["mug", "91 %"]``.
+    """Return the cells of a prediction for a picture: its label, and a number.
+
+    Examples are ``["cup", "score 0.77"]`` for detection, and ``["mug", "91 %"]``. The
+    second cell is empty if there is no number.
     """
     if prediction.probability is None:
         return [prediction.label, ""]
@@ -409,8 +418,8 @@ def format_image_prediction_cells(task: str, prediction: AnyPrediction) -> list[
 
 
 def format_image_prediction(task: str, prediction: AnyPrediction) -> str:
-    """Return one of the predictions for a picture on one line: ``cup (score
-    0.77)``, ``mug 91 %``.
+    """Return a prediction for a picture on one line: ``cup (score 0.77)`` for
+    detection, ``mug 91 %`` for other tasks.
     """
     label, number = format_image_prediction_cells(task, prediction)
     if task == DETECTION and number:
@@ -483,22 +492,23 @@ def format_outcomes(outcomes: Mapping[str, int] | None, task: str = "") -> str:
     names = dict(_OUTCOME_NAMES)
     if task in _LOOSE_NAMES:
         names[Outcome.LOOSE] = _LOOSE_NAMES[task]
+    count_by_value = outcomes or {}
     texts = []
     for outcome, name in names.items():
-        count = (outcomes or {}).get(outcome.value, 0)
+        count = count_by_value.get(outcome.value, 0)
         if count:
             texts.append(f"{count} {name}")
     return ", ".join(texts)
 
 
 def get_only_outcome(outcomes: Mapping[str, int] | None) -> Outcome | None:
-    """Return the outcome that all of some predictions had.
+    """Return the outcome of predictions that all have the same one.
 
     Args:
-        outcomes: how often there was each, by name.
+        outcomes: number of predictions by outcome; None if it is not known.
 
     Returns:
-        The outcome; None where there were several, or nothing is known of them.
+        The outcome; None if there are several, or none is known.
     """
     if outcomes is None or len(outcomes) != 1:
         return None
@@ -522,8 +532,8 @@ def format_parameter_value(value: Any) -> str:
 
 
 def format_figure_value(value: float | str) -> str:
-    """Return a value as figures write it; of a file, its name without folder and
-    suffix.
+    """Return a value as figures write it: a path becomes the name of the file without
+    its suffix.
     """
     if isinstance(value, str):
         return PurePath(value).stem if "/" in value else value
@@ -531,8 +541,8 @@ def format_figure_value(value: float | str) -> str:
 
 
 def shorten_names(text: str) -> str:
-    """Return the last parts of paths, of one or of several separated by commas:
-    ``a.hdr, studio``.
+    """Return the names in a text with commas, without the folders of paths: ``a.hdr,
+    studio`` for ``maps/a.hdr,studio``.
     """
     return ", ".join(map(shorten_name, split_names(text)))
 
@@ -578,7 +588,11 @@ def format_rate_cells(rated: VerifiedRate | ControlGroup) -> list[str]:
 
 
 def format_tally(event: str, number: int, trials: int, not_a_number: int = 0) -> str:
-    """Return ``wrong in 20 of 20``; of outputs that are not numbers, how many."""
+    """Return how often an event happened: ``wrong in 20 of 20``.
+
+    If outputs of trials were not numbers, their count follows or stands alone, as in
+    ``wrong in 12, not a number in 8 of 20``.
+    """
     nan_text = f"not a number in {not_a_number} of {trials}"
     if not not_a_number:
         return f"{event} in {number} of {trials}"
@@ -725,20 +739,20 @@ def format_twin_evidence(evidence: TwinEvidence) -> str:
             f"How far this holds for photographs was not measured: "
             f"{_TWIN_MISMATCHES[evidence.match].format(run=name)}."
         )
-    of_objects = row.object or "all objects together"
+    objects = row.object or "all objects together"
     if not evidence.same_object:
-        of_objects += ", not of this object"
+        objects += ", not of this object"
     surroundings = f"in the environment {row.surroundings}"
     if row.surroundings == IN_PHOTOGRAPH:
         surroundings = "composed over their photographs"
     if not evidence.same_surroundings:
         surroundings += ", not in these surroundings"
     agreement = (
-        f"Photographs ({name}; {of_objects}; renders {surroundings}): this model was "
+        f"Photographs ({name}; {objects}; renders {surroundings}): this model was "
         f"right or wrong on both in {format_estimate(row.agreement)} of "
         f"{format_count(row.pairs, 'pair')} of {format_count(row.frames, 'frame')}."
     )
-    failing = f"{row.both_wrong} of {row.wrong_twins}"
+    failing = f"{row.both_wrong} of {row.wrong_twins}"  # of the wrong renders
     if row.wrong_where_twin_wrong is None:
         return (
             f"{agreement} Too few renders failed to state how often a failing render "

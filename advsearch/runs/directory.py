@@ -94,9 +94,9 @@ class RunDirectory:
     StorageError.
     """
 
-    def __init__(self, path: Path, held: RunLock) -> None:
+    def __init__(self, path: Path, lock: RunLock) -> None:
         self.path = path
-        self._lock = held
+        self._lock = lock
         self._is_new = True
         self._tracker: Tracker | None = None
         self.store = store.Store(path / store.NAME)
@@ -173,7 +173,7 @@ class RunDirectory:
                 if config is not None:
                     run_directory._note_start(config)
             except BaseException:
-                with suppress(OSError):
+                with suppress(OSError):  # the first error is raised in any case
                     _clear(path)
                 raise
             undo.pop_all()  # nothing failed: the caller closes it
@@ -313,7 +313,7 @@ class RunDirectory:
                 can't go on.
         """
         stored = self.store.read_json_note(note)
-        before = {} if stored is None else stored
+        before = {} if stored is None else stored  # None at the first call
         if not isinstance(before, dict):
             type_name = type(before).__name__
             raise FileFormatError(
@@ -329,7 +329,7 @@ class RunDirectory:
                 f"with: {changes}; restore it, or {self.restart_advice}"
             )
         has_new_facts = not facts.keys() <= before.keys()
-        if has_new_facts:
+        if has_new_facts:  # the stored values of known facts stay
             self.store.write_note(note, json.dumps({**facts, **before}))
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
@@ -402,14 +402,19 @@ class RunDirectory:
         return run / PARTS / name
 
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB
-        in [0, 1], numpy or torch; return its path.
+        """Write an image as ``<folder>/<name>.png``, and return its path.
+
+        Args:
+            name: name of the file, without its suffix.
+            image: (H, W, 3) or (H, W), display-referred sRGB in [0, 1], of numpy or
+                torch.
+            folder: folder in the run directory.
         """
         return files.write_png(self.path / folder / f"{name}.png", image)
 
     def save_exr(self, name: str, image: Any, folder: str = IMAGES) -> Path:
-        """Write ``<folder>/<name>.exr`` with float32 values as given (linear, by
-        convention) and return its path.
+        """Write ``<folder>/<name>.exr`` with the values as float32, which are linear by
+        convention, and return its path.
         """
         return files.write_exr(self.path / folder / f"{name}.exr", image)
 
@@ -459,7 +464,8 @@ class RunDirectory:
         """Remove what this run wrote, and the directory if that leaves it empty."""
         self._close_tracker()
         with suppress(OSError, StorageError):
-            check_not_moved(self.path)  # else it is another's by now
+            # If the directory was moved, another run may be at its path now.
+            check_not_moved(self.path)
             self.store.close()
             _clear(self.path)
             _remove_if_bare(self.path)
@@ -508,7 +514,8 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
         stays until the new one has something to store.
     """
     location, overwrite = config.run_location
-    if overwrite and location is not None and is_run(locate_run(location)):
+    replaces_run = overwrite and location is not None and is_run(locate_run(location))
+    if replaces_run:
         yield None
         return
     home = HOME if location is None else locate_run(location).parent
@@ -521,6 +528,7 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
     try:
         yield path
     except BaseException:
+        # The directory cannot be opened if it was removed meanwhile, for instance.
         with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
             if run.is_empty:
                 run.discard()
@@ -540,10 +548,9 @@ def make_default_name(object_name: str, controls: Iterable[str]) -> str:
         object_name: name or file of the object, such as ``data/mug.obj``.
         controls: names of the controls, such as ``texture``.
     """
-    words = [Path(object_name).stem, *controls]
-    return (
-        re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
-    )
+    words = "-".join([Path(object_name).stem, *controls])
+    name = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
+    return name[:80] or "attack"  # if no sign is left
 
 
 def check_links(run: Path) -> None:
@@ -555,7 +562,7 @@ def check_links(run: Path) -> None:
     Raises:
         FileFormatError: something is a link.
     """
-    check_no_links(run, CONTENTS, SMALL_PICTURES)  # the last one is left out
+    check_no_links(run, CONTENTS, unchecked_suffix=SMALL_PICTURES)
 
 
 def locate_run(run: str | Path) -> Path:
@@ -585,9 +592,10 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
         UnknownNameError: there is no such run.
         FileFormatError: it has links in it (`check_links`).
     """
-    # a path comes before a name of the same text
+    # If there are a path and a run in runs/ of this name, the path is used.
     for path in (Path(run).expanduser(), locate_run(run)):
-        folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
+        is_file_of_run = path.name in CONTENTS and os.path.isfile(path)
+        folder = path.parent if is_file_of_run else path
         if is_run(folder):
             if checked:
                 check_links(folder)
@@ -660,7 +668,7 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
         is_free = not path.exists() or all(
             _is_leftover(entry) for entry in path.iterdir()
         )
-    if is_free:
+    if is_free:  # nothing is there, or leftovers of a run that was killed at its start
         return
     if not is_run(path):
         raise RunExistsError(
@@ -725,11 +733,9 @@ def _format_change(name: str, value: object) -> str:
             are.
     """
     text = format_value(value)
-    return (
-        name
-        if value is None or len(text) > MAX_VALUE_LENGTH
-        else f"{name} (was {text})"
-    )
+    if value is None or len(text) > MAX_VALUE_LENGTH:
+        return name
+    return f"{name} (was {text})"
 
 
 def _is_leftover(path: Path) -> bool:

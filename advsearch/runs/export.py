@@ -75,18 +75,20 @@ def write_rows(
     counts = store.count_by_kind()
     if kind is not None and kind not in counts:
         raise UnknownNameError("kind of rows", kind, counts)
-    write = {"csv": _write_csv, "json": _write_json, "parquet": _write_parquet}[format]
+    write_table = {"csv": _write_csv, "json": _write_json, "parquet": _write_parquet}[
+        format
+    ]
     # all rows are read twice, since the columns have to be known first
     names = list_columns(store.rows(kind))
     if out is None:
-        write(map(make_record, store.rows(kind)), names, stream)
+        write_table(map(make_record, store.rows(kind)), names, stream)
     else:
         with (
             name_setting_in_errors("out"),
             replace_file(out) as part,
             part.open("wb") as file,
         ):
-            write(map(make_record, store.rows(kind)), names, file)
+            write_table(map(make_record, store.rows(kind)), names, file)
     return counts[kind] if kind is not None else sum(counts.values())
 
 
@@ -198,7 +200,8 @@ def _write_json(
             allow_nan=False,
             ensure_ascii=False,
         )
-        stream.write((",\n " if number else "\n ").encode() + line.encode())
+        separator = ",\n " if number > 0 else "\n "
+        stream.write(f"{separator}{line}".encode())
     stream.write(b"\n]\n")
 
 
@@ -367,7 +370,7 @@ def _parse_line(
     row = Row(
         "sweep",
         number,
-        # 3DB writes a bool or the text of one
+        # 3DB writes true, or the text "True"
         correct=str(record.get("is_correct")) == "True",
         # A loss is large if the model is wrong, a margin if it is right, so the sign
         # changes. It is 0.0 - loss and not -loss, which would be -0.0 for 0.
@@ -413,14 +416,16 @@ def _parse_prediction(
         classes: the names by index; a class without a name is called by its index.
 
     Returns:
-        "" and None where no class was predicted.
+        "" and None if no class was predicted.
     """
-    first = prediction[0] if isinstance(prediction, list) and prediction else prediction
-    if not _is_number(first):
+    best = prediction
+    if isinstance(prediction, list) and prediction:
+        best = prediction[0]
+    if not _is_number(best):
         return "", None
-    index = int(first)
-    label = classes[index] if 0 <= index < len(classes) else str(index)
-    return label, index
+    index = int(best)
+    has_name = 0 <= index < len(classes)
+    return classes[index] if has_name else str(index), index
 
 
 def _find_picture(folder: Path, image_id: str) -> Path | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import os
 import sqlite3
 from collections.abc import Mapping, Sequence
@@ -131,19 +132,17 @@ def check_version(db: sqlite3.Connection, path: Path) -> None:
             message states which advsearch can read it.
     """
     version = read_version(db)
-    day = ""
     if version == VERSION:
         return
+    day = ""  # the day on which the file was created, if it is stored
     with suppress(sqlite3.Error):
         created = db.execute("SELECT value FROM meta WHERE key = 'created'").fetchone()
-        day = f", that of {str(created[0])[:10]}" if created else ""
+        if created:
+            day = f", that of {str(created[0])[:10]}"
     db.close()
-    # version 0 is SQLite's own, of a database in which nothing was set
-    advice = (
-        f"read it with the advsearch that wrote it{day}"
-        if version
-        else "it is not a finished results.sqlite"
-    )
+    advice = f"read it with the advsearch that wrote it{day}"
+    if version == 0:  # the default of SQLite, in a database whose tables are missing
+        advice = "it is not a finished results.sqlite"
     raise FileFormatError(
         f"{path}: expected version {VERSION} of the results, got {version}; {advice}"
     )
@@ -177,12 +176,13 @@ LAST_FRAME_MS = 2500
 
 
 def to_8bit(image: Any) -> Bytes:
-    """Return an image in [0, 1] as uint8: ``round(255 clip(image, 0, 1))`` in float32,
-    halves to even; NaN becomes 0.
+    """Return an image in [0, 1] as uint8.
+
+    It is ``round(255 clip(image, 0, 1))`` in float32, where halves are rounded to the
+    even neighbor. NaN becomes 0.
     """
-    scaled: Floats = np.clip(
-        np.nan_to_num(_to_float32(image), nan=0.0), 0.0, 1.0
-    ) * np.float32(255.0)
+    without_nan = np.nan_to_num(_to_float32(image), nan=0.0)
+    scaled: Floats = np.clip(without_nan, 0.0, 1.0) * np.float32(255.0)
     return np.rint(scaled).astype(np.uint8)
 
 
@@ -198,10 +198,9 @@ def amplify_difference(
         after: the changed image, of the same shape.
         gain: factor by which differences are amplified.
     """
-    moved: Floats = np.float32(0.5) + np.float32(gain) * (
-        _to_float32(after) - _to_float32(before)
-    )
-    return np.clip(moved, 0.0, 1.0)
+    difference = _to_float32(after) - _to_float32(before)
+    amplified: Floats = np.float32(0.5) + np.float32(gain) * difference
+    return np.clip(amplified, 0.0, 1.0)
 
 
 def encode_png(image: Any) -> bytes:
@@ -233,9 +232,8 @@ def read_png(path: Path) -> Floats:
     """Return the display-referred picture, (H, W, 3) in [0, 1], in a PNG."""
     try:
         with Image.open(path, formats=("PNG",)) as image:
-            values: Floats = np.asarray(
-                image.convert("RGB"), dtype=np.float32
-            ) / np.float32(255.0)
+            levels = np.asarray(image.convert("RGB"), dtype=np.float32)
+            values: Floats = levels / np.float32(255.0)
             return values
     except BAD_PICTURE as error:
         raise FileFormatError(f"{path}: expected a PNG picture, got {error}") from None
@@ -246,7 +244,8 @@ def write_exr(path: Path, image: Any) -> Path:
     the path.
     """
     values = np.ascontiguousarray(_check_image_shape(_to_float32(image)))
-    return _write_exr(path, {"Y" if values.ndim == 2 else "RGB": values}, {})
+    channel = "Y" if values.ndim == 2 else "RGB"  # OpenEXR's names
+    return _write_exr(path, {channel: values}, notes={})
 
 
 def write_layers(
@@ -327,9 +326,9 @@ def encode_animation(frames: Sequence[Any]) -> bytes:
         if len(data) <= ANIMATION_BYTES or is_minimal:
             return data
         if count > MIN_ANIMATION_FRAMES:
-            # a tenth less, or fewer: as many as fit if all frames are equally large
+            # the number of frames that fit if all are equally large
             fitting_count = count * ANIMATION_BYTES // len(data)
-            count = min(count * 9 // 10, fitting_count)
+            count = min(count * 9 // 10, fitting_count)  # at least a tenth less
         else:
             shrink *= 2
 
@@ -345,9 +344,10 @@ def _shrink_images(images: Sequence[Image.Image], shrink: int) -> list[Image.Ima
         shrink: factor by which they are smaller than `ANIMATION_SIDE`.
     """
     longest_side = max(images[0].size)
-    # Side of a block in pixels: longest_side * shrink / ANIMATION_SIDE, rounded up by
-    # -(-a // b). It is at least `shrink`, so that small images become smaller, too.
-    block = max(shrink, -(-longest_side * shrink // ANIMATION_SIDE))
+    # Side of a block in pixels, rounded up. It is at least `shrink`, so that small images
+    # become smaller, too.
+    block = max(shrink, math.ceil(longest_side * shrink / ANIMATION_SIDE))
+    # full blocks only, but at least one pixel
     width, height = (
         side - side % block if side > block else side for side in images[0].size
     )
@@ -400,6 +400,6 @@ def _check_image_shape(array: Any) -> Any:
 
 
 def _to_float32(image: Any) -> Floats:
-    return np.asarray(
-        image.detach().cpu() if hasattr(image, "detach") else image, dtype=np.float32
-    )
+    if hasattr(image, "detach"):  # a tensor of torch
+        image = image.detach().cpu()
+    return np.asarray(image, dtype=np.float32)

@@ -71,7 +71,8 @@ def is_finished(path: Path) -> bool:
 
     It has not if it was interrupted, or killed while its report was written.
     """
-    if not (path / summary.NAME).is_file() or summary.read_result(path).is_unfinished:
+    has_result = (path / summary.NAME).is_file()
+    if not has_result or summary.read_result(path).is_unfinished:
         return False
     # A run that was killed while its report was written has a result, but can still be
     # resumed.
@@ -79,6 +80,7 @@ def is_finished(path: Path) -> bool:
 
 
 def can_resume(path: Path) -> bool:
+    """Return whether a search of a run can go on: its cached evaluations are stored."""
     with store.Store(path / store.NAME, read_only=True) as results:
         return results.has_cached
 
@@ -115,11 +117,10 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
             listed = _make_listed_run(path, counts, running, faults)
         # whatever is wrong with one run, the others are listed
         except Exception as error:
-            faults.append(
-                str(error)
-                if isinstance(error, AdvsearchError)
-                else f"{FAULT}: {type(error).__name__}"
-            )
+            fault = f"{FAULT}: {type(error).__name__}"
+            if isinstance(error, AdvsearchError):
+                fault = str(error)
+            faults.append(fault)
             listed = _make_damaged_run(path)
         _LISTED[key] = state, replace(listed, fault=faults[0] if faults else "")
     return _LISTED[key][1]
@@ -148,7 +149,8 @@ def _state(path: Path) -> object:
     """
     with suppress(OSError):
         file = os.lstat(path)
-        if file.st_size:  # who reads leaves an empty log
+        # A reader of the database leaves an empty log, which counts as missing.
+        if file.st_size:
             return file.st_ino, file.st_size, file.st_mtime_ns
     return None
 
@@ -182,7 +184,7 @@ def _make_listed_run(
             kinds = results.count_by_kind()
     command = config.get("command") or (result.command if result else "?")
     object_name = config.get("object") or _get_object_names(result)
-    # With readable settings, the command just has no object, and the name is empty.
+    # If the settings could be read, the command has no object, and the name is empty.
     if not object_name and not config:
         object_name = "?"
     controls = getattr(result, "controls", ()) or config.get("controls") or ()

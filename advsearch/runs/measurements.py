@@ -132,8 +132,8 @@ class Measurements:
         """
         context = self._context
         collected_rows: list[Row] = []
-        # The status of the summaries that are written inside of the loop. It is
-        # replaced when the rows end, or the time is up.
+        # The status in summaries that are written before the last row. It is replaced
+        # when the rows end, or the time is up.
         context.ending = INTERRUPTED
         try:
             with reraise_lost_interrupt():
@@ -143,7 +143,7 @@ class Measurements:
                         context.run.write_summary(make_result(collected_rows))
                 context.ending = "done"
         except KeyboardInterrupt:
-            pass
+            pass  # the status stays `INTERRUPTED`
         except OutOfTime:
             context.ending = OUT_OF_TIME
         result = make_result(collected_rows)
@@ -153,6 +153,7 @@ class Measurements:
             context.ending == INTERRUPTED and not self.n_new_measurements
         )
         if may_lack_stored_rows and (context.run.path / NAME).is_file():
-            earlier = read_stored_result(context.run.path)
-            return earlier if isinstance(earlier, type(result)) else result
+            earlier_result = read_stored_result(context.run.path)
+            if isinstance(earlier_result, type(result)):
+                return earlier_result
         return result

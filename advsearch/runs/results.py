@@ -68,7 +68,7 @@ def make_fact_schema(form: str = "{}") -> dict[str, JsonValue]:
     An example is
 
         speed: float | None = optional_field("pictures a second",
-            json_schema_extra=as_fact("{:.3g}"))
+            json_schema_extra=make_fact_schema("{:.3g}"))
 
     Args:
         form: format of its value as text, for `str.format`.
@@ -128,22 +128,19 @@ class Result(Fields):
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
 
     def facts(self) -> dict[str, str]:
-        """Return the fields that are declared with `make_fact_schema`, as texts by their names.
+        """Return the fields that are declared with `make_fact_schema`, as texts by name.
 
-        Terminal, report and notebook show them. Fields that are None or NaN are left
+        Terminal, report and notebook display them. Fields that are None or NaN are left
         out.
         """
         facts = {}
         for name, field in self.get_described_fields().items():
             extra = field.json_schema_extra
             value = getattr(self, name)
-            if (
-                isinstance(extra, dict)
-                and "fact" in extra
-                and value is not None
-                and value == value  # not NaN
-            ):
-                # as_fact has a format, such as "{:.2f} s"
+            is_fact = isinstance(extra, dict) and "fact" in extra
+            is_nan = value != value
+            if is_fact and value is not None and not is_nan:
+                # `make_fact_schema` has stored a format, such as "{:.2f} s"
                 facts[name.replace("_", " ")] = str(extra["fact"]).format(value)
         return facts
 
@@ -460,8 +457,9 @@ class Extent(Fields):
             share: an estimate of the fraction; left out if it is count / total.
             counts_right: whether right predictions are counted.
         """
-        is_known_from_counts = not total or share == count / total
-        stated_share = None if is_known_from_counts else share
+        # `share` is only stored if it does not follow from the counts.
+        is_redundant = not total or share == count / total
+        stated_share = None if is_redundant else share
         return cls(
             what=what,
             count=count,
@@ -845,7 +843,7 @@ class SharedWork(Fields):
     def from_worker_stats(
         cls, facts: Any, machines: Mapping[str, Mapping[str, str]]
     ) -> SharedWork | None:
-        """Return how workers shared a run; None where there were none.
+        """Return how workers shared a run; None if it had no workers.
 
         Args:
             facts: the `cluster.WorkerStats` of the run, or None.
@@ -856,7 +854,7 @@ class SharedWork(Fields):
         # `busy` and `alive` are seconds, summed over workers. They are measured by
         # different clocks, so their ratio may slightly exceed 1.
         utilisation = min(1.0, facts.busy / facts.alive) if facts.alive else None
-        # The passed `machines` replace those of the statistics.
+        # `machines` of the statistics are replaced by those of the argument.
         return cls.model_validate(
             {**vars(facts), "utilisation": utilisation, "machines": machines}
         )

@@ -142,7 +142,7 @@ class Store:
     another process writes it.
     """
 
-    FILE: ClassVar[str] = NAME  # FILE in the directory of a run
+    FILE: ClassVar[str] = NAME  # name of the file in the directory of a run
     # label for rows that have none
     NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER
 
@@ -163,7 +163,10 @@ class Store:
             self._db = connect_to_read(path) if read_only else connect_to_write(path)
             check_version(self._db, path)
             check_schema(self._db, path, SCHEMA)
-        self._closed: Callable[[], None] | None = None if read_only else note_open(path)
+        # function to call when the file is closed
+        self._note_closed: Callable[[], None] | None = None
+        if not read_only:
+            self._note_closed = note_open(path)
 
     @staticmethod
     def is_in(run: Path) -> bool:
@@ -195,11 +198,11 @@ class Store:
         start_time = time.monotonic()
         timestamp = time.time()  # monotonic time has no date
         must_sync = start_time >= self._next_sync
+        # With FULL, SQLite waits until the disk has the rows.
+        mode = "FULL" if must_sync else "NORMAL"
         with storage_errors(self.path):
-            self._db.execute(
-                f"PRAGMA synchronous = {'FULL' if must_sync else 'NORMAL'}"
-            )
-            with self._db:
+            self._db.execute(f"PRAGMA synchronous = {mode}")
+            with self._db:  # one transaction
                 self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
                 if cached is not None:
                     row = rows[-1]
@@ -330,12 +333,13 @@ class Store:
 
     def count_rows(self, kind: str | None = None) -> int:
         """Return the number of rows of a kind; None for all kinds."""
-        condition, parameters = (
-            ("", []) if kind is None else (" WHERE kind = ?", [kind])
-        )
-        return int(
-            next(self._select(f"count(*) FROM evaluations{condition}", *parameters))[0]
-        )
+        query = "count(*) FROM evaluations"
+        if kind is None:
+            counts = self._select(query)
+        else:
+            counts = self._select(f"{query} WHERE kind = ?", kind)
+        ((count,),) = counts
+        return int(count)
 
     def find_missing_steps(self, kind: str, count: int) -> Iterator[range]:
         """Yield the steps that have no row of a kind; consecutive ones as one range.
@@ -355,8 +359,8 @@ class Store:
             yield range(expected, count)
 
     def count_by_kind(self) -> dict[str, int]:
-        what = "kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind"
-        return {str(kind): count for kind, count in self._select(what)}
+        query = "kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind"
+        return {str(kind): count for kind, count in self._select(query)}
 
     def read_note(self, key: str) -> str | None:
         """Return the text that is stored under a key, None if there is none."""
@@ -365,7 +369,11 @@ class Store:
         return None
 
     def read_json_note(self, key: str) -> Any:
-        """Return the JSON value that was noted under `key`, or None."""
+        """Return the JSON value that is stored under a key, None if there is none.
+
+        Raises:
+            FileFormatError: the stored text is no JSON.
+        """
         text = self.read_note(key)
         try:
             return None if text is None else parse_json(text)
@@ -389,8 +397,8 @@ class Store:
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         self._db.close()
-        if self._closed is not None:
-            self._closed()
+        if self._note_closed is not None:
+            self._note_closed()
 
     def __enter__(self) -> Store:
         return self
@@ -464,8 +472,8 @@ def _encode_json(value: Any) -> str:
     """Return a value as JSON."""
     try:
         return _JSON.encode(value)
-    # numbers of numpy and NaN: they are turned into Python's and None first, which is
-    # slow, so only where it is needed
+    # The value contains NaN or numbers of numpy. Converting it is slow, so it is only
+    # done if encoding fails.
     except (TypeError, ValueError):
         return _JSON.encode(to_json_value(value))
 
@@ -504,6 +512,7 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
         FileFormatError: a column has another type, or a number that no row has.
     """
     by_name = dict(zip(_FIELDS, values, strict=True))
+    # `_decode_json_columns` also replaces JSON texts by their values.
     wrong_column = _find_wrong_column(by_name) or _decode_json_columns(by_name)
     if wrong_column is not None:
         raise FileFormatError(
@@ -598,9 +607,10 @@ def _parse_named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | Non
 
 
 def _is_value(entry: object) -> bool:
-    """Return whether an entry is the value of a parameter, `{"value": ..., "unit": ...}`.
+    """Return whether an entry is the value of a parameter with its unit.
 
-    The value is a text, None, a finite number, or a list of such.
+    It has the form `{"value": ..., "unit": ...}`. The value is a text, None, a finite
+    number, or a list of these.
     """
     if (
         not isinstance(entry, dict)

@@ -61,11 +61,8 @@ def read_result(folder: Path) -> Result:
         FileFormatError: there is none, or its contents are not those of this version.
     """
     result = read_stored_result(folder)
-    return (
-        result.model_copy(update={"ending": RUNNING})
-        if result.is_unfinished and is_held(folder)
-        else result
-    )
+    is_running = result.is_unfinished and is_held(folder)
+    return result.model_copy(update={"ending": RUNNING}) if is_running else result
 
 
 def read_stored_result(folder: Path) -> Result:
@@ -84,6 +81,7 @@ def read_stored_result(folder: Path) -> Result:
             read_text(path, "the summary of a run", MAX_SUMMARY_BYTES), finite=True
         )
     except FileNotFoundError:
+        # the summary is the last file of a run
         raise make_summary_error(path, "no such file; did the run end?") from None
     except (OSError, ValueError) as error:
         raise make_summary_error(path, str(error)) from None
@@ -343,10 +341,9 @@ def find_changed_file(
     settings_read_again = {
         name: value for name, value in settings.items() if name not in NOT_READ_AGAIN
     }
-    return next(
-        iter(find_changed_facts(before, compute_file_digests(settings_read_again))),
-        None,
-    )
+    digests_now = compute_file_digests(settings_read_again)
+    changed_names = find_changed_facts(before, digests_now)
+    return changed_names[0] if changed_names else None
 
 
 def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
@@ -363,9 +360,8 @@ def compute_file_digests(settings: Mapping[str, object]) -> dict[str, str]:
     for name, value in settings.items():
         for path in _find_paths(value):
             with suppress(OSError, ValueError):
-                # The files of the path, and those that were read for them. They are
-                # added one by one: if a file cannot be read, the others before it
-                # remain. The name of the setting tells whether it may name files.
+                # The path may lead to several files. Their digests are added one by
+                # one, so that those before a file that cannot be read remain.
                 for file_name, digest in _iterate_digests(name, path):
                     digests[file_name] = digest
     return digests
@@ -401,7 +397,7 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
         file_pattern = FOLDERS[setting]
         yield folder, _digest_folder(Path(folder), file_pattern)
 
-    # A file that was read is one, whatever the setting.
+    # If this process has read the path, it is a file, whatever the setting.
     may_be_file = bool(opened_files) or setting in FILES
     if may_be_file and Path(path).is_file():
         yield path, _digest_file(Path(path))
@@ -442,8 +438,11 @@ def _find_paths(value: object) -> Iterator[str]:
     ``camera.csv+object.csv``. Then the parts are yielded, and the full text too, since
     a path may have these signs in it. Lists and mappings are searched for texts.
     """
-    if isinstance(value, (Mapping, list, tuple)):
-        for inner in value.values() if isinstance(value, Mapping) else value:
+    if isinstance(value, Mapping):
+        for inner in value.values():
+            yield from _find_paths(inner)
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
             yield from _find_paths(inner)
     elif isinstance(value, str):
         for name in value.split(","):
@@ -453,6 +452,7 @@ def _find_paths(value: object) -> Iterator[str]:
                 name.partition("#")[0],
                 *split_paths(name),
             )
+            # each of them once
             yield from dict.fromkeys(part.strip() for part in parts if part.strip())
 
 

@@ -23,11 +23,11 @@ from advsearch.runs.export import iterate_values, list_columns, make_record
 from advsearch.runs.store import NAME, Row, Store
 
 # --------------------------------------------------------------------------------
-# Which rows of a sweep are independent: those of different *units*, each of one draw. A
-# unit is a drive with all its frames, or a picture, with the predictions of all models
-# and, where one was swept, without and with the adversarial scene of a run. Where
-# nothing is drawn, samples of a point of the grid differ in noise alone: they are one
-# unit. In a folder of photographs, all pictures in one photograph are one unit.
+# Which rows of a sweep are independent: those of different *units*. A unit has the rows of
+# one draw: those of a drive with all its frames, or of one picture, by all models and, if
+# both are swept, without and with the adversarial scene of a run. If nothing is sampled,
+# the samples of a point of the grid differ only in noise, and are one unit. With a folder
+# of photographs, all pictures in one photograph are one unit.
 
 UNITS_NOTE = "units"  # the note of a run with its `Units`
 PICTURE = "picture"
@@ -153,8 +153,8 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
 
     Args:
         store: store of the run.
-        is_sampled: whether something was sampled by chance. If not, the samples of an
-            older note differ only in noise, and count as such.
+        is_sampled: whether something was sampled at random. If not, the samples in the
+            note of an older version differ only in noise, and count as such.
 
     Returns:
         The units; None if the run has not noted any.
@@ -219,11 +219,11 @@ def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
         for row in row_list
     ]
     frame = pd.DataFrame(records, columns=list(names.values()))
+    # a column with a unit is called "NAME [UNIT]" in an export
     frame.attrs["units"] = {
-        # the unit of "NAME [UNIT]": from behind " [" to before "]"
-        plain: name[len(plain) + 2 : -1]
-        for name, plain in names.items()
-        if plain != name
+        plain_name: column.removeprefix(f"{plain_name} [").removesuffix("]")
+        for column, plain_name in names.items()
+        if plain_name != column
     }
     return frame
 
@@ -248,7 +248,7 @@ def read_sweep(
         after: only rows with a larger id.
         max_rows: maximum number of rows; None for all.
         extra_columns: function that returns more columns of a row.
-        is_sampled: whether something was sampled by chance, see `read_units`.
+        is_sampled: whether something was sampled at random, see `read_units`.
 
     Raises:
         FileFormatError: the results cannot be read.
@@ -259,8 +259,9 @@ def read_sweep(
         )
         noted = store.read_json_note(EDGES_NOTE)
         units = read_units(store, is_sampled=is_sampled)
-    frame.attrs["unit name"] = PICTURE if units is None else units.name
-    if units is not None:  # otherwise each row is a unit
+    frame.attrs["unit name"] = PICTURE
+    if units is not None:  # otherwise each row is a unit, as `make_sweep_frame` set it
+        frame.attrs["unit name"] = units.name
         frame["unit"] = units.find_unit(frame["step"].to_numpy())
     # `make_sweep_frame` has set it to an empty mapping
     frame.attrs["edges"] |= _parse_edges(noted)
@@ -305,11 +306,9 @@ def make_sweep_frame(
     # units of measurement by column, which `_make_cells` fills while `cells` is
     # iterated
     units = dict[str, str]()
+    get_extra_columns = extra_columns or (lambda row: {})
     cells = (
-        {
-            **_make_cells(row, number, units),
-            **(extra_columns(row) if extra_columns else {}),
-        }
+        {**_make_cells(row, number, units), **get_extra_columns(row)}
         for number, row in enumerate(rows, 1)
     )
     frames = list[pd.DataFrame]()
@@ -371,8 +370,9 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         parameter_name = f"parameter {name}" if name in RESERVED_NAMES else name
         for column, value, unit in iterate_values({parameter_name: described}):
             units.setdefault(column, unit)
-            # equal texts of many rows share their memory
-            cells[column] = sys.intern(value) if isinstance(value, str) else value
+            if isinstance(value, str):
+                value = sys.intern(value)  # equal texts of many rows share their memory
+            cells[column] = value
     return cells
 
 

@@ -184,11 +184,11 @@ def _open_tracker(
     if name == "tensorboard":
         writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
 
-        def add(numbers: MetricValues, step: int) -> None:
+        def add_scalars(numbers: MetricValues, step: int) -> None:
             for metric, value in numbers.items():
                 writer.add_scalar(metric, value, step)
 
-        return add, writer.close
+        return add_scalars, writer.close
     run = package.init(
         project="advsearch",
         name=folder.name,
@@ -200,7 +200,7 @@ def _open_tracker(
         # The step of wandb itself may never decrease, but the steps of each kind of
         # rows begin at 0. So the step is sent as a metric of its own, such as
         # "search/step" with the metric "search/margin".
-        first_metric = next(iter(numbers), "rows/")
+        first_metric = next(iter(numbers), "rows/")  # "rows/" if there are no metrics
         kind = first_metric.partition("/")[0]
         run.log({**numbers, f"{kind}/step": step})
 

@@ -53,11 +53,11 @@ def find_twin_evidence(
     environment: str,
     in_photograph: bool = False,
 ) -> TwinEvidence | None:
-    """Return how well renders agreed with photographs, for conditions like those given.
+    """Return how well renders agree with photographs, for conditions like those of a run.
 
-    A run of `advsearch twins` compares a model's predictions on photographs with those
-    on renders of the same scenes. The row of its table is chosen that is nearest to the
-    conditions of another run.
+    A run of `advsearch twins` compares a model's predictions for photographs with those
+    for renders of the same scenes. From its table the row is selected whose conditions
+    are most similar to those of another run.
 
     Args:
         run: name or folder of the run of twins; None if there is none.
@@ -90,7 +90,11 @@ def find_twin_evidence(
     object_stem = PurePath(object_name).stem
 
     def rank(row: TwinAgreement) -> tuple[bool, ...]:
-        """Return how similar the conditions of a row are; the first entry counts most."""
+        """Return how similar the conditions of a row are, as a key for sorting.
+
+        The first entry counts most: the same object, all objects together, the same
+        surroundings, and any environment rather than a photograph.
+        """
         is_of_all_objects = not row.object
         return (
             row.object == object_stem,

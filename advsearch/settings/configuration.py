@@ -131,8 +131,8 @@ def setting(
         read_texts: function that converts texts to a mapping, for settings with one.
         switched: what the flag does, if it is the opposite of the description; "" if
             the description says it.
-        power: function that returns the effect of a value outside of the run, such as
-            to connect to an address; "" for no effect.
+        power: function that returns the effect of a value outside of the run as text,
+            such as to connect to an address, or "" if it has none.
         constraints: constraints of `pydantic.Field`, such as `ge`.
     """
     declared = Setting(
@@ -208,7 +208,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
     for field, info in config.model_fields.items():
         if field in config.excluded_settings:
             continue
-        extra: Any = info.json_schema_extra  # of the field, from `setting`
+        extra: Any = info.json_schema_extra  # `setting` has stored it
         declared: Setting = extra["declared"]
         is_mapping = get_origin(info.annotation) is dict
         default = None
@@ -344,7 +344,7 @@ class Config(BaseModel):
 
     _python_only_parts: tuple[PythonOnly, ...] = PrivateAttr(())
     _python_objects: dict[tuple[str, str], Any] = PrivateAttr(default_factory=dict)
-    _left_out: tuple[OmittedSetting, ...] = PrivateAttr(())
+    _omitted_settings: tuple[OmittedSetting, ...] = PrivateAttr(())
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False
@@ -379,7 +379,7 @@ class Config(BaseModel):
         for 1 and 0.
         """
         is_switch = cls.model_fields[info.field_name].annotation is bool
-        # YAML's `epsilon: yes` is a slip, not 1
+        # In YAML, `yes` is true: `epsilon: yes` is a slip, and does not mean 1.
         if isinstance(value, bool) and not is_switch:
             raise ValueError("a truth value is not accepted here")
         return value
@@ -394,7 +394,7 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
-        """Check that all settings exist for this command and do not contradict each other.
+        """Check that the command has all settings, and that none contradict each other.
 
         A command does not have the settings in `excluded_settings`, although its class
         inherits them. `clashes` lists the settings that contradict others.
@@ -424,8 +424,9 @@ class Config(BaseModel):
 
         The file has a mapping from settings to values, which may also have `schema`,
         `command` and `base` (see `read_yaml`). A setting in the file that affects more
-        than the run, such as an address to connect to (`settings_with_effects`), is ignored, since
-        somebody else may have written the file; `omitted_settings` lists it.
+        than the run, such as an address to connect to (`settings_with_effects`), is
+        ignored, since somebody else may have written the file; `omitted_settings` lists
+        it.
 
         Args:
             path: path of the file.
@@ -444,20 +445,21 @@ class Config(BaseModel):
         for name, value in overrides.items():
             written.set_dotted(data, name, value)
         try:
-            # This first configuration only serves to find its powers.
-            left_out = [
-                power
-                for power in cls(**data).settings_with_effects
-                if power.name not in overrides
+            # This first configuration only serves to find the settings with effects.
+            # Those that the user has requested by `overrides` remain.
+            omitted_settings = [
+                setting
+                for setting in cls(**data).settings_with_effects
+                if setting.name not in overrides
             ]
-            for power in left_out:
+            for setting in omitted_settings:
                 # The file may use the name of the setting or of its field.
-                data.pop(power.name, None)
-                data.pop(power.field, None)
+                data.pop(setting.name, None)
+                data.pop(setting.field, None)
             config = cls(**data)
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
-        config._left_out = tuple(left_out)
+        config._omitted_settings = tuple(omitted_settings)
         return config
 
     @property
@@ -467,12 +469,12 @@ class Config(BaseModel):
         An example is an address to which images are sent (`trust.powers`). They have
         the type of settings that are omitted if only a file, and no person, sets them.
         """
-        powers = []
+        settings_with_effects = []
         for setting in settings(type(self)):
             value = getattr(self, setting.field)
             effect = setting.power(value)
             if effect:
-                powers.append(
+                settings_with_effects.append(
                     OmittedSetting(
                         name=setting.name,
                         field=setting.field,
@@ -481,14 +483,14 @@ class Config(BaseModel):
                         default=setting.default,
                     )
                 )
-        return tuple(powers)
+        return tuple(settings_with_effects)
 
     @property
     def omitted_settings(self) -> tuple[OmittedSetting, ...]:
-        """The settings of the file that were not taken over, since they do more than
-        change what happens in the run.
+        """The settings of the file that `from_yaml` has ignored, since they have an
+        effect outside of the run.
         """
-        return self._left_out
+        return self._omitted_settings
 
     @property
     def session_settings(self) -> dict[str, Any]:
@@ -496,8 +498,8 @@ class Config(BaseModel):
 
         A part, such as an attack of a study, reads its settings from its own file. But
         settings with an effect outside of the run, such as an address to connect to,
-        are never read from files (`settings_with_effects`). So they are passed on, if they do not
-        change the numbers of the run (`changeable_settings`).
+        are never read from files (`settings_with_effects`). So they are passed on, if
+        they do not change the numbers of the run (`changeable_settings`).
         """
         return {
             setting.name: getattr(self, setting.field)
@@ -508,10 +510,10 @@ class Config(BaseModel):
         }
 
     def check_no_effects(self, where: str) -> None:
-        """Check that no setting has an effect outside of the run (`settings_with_effects`).
+        """Check that no setting has an effect outside of the run.
 
         This is for files of which the user cannot confirm single settings, such as
-        those that another file names.
+        those that another file names (see `settings_with_effects`).
 
         Args:
             where: name of the file, for messages.
@@ -555,8 +557,10 @@ class Config(BaseModel):
 
     @classmethod
     def from_config(cls, other: Config, **changes: object) -> Self:
-        """Create a configuration of this command from that of another: with the settings
-        that both have (`get_shared_settings`), and with changes.
+        """Create a configuration of this command from that of another command.
+
+        It has the settings that both commands have (`get_shared_settings`), with
+        changes.
         """
         values = {**cls.get_shared_settings(other), **changes}
         return cls(**values).with_python_parts_of(other)
@@ -624,7 +628,7 @@ class Config(BaseModel):
 
     @property
     def run_name_words(self) -> tuple[str, ...]:
-        """The words from which a run without a stated place is named."""
+        """The words of the default name of a run."""
         return (self.command,)
 
     def make_repeatable(self) -> Self:
@@ -638,7 +642,7 @@ class Config(BaseModel):
             value = getattr(self, name, None)
             if value is not None:
                 convert = _make_absolute
-                if name == "backdrop":
+                if name == "backdrop":  # which may be a folder
                     convert = _make_backdrop_absolute
                 absolute[name] = ",".join(map(convert, written.split_names(value)))
         return self.model_copy(update={**absolute, **RUN_LOCATION})
@@ -659,8 +663,8 @@ class Config(BaseModel):
     def get_deciding_settings(self) -> JsonObject:
         """Return the settings on which the numbers of a run depend, as JSON values.
 
-        They are all settings that are not in `free`. A file is represented by its name
-        without directories, since it may have been moved.
+        They are all settings that are not in `changeable_settings`. A file is
+        represented by its name without directories, since it may have been moved.
         """
         values = {
             name: value
@@ -762,7 +766,8 @@ def _make_settings_error(config: type[Config], errors: Sequence[Any]) -> Advsear
         got = "nothing"
         if error["type"] != "missing":
             got = written.format_value(error["input"])
-        is_entry_wrong = setting.is_mapping and len(location) > 1  # not all of it
+        # whether one entry of a mapping is wrong, and not the full value
+        is_entry_wrong = setting.is_mapping and len(location) > 1
         if is_entry_wrong:
             got = f"{location[1]}={got}"
         problems.setdefault(setting.name, f"expected {setting.expects}, got {got}")
@@ -781,7 +786,7 @@ def _make_absolute(name: str) -> str:
     path = name
     node = ""
     is_file = os.path.isfile(name)
-    if not is_file:  # else a # belongs to the name of the file
+    if not is_file:  # a # in the name of an existing file separates no node
         path, mark, node_name = name.partition("#")
         node = f"{mark}{node_name}"
     looks_like_path = "/" in path or Path(path).suffix != ""

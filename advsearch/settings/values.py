@@ -82,8 +82,10 @@ def text_validator(*names: str, several: Sequence[str] = ()) -> Any:
 
 
 def unique_names_validator(*names: str) -> Any:
-    """Return a pydantic validator that rejects duplicate names in each of some
-    settings, the fields `names`.
+    """Return a pydantic validator that rejects settings with duplicate names.
+
+    Args:
+        names: fields of the settings, each of which may have several names.
     """
 
     def check(value: str | None, info: ValidationInfo) -> str | None:
@@ -240,7 +242,8 @@ def _split_outside_brackets(text: str) -> list[str]:
             depth += 1
         elif char in "}]":
             depth -= 1
-        if char == "," and depth <= 0:  # below 0 if there are brackets too many
+        # the depth is below 0 if there are too many closing brackets
+        if char == "," and depth <= 0:
             entries.append("")
         else:
             entries[-1] += char
@@ -248,22 +251,24 @@ def _split_outside_brackets(text: str) -> list[str]:
 
 
 def split_names(text: str) -> tuple[str, ...]:
-    """Split ``mug,bowl`` into names; a file whose name has a comma is one."""
+    """Split ``mug,bowl`` into names, except for the name of a file with a comma."""
     if "," not in text or os.path.isfile(text):
         return (text,)
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def join_names(texts: Iterable[str]) -> str:
-    """Join several such texts into one, without duplicates."""
+    """Join texts like ``mug,bowl`` into one, without duplicates of names."""
     return ",".join(dict.fromkeys(name for text in texts for name in split_names(text)))
 
 
 def check_no_duplicates(names: Iterable[str], setting: str) -> None:
-    """Raise InputError, which names the setting, if a name comes twice."""
-    twice = [name for name, count in Counter(names).items() if count > 1]
-    if twice:
-        raise InputError(f"{setting}: {twice[0]} is given twice; leave one of them out")
+    """Raise InputError, which names the setting, if a name occurs twice."""
+    duplicates = [name for name, count in Counter(names).items() if count > 1]
+    if duplicates:
+        raise InputError(
+            f"{setting}: {duplicates[0]} is given twice; leave one of them out"
+        )
 
 
 def format_value(value: Any) -> str:
@@ -274,8 +279,9 @@ def format_value(value: Any) -> str:
     # nested too deeply, or an integer of thousands of digits
     except (RecursionError, ValueError):
         text = f"a {type(value).__name__} that is too long to show"
-    # 80 characters with the dots
-    return text if len(text) <= 80 else text[:77] + "..."
+    if len(text) > 80:
+        return f"{text[:77]}..."  # 80 characters with the dots
+    return text
 
 
 SCHEMA = 2  # version of the YAML form

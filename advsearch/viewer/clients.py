@@ -118,9 +118,9 @@ class ConnectionPool:
         self._listening = listening_socket
         self._handle = handle
         self._context = context
-        # Connections (and the clients' addresses) that have sent something and wait for a
-        # worker; None ends a worker. The newest is served first: many old ones may be an
-        # attack.
+        # Connections that have sent something and wait for a worker, with the address of
+        # the client; None ends a worker. The newest is served first: many old ones may be
+        # an attack.
         self._ready: LifoQueue[tuple[socket.socket, Any] | None] = LifoQueue()
         self._connections: dict[int, _Connection] = {}  # by the thread of their worker
         self._closed = threading.Event()
@@ -195,7 +195,7 @@ class ConnectionPool:
         """
         # connections that have sent nothing yet
         silent: dict[Any, _SilentClient] = {}
-        listens = False  # whether new connections are accepted at present
+        listens = False  # whether the selector waits for new connections at present
         while not self._closed.is_set():
             # with too many connections, new ones wait in the system's queue
             has_room = len(silent) + self._ready.qsize() < MAX_WAITING
@@ -207,20 +207,21 @@ class ConnectionPool:
             for key, _ in selector.select(CHECK_INTERVAL):
                 connection: Any = key.fileobj
                 if connection is self._listening:
-                    with suppress(OSError):
+                    with suppress(OSError):  # the client may have gone
                         connection, address = self._listening.accept()
                         silent[connection] = _SilentClient(address, time.monotonic())
                         selector.register(connection, selectors.EVENT_READ)
-                else:
+                else:  # a silent client has sent something
                     selector.unregister(connection)
-                    self._ready.put((connection, silent.pop(connection).address))
+                    client = silent.pop(connection)
+                    self._ready.put((connection, client.address))
             now = time.monotonic()
-            # silent clients have less time where others wait
-            patience = REQUEST_SECONDS
+            # silent clients have less time if others wait
+            max_silence = REQUEST_SECONDS
             if not has_room:
-                patience = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
+                max_silence = min(REQUEST_SECONDS, SLOW_CLIENT_SECONDS)
             for connection, client in list(silent.items()):
-                if now - client.since > patience:
+                if now - client.since > max_silence:
                     del silent[connection]
                     selector.unregister(connection)
                     connection.close()
@@ -247,7 +248,8 @@ class ConnectionPool:
         for client in clients:
             is_overdue = client.due < now
             is_slow = now - client.since > SLOW_CLIENT_SECONDS
-            if not is_overdue and not (n_needed_workers > 0 and is_slow):
+            must_make_room = n_needed_workers > 0 and is_slow
+            if not is_overdue and not must_make_room:
                 continue
             n_needed_workers -= 1  # its worker becomes free
             # These values make it neither slow nor overdue, so that it is not
@@ -273,7 +275,8 @@ class ConnectionPool:
         try:
             connection.setblocking(True)
             if self._context is not None:
-                # the handshake waits for the client: it is done below, where its time counts
+                # The handshake waits for the client. So it is done below, where the
+                # waiting time is measured.
                 connection = self._context.wrap_socket(
                     connection, server_side=True, do_handshake_on_connect=False
                 )

@@ -46,7 +46,8 @@ class Boxes:
         values: `VALUES_PER_BOX` uint16 values for each box, one box after the other:
             x0, y0, x1 and y1 in units of 1 / `BOX_STEPS` of a pixel, the index of the
             name, and the score in units of 1/10000 (`NO_PROBABILITY` for true boxes).
-        cumulative_counts: for each row, the number of boxes in this row and all rows before.
+        cumulative_counts: for each row, the number of boxes in this row and all rows
+            before.
         names: index of each name of a class or an object.
     """
 
@@ -137,7 +138,8 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
 
     Args:
         row: row of a sweep.
-        boxes: collection to which the boxes are added, and an entry of `ends`.
+        boxes: collection to which the boxes are added, and an entry of
+            `cumulative_counts`.
     """
     payload: Any = row.payload
     corners: Mapping[str, float] = {}
@@ -146,7 +148,8 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
         boxes.add(payload)
         values = list[float]()
         for box in (payload["box"], best_box):
-            for corner in box or [None] * 4:  # no box: four NaN
+            corners_of_box = box or [None] * 4  # without a box four NaN
+            for corner in corners_of_box:
                 values.append(math.nan if corner is None else float(corner))
         corners = dict(zip(CORNERS, values, strict=True))
     # Every row gets an entry, also one without boxes.
@@ -156,9 +159,12 @@ def _read_corners(row: Row, boxes: Boxes) -> Mapping[str, float]:
 
 
 def _find_best_detection(row: Row, payload: Mapping[str, Any]) -> Any:
-    """Return the box of the first detection with the label that the model predicted or,
-    where it missed the object, should have; None if there is none.
+    """Return the box of the first detection with the predicted label; None if there is
+    none.
+
+    If the model missed the object, it is the first one with the object's label.
     """
+    # a payload has "class", the right label, if the object was missed
     label = payload.get("class", row.label)
     for detection in payload.get("found", ()):
         if detection["label"] == label:
@@ -192,7 +198,8 @@ def pack_columns(
     parameter_columns, parameters = _parameter_columns(rows)
     columns |= parameter_columns
     columns |= _box_columns(rows)
-    # `itemsize` is the size of one value, also in a column with several for each row
+    # The columns with the largest values first. `itemsize` is the bytes of one value,
+    # also in a column with several values for each row.
     arrays = sorted(columns.items(), key=lambda item: -item[1].itemsize)
 
     boxes: Boxes | None = rows.attrs.get(BOXES_ATTRIBUTE)
@@ -258,8 +265,7 @@ def _prediction_columns(
     probability = np.where(
         np.isnan(probability), NO_PROBABILITY, probability.round()
     ).astype(np.uint16)
-    # Such a label marks a row whose object is not visible. Whether the prediction is
-    # right is unknown then.
+    # If the object is not visible, it is unknown whether the prediction is right.
     is_in_view = rows["label"] != OUT_OF_VIEW
     is_right = rows["correct"].where(is_in_view).fillna(UNKNOWN)
     columns = {
@@ -289,7 +295,7 @@ def _parameter_columns(
     for index, (name, unit) in enumerate(rows.attrs["units"].items()):
         column = rows[name]
         levels = None
-        if column.dtype == "category":
+        if column.dtype == "category":  # names, which have no unit
             unit = ""
             values, levels = _encode_levels(column)
         else:

@@ -117,8 +117,8 @@ def _script_digests() -> frozenset[str]:
 def has_other_scripts(page: bytes) -> bool:
     """Return whether a page has a script that is none of `SCRIPTS`.
 
-    Such a script, as of another version, does not run under `make_served_policy`. Scripts
-    that are data do not count.
+    Such a script, for example that of another version, does not run under the policy of
+    `make_security_policy`. Scripts that only hold data do not count.
     """
     return pages.has_other_scripts(page, _script_digests())
 
@@ -182,8 +182,9 @@ def make_header(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
 
 
 def remarks_html(remarks: Sequence[str]) -> Html:
-    """Return a list of the remarks on a result, and after it a second list of those
-    that say how files were read, which is folded if it is long.
+    """Return the remarks on a result as two lists.
+
+    The second list has the notes on how files were read. It is folded if it is long.
     """
     notes = [remark for remark in remarks if _FILE_REMARK.match(remark)]
     others = [remark for remark in remarks if remark not in notes]
@@ -241,16 +242,16 @@ def make_table(
         heads: heads of the columns.
         rows: texts of the cells of each row, the name first.
         links: address to which the name of each row links; "" or missing for none.
-        shares: fractions in [0, 1] by which cells are colored, by (row, column); the
-            name is column 0.
+        shares: for cells that are colored, the fraction in [0, 1] that determines the
+            color, by (row, column); the name is column 0.
         bars: interval of each row, drawn in an additional column: (lower end, upper
             end, mark) as fractions of its width; None for no interval.
     """
     lines = []
-    for row, (first, *texts) in enumerate(rows):
+    for row, (name, *texts) in enumerate(rows):
         link = links[row] if row < len(links) else ""
-        name = make_element("a", first, href=link) if link else first
-        cells = [make_element("th", name, scope="row")]
+        linked_name = make_element("a", name, href=link) if link else name
+        cells = [make_element("th", linked_name, scope="row")]
         for column, text in enumerate(texts, 1):  # the name is column 0
             share = (shares or {}).get((row, column))
             cells.append(make_element("td", text, class_=_cell_class(text, share)))
@@ -259,8 +260,9 @@ def make_table(
                 make_element("td", _interval_bar(bars[row]), class_="hide-small")
             )
         lines.append(make_element("tr", *cells))
-    # the column of bars has no head
-    bar_head = make_element("td", class_="hide-small") if bars else None
+    bar_head = None
+    if bars:  # an empty head for the column of bars
+        bar_head = make_element("td", class_="hide-small")
     column_heads = (make_element("th", text, scope="col") for text in heads)
     head = make_element("tr", *column_heads, bar_head)
     return make_scrollable(

@@ -122,7 +122,7 @@ def _part_content(run: Path, part: ResultPart, description: str) -> Html:
                 part.column_heads, part.rows, links, part.cell_fractions, part.bars
             )
         )
-    elif part.rows:  # names and values
+    elif part.rows:  # without heads, the rows are pairs of a name and a value
         content.append(document.facts_table({row[0]: row[1] for row in part.rows}))
     for group in part.pictures:
         content.append(_embed_images(run, group, part.layout))
@@ -156,7 +156,8 @@ def _embed_images(run: Path, group: Iterable[Picture], layout: str) -> Html | No
         figures.append(make_element("figure", image, caption))
     if not figures:
         return None
-    if not layout and len(figures) <= 2:
+    is_pair = len(figures) <= 2
+    if not layout and is_pair:
         layout = "pair"
     return make_element("div", *figures, class_=f"pictures {layout}".strip())
 
@@ -198,11 +199,11 @@ def make_page_end(run: Path, result: Result, view: ShownResult) -> Html:
 
     The commands resume a run that was stopped, and repeat a run.
     """
-    facts = {
-        name[:1].upper() + name[1:]: text
-        for name, text in views.collect_facts(result, view).items()
-    }
-    content = [make_element("h2", "Cost and conditions"), document.facts_table(facts)]
+    facts = views.collect_facts(result, view)
+    facts_html = document.facts_table(
+        {name[:1].upper() + name[1:]: text for name, text in facts.items()}
+    )
+    content = [make_element("h2", "Cost and conditions"), facts_html]
     if result.is_unfinished:
         resume = shlex.join(["advsearch", "resume", str(run)])
         content += _make_command("Go on", resume)
@@ -278,7 +279,8 @@ def _read_header(data: bytes) -> dict[str, dict[str, object]]:
         magic, _, _, length, kind = struct.unpack_from("<4sII I4s", data)
         if (magic, kind) != (b"glTF", b"JSON"):
             return {}
-        header = json.loads(data[20 : 20 + length])  # behind these 20 bytes
+        begin = struct.calcsize("<4sII I4s")  # the JSON follows these fields
+        header = json.loads(data[begin : begin + length])
     except (struct.error, ValueError, RecursionError):
         return {}
     if not isinstance(header, dict) or not isinstance(header.get("asset"), dict):
@@ -343,8 +345,7 @@ def make_view_page(
     if not has_chosen_images:  # then all images of the run are displayed
         content += _embed_all_images(run, view)
     for part in view.sections:
-        is_for_page = part.only_medium in ("", "page")  # and not for texts alone
-        if is_for_page and not part.is_empty:
+        if part.is_visible_in("page"):
             content.append(make_part(run, part, view.statement))
     content.append(_list_parts(run, list(getattr(result, "parts", ()))))
     subjects = views.list_subjects(result, view)

@@ -91,7 +91,7 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
         (name, listing.read_listed_run(path, counts=False))
         for name, path in runs.items()
     ]
-    # the newest first; those of an unknown time last
+    # the newest first; runs with an unknown time of their start last
     listed.sort(key=lambda item: item[1].when or 0.0, reverse=True)
     # a single sweep has nothing to be compared with
     can_compare = sum(run.command == "sweep" for _, run in listed) > 1
@@ -99,10 +99,11 @@ def make_list_page(runs: Mapping[str, Path]) -> str:
     if can_compare:
         text = "Show the chosen sweeps side by side"
         button = make_element("p", make_element("button", text, type="submit"))
-    content = make_element(
-        "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
-    )
-    if listed:
+    if not listed:
+        content = make_element(
+            "p", "No runs here yet: advsearch sweep, or advsearch attack, makes one."
+        )
+    else:
         table = make_scrollable(_runs_table(listed, can_compare))
         content = make_element("form", table, button, action="compare/")
     title = make_element("header", make_element("h1", "Runs"))
@@ -231,14 +232,15 @@ def make_progress_page(name: str, run: Path) -> str:
         run: directory of the run.
     """
     listed = listing.read_listed_run(run)
-    facts = (listed.command, listed.object, " and ".join(listed.controls))
-    state = f"It was stopped: advsearch resume {name} goes on."
+    subjects = (listed.command, listed.object, " and ".join(listed.controls))
     if listed.state == "running":
         state = "A process is working on it."
+    else:
+        state = f"It was stopped: advsearch resume {name} goes on."
     counts = [f"{count} of {kind}" for kind, count in listed.kinds.items()]
     header = make_element(
         "header",
-        make_element("p", ", ".join(filter(None, facts)), class_="eyebrow"),
+        make_element("p", ", ".join(filter(None, subjects)), class_="eyebrow"),
         make_element("h1", f"{name} has not ended"),
     )
     # The script requests rows after a row from this address, relative to the page.
@@ -247,7 +249,7 @@ def make_progress_page(name: str, run: Path) -> str:
     main = make_element(
         "main",
         make_element("p", state_text, id="state"),
-        make_element("div", id="follow"),
+        make_element("div", id="follow"),  # filled by the script follow.js
         _attack_list_html(run),
     )
     return make_document(
@@ -292,7 +294,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
     # The state is read before the rows. If the run ends in between, it counts as
     # running, so that the page requests its last rows once more.
     running = is_held(run)  # a process works on it
-    ended = not is_unfinished(run)  # not running, and cannot be resumed
+    ended = not is_unfinished(run)  # it has its final page
     last_id = after
     rows = list[dict[str, object]]()
     pictures = list[dict[str, object]]()
@@ -300,7 +302,7 @@ def make_progress_json(run: Path, after: int) -> bytes:
         with store.Store(run / store.NAME, read_only=True) as results:
             for row in islice(results.rows(after=after), MAX_PROGRESS_ROWS):
                 rows.append(_row_json(row))
-                last_id = row.id or after
+                last_id = row.id or after  # stored rows have an id
             # Only images of the search, since the page displays no others. The index of
             # an evaluation in its search is its step.
             for step, picture in results.iterate_images("search", after, last_id):
@@ -395,11 +397,12 @@ def _name_runs(paths: Sequence[Path]) -> dict[str, Path]:
     """
     path_of_name: dict[str, Path] = {}
     for path in paths:
-        name = path.resolve().name
+        folder_name = path.resolve().name
+        name = folder_name
         number = 2
         while name in path_of_name:
-            name = f"{path.resolve().name} ({number})"
-            number = number + 1
+            name = f"{folder_name} ({number})"
+            number += 1
         path_of_name[name] = path
     return path_of_name
 
@@ -444,8 +447,9 @@ class Dashboard(HTTPServer):
         self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret = secrets.token_bytes(32)  # from which `make_key` makes keys
         self.photographs = photographs
-        # Held while the list of runs is read. Other requests then find cached entries.
-        self._listing = threading.Lock()
+        # The lock is held while the list of runs is read, so that a request at the same
+        # time waits, and finds cached entries.
+        self._list_lock = threading.Lock()
         self.host_name = host
         self.fingerprint = None
         self._context: ssl.SSLContext | None = None
@@ -511,10 +515,10 @@ class Dashboard(HTTPServer):
 
     @property
     def photograph_pages(self) -> PhotographServer:
-        """What handles photographs.
+        """The object that serves the pages for photographs.
 
         Raises:
-            RequestRejected: this server takes none.
+            RequestRejected: this server accepts no photographs.
         """
         if self.photographs is None:
             raise RequestRejected(
@@ -529,7 +533,7 @@ class Dashboard(HTTPServer):
 
     def make_list_page(self) -> str:
         """Return the page that lists the runs."""
-        with self._listing:  # one thread reads, the others find its cached entries
+        with self._list_lock:
             return make_list_page(self.list_runs())
 
     def serve_forever(self, poll_interval: float = CHECK_INTERVAL) -> None:
@@ -638,10 +642,8 @@ class _Handler(BaseHTTPRequestHandler):
                 self.server.server_port, self.server.token
             )
         # surrogates stand for bytes of a file name that are not UTF-8
-        parts = [
-            unquote(part, errors="surrogateescape")
-            for part in address.path.split("/")[1:]
-        ]
+        encoded_parts = address.path.split("/")[1:]  # before the first slash is nothing
+        parts = [unquote(part, errors="surrogateescape") for part in encoded_parts]
         if self.command == "POST":  # only photographs are posted
             return self._take_photograph(parts), headers
         return self._route(query, parts), headers
@@ -690,6 +692,7 @@ class _Handler(BaseHTTPRequestHandler):
             # the page of a part of a study, to which the study's page links
             case ["runs", name, directory.PARTS, part, directory.REPORT]:
                 return self._serve_part(name, part)
+            # such as pictures/0001/1234.jpg; the number finds the file
             case ["runs", name, "pictures", folder, file] if THUMBNAIL_PATH.fullmatch(
                 f"{folder}/{file}"
             ):
@@ -744,23 +747,25 @@ class _Handler(BaseHTTPRequestHandler):
         page = self.server.photograph_pages.make_page(
             run, name, self.server.make_key(name), other_device_url
         )
-        return _serve_page(page, "../../../", ("../", name))
+        # from runs/NAME/align/
+        return _serve_page(page, home="../../../", above=("../", name))
 
     def _serve_comparison(self, query: Query) -> Response:
         """Return a page of several sweeps side by side."""
-        names = dict.fromkeys(query.get("run", []))
+        names = dict.fromkeys(query.get("run", []))  # each name once
         runs = [(name, self.server.find_run(name)) for name in names]
         if not runs:
             raise RequestRejected(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
-        others = [
+        other_commands = [
             name
             for name, run in runs
             if listing.read_listed_run(run, counts=False).command != "sweep"
         ]
-        if others:
+        if other_commands:
             raise RequestRejected(
                 HTTPStatus.BAD_REQUEST,
-                f"only sweeps can be shown side by side; {', '.join(others)} is none",
+                "only sweeps can be shown side by side; "
+                f"{', '.join(other_commands)} is none",
             )
         sources = [
             _make_source(name, run, f"../runs/{quote_name(name)}/")
@@ -769,7 +774,7 @@ class _Handler(BaseHTTPRequestHandler):
         page = make_sweep_page(
             [(run, load_sweep_result(run)) for _, run in runs], sources
         )
-        return _serve_page(page, "../")
+        return _serve_page(page, home="../")  # from compare/
 
     def _serve_rows(self, query: Query, run: Path) -> Response:
         """Return rows of a sweep as packed columns.
@@ -834,7 +839,7 @@ def _describe_error(error: Exception) -> tuple[HTTPStatus, str]:
         return error.status, str(error)
     if isinstance(error, AdvsearchError):
         return HTTPStatus.INTERNAL_SERVER_ERROR, str(error)
-    if isinstance(error, OSError):
+    if isinstance(error, OSError):  # such as a file that was removed meanwhile
         return HTTPStatus.NOT_FOUND, "it is not there any more"
     text = f"{FAULT_MESSAGE}: {type(error).__name__}"
     return HTTPStatus.INTERNAL_SERVER_ERROR, text
@@ -851,7 +856,7 @@ def _make_source(name: str, run: Path, base: str) -> SweepSource:
     return SweepSource(
         name,
         f"{base}rows",
-        # the page has no rows of its own, but asks for them
+        # the page contains no rows, and requests them from the server
         is_partial=True,
         thumbnails=find_thumbnails(run),
         thumbnail_address=f"{base}pictures",

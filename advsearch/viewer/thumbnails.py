@@ -80,9 +80,8 @@ def _encode_jpeg(image: Image.Image) -> bytes:
 
 def thumbnail_path(run: Path, number: int) -> Path:
     """Return where the thumbnail of an image is stored."""
-    return (
-        run / SMALL_PICTURES / f"{number // IMAGES_PER_DIRECTORY:04d}" / f"{number}.jpg"
-    )
+    directory = f"{number // IMAGES_PER_DIRECTORY:04d}"
+    return run / SMALL_PICTURES / directory / f"{number}.jpg"
 
 
 def find_thumbnail(run: Path, number: int) -> Path | None:
@@ -185,9 +184,9 @@ class Thumbnails:
             number = int(step) // self.rows_per_image
             if number not in remaining:
                 continue
-            remaining.discard(number)  # once, whichever of its rows comes first
+            remaining.discard(number)  # yielded once, for the worst of its rows
             data = read_thumbnail(self.run, number)
-            # base64 makes 4 letters of 3 bytes
+            # base64 encodes 3 bytes as 4 letters
             n_bytes += len(data) * 4 // 3
             if n_bytes > max_bytes:
                 return
@@ -197,7 +196,8 @@ class Thumbnails:
 
 def find_thumbnails(run: Path) -> Thumbnails | None:
     """Return the thumbnails of a sweep, None if it has none."""
-    if next(_list_numbers(run), None) is None:
+    has_thumbnails = next(_list_numbers(run), None) is not None
+    if not has_thumbnails:
         return None
     settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
     # Every model has a row for each image. Without the setting there is a single model.

@@ -38,7 +38,7 @@ class Sheets(Exporter):
         known_size = options["size"]
         if known_size is None:
             known_size = exports.get_real_size(run)
-        # the object's longest side in millimetres: `--size`, or the known real size
+        # longest side of the object in millimetres
         longest = USUAL_SIZE if known_size is None else known_size
         pieces = exports.make_printable_pieces(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])
@@ -48,7 +48,7 @@ class Sheets(Exporter):
         if max_sheets is None:
             max_sheets = exports.DEFAULT_MAX_SHEETS
         with writing.name_setting_in_errors("out"), writing.replace_file(out) as part:
-            pages = exports.write_sheets(
+            n_pages = exports.write_sheets(
                 part,
                 pieces,
                 title,
@@ -62,7 +62,7 @@ class Sheets(Exporter):
             for piece in pieces
         ]
         text = (
-            f"{pages} pages in {out}; print them at 100 % and measure the square on "
+            f"{n_pages} pages in {out}; print them at 100 % and measure the square on "
             "the first"
         )
         if known_size is None:
@@ -70,4 +70,4 @@ class Sheets(Exporter):
                 "\nThe real object's longest side is taken for "
                 f"{exports.format_rounded(longest)} mm; --size says otherwise."
             )
-        return Exported({"pages": pages, "size_mm": longest, "pieces": sizes}, text)
+        return Exported({"pages": n_pages, "size_mm": longest, "pieces": sizes}, text)

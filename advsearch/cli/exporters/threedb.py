@@ -131,6 +131,11 @@ def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]
     }
 
 
+def _read_no_picture(step: int) -> bytes | None:
+    """Return None, for a run without small pictures."""
+    return None
+
+
 class ThreeDB(Exporter):
     """A sweep as a folder for 3DB's dashboard."""
 
@@ -155,7 +160,7 @@ class ThreeDB(Exporter):
         run_path = directory.find_run(run)
         thumbnails = exports.thumbnails.find_thumbnails(run_path)
         with Store(run_path / Store.FILE, read_only=True) as store:
-            read_picture = thumbnails.read_png if thumbnails else lambda _: None
+            read_picture = thumbnails.read_png if thumbnails else _read_no_picture
             n_rows = write_threedb(
                 lambda: store.rows(options["kind"] or "sweep"), out, read_picture
             )

@@ -64,7 +64,7 @@ class Categories:
         """
         labels, object_category = _find_object_category(image)
         is_first_image = not self.labels
-        if not is_first_image and labels != self.labels:
+        if labels != self.labels and not is_first_image:
             raise InputError(
                 f"RUN: its parts have other categories, {image.facts.object} among "
                 "them; export one of its parts"
@@ -106,7 +106,7 @@ def _find_object_category(image: Any) -> tuple[tuple[str, ...], int]:
 
 
 def _find_category(label: str, labels: tuple[str, ...]) -> int | None:
-    """Return the index of the first of `labels` that a label means; None without one."""
+    """Return the index of the first of `labels` that a label means; None if none is."""
     try:
         label_set = models.find_label_set(label, labels)
     except InputError:
@@ -126,15 +126,15 @@ def write_dataset(
         run: run of `sweep` or `attack`, or with such parts (a suite, a study).
         out: the folder, which is made, or empty.
         format: "coco" or "yolo".
-        every: also write pictures that all models are right about.
+        every: whether to write all pictures; otherwise only those about which a model
+            is wrong.
         progress: progress of the rows.
 
     Returns:
-        How many pictures there are, and sentences that a reader has to know.
+        The number of pictures, and sentences that users of the dataset should know.
 
     Raises:
-        InputError: the scene of the run is not to be had any more, or `out` is not
-            empty.
+        InputError: the scene of the run does not exist any more, or `out` is not empty.
         FileFormatError: the run is of another command, or has not ended.
     """
     writing.check_free_folder(out, "out")
@@ -168,8 +168,8 @@ def _write_files(
         format: "coco" or "yolo".
 
     Returns:
-        How many pictures there are, and in how many of them a prediction differs from
-        that of the run.
+        The number of pictures, and in how many of them the prediction differs from that
+        of the run.
     """
     images = list[dict[str, Any]]()
     annotations = list[dict[str, Any]]()
@@ -179,8 +179,10 @@ def _write_files(
         path = folder / IMAGES / f"{image.name}.png"
         Exporter.write_png(path, image.picture.numpy())
         images.append(make_image(image_id, image))
-        annotations += make_things(len(annotations) + 1, image_id, things)
-        n_changed += not image.is_reproduced
+        next_annotation_id = len(annotations) + 1
+        annotations += make_things(next_annotation_id, image_id, things)
+        if not image.is_reproduced:
+            n_changed += 1
         if format == "yolo":
             labels = make_yolo_labels(image, things)
             writing.write_text(folder / LABELS / f"{image.name}.txt", labels)
@@ -204,14 +206,14 @@ def make_yolo_labels(image: Any, things: list[tuple[Any, int]]) -> str:
     image_height, image_width = image.picture.shape[:2]
     lines = []
     for thing, category in things:
-        x, y, width, height = find_box(thing)
-        box = (
-            (x + width / 2) / image_width,
-            (y + height / 2) / image_height,
+        left, top, width, height = find_box(thing)
+        center_and_size = (
+            (left + width / 2) / image_width,
+            (top + height / 2) / image_height,
             width / image_width,
             height / image_height,
         )
-        numbers = " ".join(f"{value:.6f}" for value in box)
+        numbers = " ".join(f"{value:.6f}" for value in center_and_size)
         lines.append(f"{category} {numbers}\n")
     return "".join(lines)
 
@@ -351,19 +353,21 @@ def make_things(
     ]
 
 
-def make_thing(number: int, image: int, thing: Any, category: int) -> dict[str, Any]:
+def make_thing(
+    annotation_id: int, image_id: int, thing: Any, category: int
+) -> dict[str, Any]:
     """Return the annotation of a thing in COCO's JSON; its mask is run-length encoded.
 
     Args:
-        number: the id of the annotation.
-        image: the id of its picture.
+        annotation_id: the id of the annotation.
+        image_id: the id of its picture.
         thing: its ground truth.
         category: the index of its label.
     """
     fraction = thing.visible_fraction
     return {
-        "id": number,
-        "image_id": image,
+        "id": annotation_id,
+        "image_id": image_id,
         "category_id": category,
         "bbox": [*find_box(thing)],
         "area": int(thing.mask.sum()),
@@ -387,7 +391,9 @@ def find_runs(mask: NDArray[np.bool_]) -> list[int]:
     pixel is inside.
     """
     flat = mask.ravel(order="F")  # column by column
-    bounds = [0, *(np.flatnonzero(np.diff(flat)) + 1).tolist(), flat.size]
+    # indices of pixels that differ from the previous one: there a run begins
+    changes = np.flatnonzero(np.diff(flat)) + 1
+    bounds = [0, *changes.tolist(), flat.size]
     lengths = np.diff(bounds).tolist()
     begins_inside = bool(flat[0])
     return [0, *lengths] if begins_inside else lengths

@@ -52,12 +52,12 @@ class MarkedTexel(NamedTuple):
 
 
 def write_projection(run: str | Path, out: Path) -> list[str]:
-    """Write a folder with what to project for each projector of a run's adversarial
-    scene.
+    """Write a folder with the images to project, for each projector of a run.
 
-    It has `picture.png` to project, `texels.png` with the exact values, `marks.png`
-    with numbered crosses to project first, `seen.png` with these crosses as the run's
-    camera sees them, and `README.txt`.
+    The settings of the projectors are those in the adversarial scene. The folder has
+    `picture.png` to project, `texels.png` with the exact values, `marks.png` with
+    numbered crosses to project first, `seen.png` with these crosses as the run's camera
+    sees them, and `README.txt`.
 
     Args:
         run: name or folder of the run.
@@ -107,11 +107,11 @@ def write_projector(
     pattern = values["pattern"]
     n_rows, n_columns = pattern.shape[:2]
     # pixels per texel, rounded up: images are at least MIN_HEIGHT pixels high
-    factor = -(-MIN_HEIGHT // n_rows)
+    factor = math.ceil(MIN_HEIGHT / n_rows)
     # an image of nine crosses, and the texels at their centers
     marks, marked_texels = make_marks((n_rows, n_columns), factor)
-    # the marks at the resolution of the pattern, as the mean of each texel; avg_pool2d
-    # takes (1, 3, H, W)
+    # The marks at the resolution of the pattern: the mean over each texel. `avg_pool2d`
+    # takes and returns images as (1, 3, H, W).
     pooled_marks = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)
     texel_marks = pooled_marks[0].permute(1, 2, 0)
     Exporter.write_png(folder / "picture.png", images.enlarge(pattern, factor))
@@ -146,7 +146,7 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
         control: the projector.
         values: values of the projector by name; only single numbers are read.
     """
-    number = {name: float(value) for name, value in values.items() if value.ndim == 0}
+    numbers = {name: float(value) for name, value in values.items() if value.ndim == 0}
     unit = "m" if control.scene.object.size_in_metres is not None else "object sizes"
     fov = control.projector_part.fov  # horizontal field of view in degrees
     # illuminance of the object by a white image, in lux
@@ -155,16 +155,17 @@ def describe_settings(control: Any, values: dict[str, Tensor]) -> list[str]:
     # Half the width of the picture at distance 1. The throw ratio of a projector is
     # distance / width, which is 1 / (2 half_width).
     half_width = math.tan(math.radians(fov) / 2.0)
+    throw_ratio = 0.5 / half_width
     return [
-        f"{number['lumens']:g} lumens for a white picture, "
-        f"{number['distance']:.3g} {unit} from the object's "
+        f"{numbers['lumens']:g} lumens for a white picture, "
+        f"{numbers['distance']:.3g} {unit} from the object's "
         "middle",
-        f"a picture {fov:.3g} degrees wide (throw ratio {0.5 / half_width:.2f}), "
+        f"a picture {fov:.3g} degrees wide (throw ratio {throw_ratio:.2f}), "
         f"{control.projector_part.aspect:.3g} times as wide as high",
-        f"azimuth {number['azimuth'] % 360.0:.4g} and elevation "
-        f"{number['elevation']:.4g} degrees around the "
+        f"azimuth {numbers['azimuth'] % 360.0:.4g} and elevation "
+        f"{numbers['elevation']:.4g} degrees around the "
         "object",
-        f"ambient light of {number['ambient']:.4g} lux; white is {white:.4g} "
+        f"ambient light of {numbers['ambient']:.4g} lux; white is {white:.4g} "
         "lux on the object",
     ]
 
@@ -196,8 +197,8 @@ def describe_marks(control: Any, marked_texels: Sequence[MarkedTexel]) -> list[s
 
 
 def has_pattern(control: Control) -> bool:
-    """Return whether a control throws an image whose texels are known, as the control
-    projector does.
+    """Return whether a control projects an image (`pattern`), as the control projector
+    does.
     """
     return control.competes_with_ambient and any(
         slot.parameter.name == "pattern" for slot in control.parameter_slots
@@ -205,11 +206,11 @@ def has_pattern(control: Control) -> bool:
 
 
 def make_marks(shape: tuple[int, int], factor: int) -> tuple[Tensor, list[MarkedTexel]]:
-    """Return a picture of a frame and nine numbered crosses, and where the crosses are.
+    """Return a picture of a frame and nine numbered crosses, and their positions.
 
     Args:
         shape: rows and columns of the projector's pattern.
-        factor: how many pixels of the picture a texel is wide.
+        factor: width and height of a texel in pixels of the picture.
 
     Returns:
         The picture, white on black, (h, w, 3) linear in [0, 1]; and the texel at the

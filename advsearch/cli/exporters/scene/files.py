@@ -47,7 +47,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     # color of a plain background; None if the environment is visible
     backdrop = image_inputs.get("backdrop.color")
     hazy = has_haze(renderer, scene_inputs)
-    _check_backdrop(backdrop, adversarial.folder, hazy=hazy)
+    _check_backdrop(backdrop, adversarial.folder, hazy=hazy)  # raises for photographs
     # factor from radiance to the value that the sRGB curve takes
     gain = renderer.formation.gain
     if "camera.exposure" in image_inputs:
@@ -67,7 +67,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
                 " ".join(notes),
                 hide_environment=backdrop is not None,
             )
-            # moved when all are written, so that none is left after an error
+            # Moved when all files are written: so an error leaves none of them.
             for file in sorted(Path(folder).iterdir()):
                 os.replace(file, path.parent / file.name)
         title = (
@@ -212,7 +212,8 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
     adversarial = exports.AdversarialRun.load(run)
-    # the object as the scene describes it, and in its adversarial pose and texture
+    # the object as the scene describes it, and its mesh in its adversarial pose and
+    # texture
     described_object, posed_asset = adversarial.posed_object()
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.size_in_metres
