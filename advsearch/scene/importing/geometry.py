@@ -97,7 +97,8 @@ def compute_rotation(up: str, front: str) -> Float64Array:
         up: "y" or "z".
         front: one of `FRONT_AXES`, such as "-y", but not along `up`.
     """
-    sign, letter = front
+    sign = front[0]
+    letter = front[1]
     front_axis = np.eye(3)["xyz".index(letter)]
     front_axis = front_axis * (-1.0 if sign == "-" else 1.0)
     up_axis = np.eye(3)["xyz".index(up)]

@@ -78,7 +78,7 @@ class Entry(BaseModel):
     def iterate_entries(self) -> Iterator[Entry]:
         """Yield this entry, and all entries within it."""
         queue: list[object] = [self]
-        for item in queue:  # it grows
+        for item in queue:  # the loop also reaches the items that are added in it
             if isinstance(item, Entry):
                 yield item
                 queue.extend(vars(item).values())
@@ -98,7 +98,8 @@ class Entry(BaseModel):
         keys_of_extension: dict[str, set[str]] = {}
         for info in cls.model_fields.values():
             if isinstance(info.validation_alias, AliasPath):
-                # "extensions", the extension, and its key unless it is an entry itself
+                # A path is "extensions", the name of the extension, and a key in it. It
+                # has no key if the field is the extension itself.
                 _, extension, *keys = map(str, info.validation_alias.path)
                 keys_of_extension.setdefault(extension, set()).update(keys[:1])
         return keys_of_extension
@@ -111,7 +112,7 @@ class Entry(BaseModel):
         """
         for name, value in vars(self).items():
             queue: list[Any] = [value] if name in REFERENCED_LISTS else []
-            for item in queue:  # it grows
+            for item in queue:  # the loop also reaches the items that are added in it
                 if isinstance(item, int):
                     yield REFERENCED_LISTS[name], item
                 elif isinstance(item, (list, dict)):

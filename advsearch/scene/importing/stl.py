@@ -173,9 +173,11 @@ def _read_colors(
     if object_color is not None:
         colors = colors[:, ::-1]
         default_color = object_color
-        # If no facet has any bit set, none has a color, and all have the object's.
+        # If no facet has any bit set, colors were not stored, and all facets have the
+        # object's.
         has_any_bits = bool(attributes.any())
-        has_color = (attributes & _COLOR_FLAG == 0) & has_any_bits
+        is_flag_unset = attributes & _COLOR_FLAG == 0
+        has_color = is_flag_unset & has_any_bits
     else:
         default_color = np.full(3, NEUTRAL_GREY, np.float32)
         has_color = attributes & _COLOR_FLAG != 0

@@ -36,7 +36,7 @@ class TrackedKeys(Generic[T]):
         fold: Callable[[str], str] = str,
         prefix: str = "",
     ) -> None:
-        """Fold all keys, and find those with the same folded key as a later one.
+        """Store the values by folded key, and collect repeated keys.
 
         Args:
             values: values by key, as the file spells the keys.
@@ -63,8 +63,8 @@ class TrackedKeys(Generic[T]):
     def get(self, *keys: str) -> T | None:
         """Return the value of the first of several folded keys that has one, or None.
 
-        That key is marked as read, and so are keys without a value. Other keys with a
-        value stay unread, since their values are ignored.
+        That key is marked as read, and so are those of `keys` that have no value. Other
+        keys stay unread, since their values are ignored.
         """
         keys_with_value = [key for key in keys if self._values.get(key) is not None]
         ignored_keys = keys_with_value[1:]
