@@ -185,7 +185,8 @@ class Detection(ClassTask):
         self._check_choice("boxes", ("", *FORMS))
         self._check_choice("unit", ("", *UNITS))
         self._check_choice("seek", tuple(GOALS))
-        # The option `seek` is set by the setting `objective` of a run.
+        # Users set the option `seek` by the setting `objective` of a run. So messages call
+        # it the objective.
         if self.target is not None and self.seek not in ("mislabel", "create"):
             raise InputError(
                 f"target: the objective {self.seek} has none; set `objective` to "
@@ -224,9 +225,11 @@ class Detection(ClassTask):
         with torch.no_grad():
             noise = torch.rand((1, *model.input_size, 3), generator=generator)
             output = model(noise)
-        # Rows of NaN in the output for noise are unused rows, and no error.
+        # Rows of NaN, which are counted as "n_nan_rows", are no error in the output for
+        # noise: the model leaves them in unused rows.
         fills_with_nan = any("n_nan_rows" in detections for detections in output)
-        # Options of the user take precedence over the network's declaration.
+        # The network may declare the format of its boxes by an attribute. Options of the
+        # user take precedence.
         has_format_options = bool(self.boxes or self.unit)
         is_declared = not has_format_options and getattr(
             model.module, DECLARED_FORMAT_ATTRIBUTE, False
@@ -250,16 +253,17 @@ class Detection(ClassTask):
     ) -> Detection:
         """Infer the format of the boxes from the clean image, and store doubts about it.
 
-        If there are boxes of right classes and a true box, the format in which one of
-        them fits best is compared with the one in use. Otherwise the boxes with the best
-        scores are checked for plausibility.
+        If there are boxes of right classes and a true box, the boxes should fit it in
+        the inferred format: doubts name a format in which one fits much better.
+        Otherwise doubts are about implausible boxes among those with the best scores.
 
         Args:
             output: output of the model for the clean image.
             truth: truth of that image; None if it is unknown.
 
         Returns:
-            The task with its `format_doubts`: why its format may be wrong, or "".
+            The task with its `format_doubts`: why its format may be wrong, "" if there is
+            no reason.
         """
         task = self._infer_format(output)
         output = task._resolve_grids(output)
@@ -304,7 +308,8 @@ class Detection(ClassTask):
         """Return the task with the order and unit that an output of its model shows.
 
         An order or unit that this output does not show stays as it was inferred from an
-        earlier output: noise comes first, and then the clean image.
+        earlier output. The first output is for noise (see `on`), the next for the clean
+        image (see `after_calibration`).
         """
         order = self._infer_order(output)
         grids = [detections["grid"] for detections in output if "grid" in detections]
@@ -350,7 +355,7 @@ class Detection(ClassTask):
         is_last_nothing = self.has_class_names and is_nothing_name(self.labels[-1])
         if not stated_order and has_logits and is_last_nothing:
             stated_order = SOFTMAX_QUERIES
-        # Only names show the number of classes; it counts a last one for nothing, too.
+        # Without names the number of classes is unknown. A last class for nothing counts.
         n_classes = len(self.labels) if self.has_class_names else None
         try:
             return outputs.infer_order(output, n_classes, stated_order)
@@ -382,18 +387,19 @@ class Detection(ClassTask):
             return False
         channel_axis = 0 if order.endswith(CHANNELS_FIRST) else 1
         n_channels = grids[0].shape[channel_axis]
-        # The first score has as many channels before it: those of the box, and perhaps
-        # objectness. No head is the beginning of another one.
+        # The channels of the box, and perhaps of objectness. `order` is a head and a
+        # layout; it begins with one head only.
         n_channels_before_scores = next(
             first_score for head, first_score in HEADS.items() if order.startswith(head)
         )
         return n_channels > n_channels_before_scores + len(self.labels)
 
     def _resolve_grids(self, output: Sequence[Detections]) -> Sequence[Detections]:
-        """Return an output whose YOLO grids or DETR logits are boxes and scores.
+        """Convert YOLO grids or DETR logits in an output to boxes and scores.
 
-        Other outputs are returned unchanged.
+        Outputs without them are returned unchanged.
         """
+        # All images of an output have the same form.
         if any("grid" in detections or "logits" in detections for detections in output):
             return self._resolve_labels(output)
         return output
@@ -520,6 +526,7 @@ class Detection(ClassTask):
             instead by how much the best phantom exceeds `confidence`; a phantom is a
             box at a spot without an object of its class.
         """
+        # These scores are over 0 if the prediction is wrong, as a loss is.
         if self.seek == "create":
             loss_of_image = self._score_create
         else:
@@ -533,11 +540,12 @@ class Detection(ClassTask):
     def score(self, output: Sequence[Detections], truth: DetectionTruth) -> Tensor:
         """Compute how near each output is to what is sought, (N,), in log-odds.
 
-        It is over 0 if the output is a success. The loss reads only boxes that survive
-        suppression. A score also reads suppressed boxes with a right class, so that the
-        object has not vanished if only suppressed boxes are at it. A box that has to
-        exist for a success, with a wrong class or where nothing is, has to survive
-        suppression.
+        It is over 0 if the output is a success.
+
+        Suppression is treated so that it does not make an attack succeed. A suppressed
+        box of a right class at the object still counts: the object has not vanished. But
+        a box that makes the attack succeed, with a wrong class or where nothing is, has
+        to survive suppression. (The loss reads only boxes that survive.)
         """
         # `__post_init__` allows `minimise` for the goal "vanish" only.
         if self.minimise:
@@ -562,9 +570,10 @@ class Detection(ClassTask):
         """Apply a function to the detections of each image, (N,).
 
         The value is NaN if the detections cannot be judged, as with a box that is not
-        finite (`_is_broken`). If the object is out of view, the value is -1, which
-        stands for a right prediction. The goal "create" is an exception: it seeks boxes
-        at positions without an object, so that the object need not be visible.
+        finite (`_is_broken`). If the object is out of view, the value is -1: as a loss a
+        right prediction, as a score no success. The goal "create" is an exception: it
+        seeks boxes at positions without an object, so that the object need not be
+        visible.
 
         Args:
             output: output of N images.
@@ -598,8 +607,8 @@ class Detection(ClassTask):
 
         It is mislabeled if it has vanished, and a box at the object has a wrong class. So
         the score is the smaller of two numbers: that of the goal "vanish", and by how
-        much the best wrong box at the object exceeds `confidence`. Only the wrong box
-        has to survive suppression.
+        much the best wrong box at the object exceeds `confidence`. The wrong box has to
+        survive suppression. Boxes of a right class count even if they are suppressed.
         """
         wrong_score = self._find_rival_scores(self._suppress(detections), truth.labels)
         # suppression changes scores only, so that boxes are the same
@@ -619,9 +628,9 @@ class Detection(ClassTask):
         """
         scores = self._find_best_scores(detections, truth.labels)
         score_excess = compute_log_odds(max_or_zero(scores)) - self._min_log_odds
-        counts = scores >= self.confidence
+        is_found = scores >= self.confidence
         overlaps = compute_iou_with_truth(detections, truth)
-        best_overlap = max_or_zero(overlaps, counts)
+        best_overlap = max_or_zero(overlaps, is_found)
         # The derivative of log-odds at `iou` is 1 / (iou (1 - iou)).
         overlap_shortfall = (self.iou - best_overlap) / (self.iou * (1.0 - self.iou))
         return torch.minimum(overlap_shortfall, score_excess)
@@ -665,10 +674,10 @@ class Detection(ClassTask):
     def _read_boxes(self, output: Sequence[Detections]) -> list[Detections]:
         """Return the detections of each image with boxes as fractions of the image.
 
-        Classes such as "no object" get a score of 0. A box that is not finite makes the
-        output broken (`_is_broken`). But it is removed here if all its scores are too
-        low to be stored, since networks leave such boxes in unused rows. A score of NaN
-        does not count as low.
+        Classes such as "no object" get a score of 0. Boxes that are not finite are removed
+        if all their scores are too low to be stored, since networks leave such boxes in
+        unused rows. Other boxes that are not finite stay, and make the output broken
+        (`_is_broken`).
         """
         images = list[Detections]()
         box_format = self._box_format
@@ -677,9 +686,9 @@ class Detection(ClassTask):
             scores = self._clear_nothing_classes(detections)
             resolved = {**detections, "boxes": boxes, "scores": scores}
             is_finite = boxes.detach().isfinite().all(dim=1)
-            has_low_scores = (get_possible_scores(resolved) < self._min_score).all(
-                dim=1
-            )
+            # false for a score of NaN
+            is_low = get_possible_scores(resolved) < self._min_score
+            has_low_scores = is_low.all(dim=1)
             is_used = is_finite | ~has_low_scores
             if not bool(is_used.all()):
                 resolved = {
@@ -710,10 +719,11 @@ class Detection(ClassTask):
     def _is_broken(self, detections: Detections) -> bool:
         """Return whether the detections of an image cannot be judged.
 
-        They cannot if a score or a box is not finite. They cannot either if all rows of
-        the output were NaN, unless the model fills unused rows with NaN: then such an
-        output means that nothing is detected.
+        This is so if a score or a box is not finite, or if all rows of the output were
+        NaN. An exception are models that fill unused rows with NaN: then rows of NaN mean
+        that nothing is detected.
         """
+        # Rows of NaN have been removed. If there were any, "n_nan_rows" is their count.
         has_only_nan_rows = "n_nan_rows" in detections and not len(detections["boxes"])
         if has_only_nan_rows and not self.fills_with_nan:
             return True
@@ -791,12 +801,16 @@ class Detection(ClassTask):
     ) -> Tensor:
         """Return the score of each box as a phantom, (D,); 0 if the box is none.
 
-        A phantom is a box at a position without an object of its class. A box of a
-        right class is a phantom if it is on no object of these classes, however loosely.
-        The true boxes of other classes are unknown. So a box of another class is a
-        phantom only if it is elsewhere than the object: at the object, it would be a
-        wrong class for the object. If there is a target, only the scores of target
-        classes count.
+        A phantom is a box at a position without an object of its class:
+
+        - A box of a right class is a phantom if it is on no object of the right classes,
+          not even loosely (`_is_on_nothing`).
+        - The true boxes of other classes are unknown. A box of another class is a phantom
+          if it is away from the object (`_is_elsewhere`): at the object, it would be a
+          wrong class for the object.
+
+        If there is a target, only the scores of target classes count; they may be right
+        classes of the object, too.
         """
         if self.target is None:
             right_score = self._find_best_scores(detections, truth.labels)
@@ -832,13 +846,18 @@ class Detection(ClassTask):
     def _find_rival_scores(self, detections: Detections, classes: Labels) -> Tensor:
         """Return the best score of each box for a class that the attack seeks, (D,).
 
-        These are the classes of the target; without a target, all but `classes`, which
-        are the right ones.
+        These rivals of the right classes are the classes of the target; or without a
+        target, all other classes.
+
+        Args:
+            detections: detections of an image.
+            classes: the right classes.
         """
         if self.target is not None:
             return self._find_best_scores(detections, self.target)
         if "labels" in detections:
-            # the score of the box's own class, or 0 if that is one of `classes`
+            # A box has one class and score. The second term is that score if the class is
+            # one of `classes`, else 0. So rivals keep their score, and others get 0.
             return detections["scores"] - self._find_best_scores(detections, classes)
         n_classes = detections["scores"].shape[1]
         rivals = tuple(sorted(set(range(n_classes)) - set(classes)))
@@ -947,8 +966,8 @@ class Detection(ClassTask):
         """Return the outcome for an image in which the object is out of view.
 
         It is a phantom if a box of a right class reaches `confidence` and is on no
-        object of these classes. Otherwise there is no outcome. With the goal "create",
-        `_match_object` has found no phantom, so that there is none here.
+        object of these classes. Otherwise there is no outcome. With the goal "create"
+        there is none either, because `_match_object` has looked for phantoms before.
         """
         right_score = self._find_best_scores(detections, truth.labels)
         is_on_nothing = self._is_on_nothing(detections, truth)
@@ -964,7 +983,7 @@ class Detection(ClassTask):
     ) -> ObjectMatch:
         """Return the outcome for an object that is in view.
 
-        The outcomes are tried in order, the best one for the model first. The first one
+        The outcomes are tried in order, from a found object to worse ones. The first one
         whose best box reaches `confidence` is returned with that box. If there is none,
         the object is missed.
         """
@@ -972,7 +991,9 @@ class Detection(ClassTask):
         is_on_nothing = self._is_on_nothing(detections, truth)
         is_at_object = self._is_at_object(detections, truth)
         is_loose = self._is_loosely_on_object(detections, truth) & ~is_at_object
+        # of target classes only, if there is a target
         wrong_score = self._find_rival_scores(detections, truth.labels)
+        # outcome, scores that count for it, and boxes that count for it
         candidates = (
             (Outcome.FOUND, right_score, is_at_object),
             (Outcome.WRONG_CLASS, wrong_score, is_at_object),
@@ -1014,7 +1035,9 @@ class Detection(ClassTask):
         score = float(scores[row])
         if "labels" in detections:
             class_id = int(detections["labels"][row])
-        else:  # the first class that has this score
+        else:
+            # The first class with this score. It is equal exactly, since `score` is one of
+            # the scores of the box.
             class_id = int((detections["scores"][row] == score).nonzero()[0])
         iou = None
         if truth.box is not None:
@@ -1024,15 +1047,16 @@ class Detection(ClassTask):
     def _describe_match(self, match: ObjectMatch, truth: DetectionTruth) -> Prediction:
         """Return the prediction about the object, with the score of the deciding box.
 
-        If the object is out of view, that is the prediction, whatever is detected. But
-        with the goal "create" a detected phantom is the prediction.
+        If the object is out of view, the prediction says only that, whatever is detected.
+        An exception is a detected phantom with the goal "create".
         """
         class_name = self.get_class_name(match.class_index)
         is_out_of_view = truth.box is None and self.seek != "create"
         if match.outcome is None or is_out_of_view:
             return Prediction(OUT_OF_VIEW)
         if match.outcome in LABELS:
-            label = LABELS[match.outcome].format(class_name)
+            label = LABELS[match.outcome].format(class_name)  # "mug elsewhere"
+            # Such a label is no class, so that it has no index.
             return Prediction(label, None, match.score)
         return Prediction(class_name, match.class_index, match.score)
 

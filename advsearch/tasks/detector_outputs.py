@@ -151,7 +151,8 @@ def parse_order(text: str) -> tuple[str, ...]:
     if is_head_or_query:
         return names
     components = list(NAMES)  # boxes, scores and labels
-    if sorted(names) not in (sorted(components), sorted([*components, "batch"])):
+    is_known = sorted(names) in (sorted(components), sorted([*components, "batch"]))
+    if not is_known:
         raise ValueError(
             f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', "
             f"of a YOLO's head {' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or "
@@ -193,6 +194,7 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
         and predictions.shape[0] == count
         and predictions.shape[2] != 4  # boxes without scores, as of a DETR
     )
+    # rows of a box, a score, a class and mask coefficients
     has_mask_rows = is_single_tensor and _has_mask_rows(predictions, channels)
     if is_single_tensor and _is_grid(predictions, order, has_mask_rows=has_mask_rows):
         return [
@@ -200,10 +202,12 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
         ]
     if has_mask_rows:
         # The mask coefficients after the first six columns are not read.
-        rows = read_detections(predictions[..., :6], count, order)
+        without_masks = predictions[..., :6]
+        rows = read_detections(without_masks, count, order)
         return [{**detections, "map_channels": map_channels} for detections in rows]
-    # The user states the order of a YOLO head, but the output is no grid.
-    if "objectness" in order_names or "channels" in order_names:
+    # If the user states the order of a YOLO head, the output should have been a grid.
+    is_head_stated = "objectness" in order_names or "channels" in order_names
+    if is_head_stated:
         raise ValueError(EXPECTED)
     return [
         _check_detections(components)
@@ -215,7 +219,8 @@ def _is_grid(predictions: Tensor, order: str, *, has_mask_rows: bool) -> bool:
     """Return whether a tensor (N, A, B) is the output of a YOLO head.
 
     Its channels can be read only with the number of classes. Other tensors have rows: a
-    box, a score and a class, and perhaps mask coefficients.
+    box, a score and a class, and perhaps mask coefficients. Without a stated order, six
+    columns are such rows.
 
     Args:
         predictions: the tensor.
@@ -249,11 +254,12 @@ def _has_mask_rows(grid: Tensor, channels: Collection[int]) -> bool:
         channels: numbers of channels of the feature maps that came with them. One of
             these has a channel for each coefficient.
     """
-    n_coefficients = grid.shape[2] - 6  # without four numbers of a box and two others
+    n_coefficients = grid.shape[2] - 6  # without a box (4 columns), a score and a class
     if n_coefficients not in channels:
         return False
     class_column = grid[..., 5]
-    return bool((class_column == class_column.round()).all())
+    is_integer = class_column == class_column.round()
+    return bool(is_integer.all())
 
 
 def _split_queries(boxes: Tensor, logits: Tensor) -> list[Detections]:
@@ -299,12 +305,15 @@ def _split_images(
             else _find_components(output, order_names)
             for output in returned
         ]
-    # rows of all images: a box, two numbers, and the index of the image
-    if isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7:
+    # rows (D, 7) of all images: a box, two numbers, and the index of the image
+    has_rows_of_all_images = (
+        isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7
+    )
+    if has_rows_of_all_images:
         return _split_batch_rows(returned, count, order_names)
     batch = _find_components(returned, order_names)
     if batch["boxes"].ndim == 2 and count == 1:
-        # The network has dropped the batch dimension.
+        # The network has dropped the batch dimension, which is added again.
         batch = {name: component[None] for name, component in batch.items()}
     if batch["boxes"].ndim != 3 or any(len(x) != count for x in batch.values()):
         raise ValueError(EXPECTED)
@@ -335,7 +344,7 @@ def _split_batch_rows(
     names_before: Sequence[str] = ()
     if "batch" in order_names:
         names_before = order_names[: order_names.index("batch")]
-    # A name has one column, but "boxes" has four.
+    # A name has one column, but "boxes" has four. The column is 0 without a stated order.
     batch_column = sum(4 if name == "boxes" else 1 for name in names_before)
     image_index = rows.detach()[:, batch_column]
     is_index = (
@@ -349,6 +358,7 @@ def _split_batch_rows(
         [rows[:, :batch_column], rows[:, batch_column + 1 :]], dim=1
     )
     other_names = [name for name in order_names if name != "batch"]
+    # Padding, with the index -1, is in no image.
     return [
         _find_components(other_columns[image_index == index], other_names)
         for index in range(count)
@@ -401,20 +411,22 @@ def _are_fraction_boxes(tensor: Tensor) -> bool:
 
 
 def _split_off_maps(returned: Any) -> tuple[Any, set[int]]:
-    """Split the tuple that a YOLO network returns into predictions and feature maps.
+    """Take the predictions out of the tuple that a YOLO network returns.
 
     The predictions (N, A, B) come first. Feature maps (N, K, h, w) and prototypes of
     masks follow, also nested in lists and mappings.
 
     Returns:
-        The predictions, and the numbers of channels K of the maps. An output of any
-        other form is returned unchanged, with an empty set.
+        The predictions, and the numbers of channels K of the maps, of which one may be
+        the number of mask coefficients. An output of any other form is returned
+        unchanged, with an empty set.
     """
     is_sequence = isinstance(returned, (list, tuple)) and len(returned) > 0
     if not is_sequence or not isinstance(returned[0], Tensor):
         return returned, set()
     predictions = returned[0]
     rest = returned[1:]
+    # boxes (N, D, 4) without scores, whose scores follow as another tensor
     is_boxes = predictions.ndim == 3 and predictions.shape[2] == 4
     # Feature maps have four axes. Tensors with fewer are scores or labels: then the tuple
     # is not that of a YOLO network.
@@ -471,10 +483,9 @@ def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Ten
     # Without known names, the stated order identifies the tensors, or else their shapes.
     tensors = _list_tensors_in_order(returned)
     if order_names and len(tensors) == len(order_names):
-        components = dict(
-            zip(order_names, tensors, strict=True)
-        )  # each order has boxes
-        # (D,) or (N, D); scores and labels may have a further axis of one
+        components = dict(zip(order_names, tensors, strict=True))
+        # (D,) or (N, D). Scores and labels may have another axis of size one, which is
+        # removed. Each order has boxes.
         shape = components["boxes"].shape[:-1]
         return {
             name: _squeeze_last(tensor, shape) for name, tensor in components.items()
@@ -521,7 +532,8 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
     """Find the components of a mapping or an object by their names.
 
     A component has one of its `NAMES`, or else is the only tensor with one of its
-    `WORDS` in the name.
+    `WORDS` in the name. A tensor is used once: for the first component, in the order of
+    `NAMES`, that it fits.
 
     Returns:
         Those of "boxes", "scores" and "labels" that are found; None if it is neither a
@@ -538,7 +550,7 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
             name for name in tensors if any(word in name.lower() for word in words)
         ]
         if exact or len(similar) == 1:
-            match = (exact or similar)[0]
+            match = exact[0] if exact else similar[0]
             # taken out, so that no tensor is found for two components
             components[component] = tensors.pop(match)
     return components
@@ -569,9 +581,10 @@ def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:
 def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
     """Identify the components of a tuple by shape and type.
 
-    Boxes have four columns. A single further tensor with the same number of axes is a
+    Boxes have four columns. A single other tensor with the same number of axes is a
     score for every class. Otherwise there are two numbers for each box: the label has an
-    integer type, or both are "score_or_label", (..., 2).
+    integer type, or both are "score_or_label", (..., 2). Tensors that have no number for
+    each box are left out.
 
     Raises:
         ValueError: shapes and types do not identify them.
@@ -589,6 +602,7 @@ def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
     numbers = [_squeeze_last(tensor, shape) for tensor in others]
     integers = [tensor for tensor in numbers if not tensor.is_floating_point()]
     has_other_shape = any(tensor.shape != shape for tensor in numbers)
+    # Of two integers none is a score.
     if len(numbers) != 2 or len(integers) == 2 or has_other_shape:
         raise ValueError(EXPECTED)
     if integers:
@@ -606,15 +620,15 @@ def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
 def _find_boxes_by_shape(tensors: Sequence[Tensor]) -> Tensor:
     """Return which of several tensors holds the boxes: it has four columns.
 
-    Scores of four classes have four columns too, but no values over 1. So of several
-    tensors with four columns the only one with such values is chosen; otherwise the
-    first one.
+    Two kinds of scores have four columns, too. One score for each of exactly four boxes
+    (N, 4) has an axis less than boxes (N, 4, 4). Scores of four classes (N, D, 4) have
+    no values over 1, but boxes in pixels have. So of several tensors with as many axes,
+    the only one with such values is chosen; otherwise the first one.
 
     Raises:
-        ValueError: there are no boxes, or nothing else.
+        ValueError: there are no boxes, or there is no other tensor.
     """
     with_four_columns = [x for x in tensors if x.ndim > 1 and x.shape[-1] == 4]
-    # Scores of exactly four boxes have four columns too, but an axis less than boxes.
     max_ndim = max((x.ndim for x in with_four_columns), default=0)
     candidates = [x for x in with_four_columns if x.ndim == max_ndim]
     if not candidates or len(tensors) < 2:
@@ -656,8 +670,8 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
     if labels is not None:
         checked["labels"] = labels.long()
     detections = dict(_remove_padding(checked, is_padding, values))
-    # Pairs "score_or_label" were checked before, and rows of NaN were removed then. Their
-    # count is kept.
+    # Components of pairs "score_or_label" come here a second time, with scores and labels
+    # identified. Rows of NaN were removed, and counted, the first time.
     if "n_nan_rows" in components:
         detections["n_nan_rows"] = components["n_nan_rows"]
     return detections
@@ -685,8 +699,8 @@ def _find_padding(boxes: Tensor, scores: Tensor, labels: Tensor | None) -> Tenso
 def _remove_padded_pairs(boxes: Tensor, pairs: Tensor) -> Detections:
     """Return boxes with their pairs ("score_or_label"), without rows of padding.
 
-    Such a row has an invalid box, and its two numbers are not both positive. NaN is not
-    positive.
+    Such a row has an invalid box, and at least one of its two numbers is not positive
+    (or NaN).
 
     Args:
         boxes: (D, 4).
@@ -728,14 +742,15 @@ def _check_scores(components: Mapping[str, Tensor]) -> tuple[Tensor, Tensor | No
 def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
     """Raise ValueError if a score is outside [0, 1].
 
-    NaN and plus infinity are not checked here; they make an output broken. Scores without
-    labels may be logits of a DETR. Then the message names the option that states this.
+    NaN and plus infinity are no error here: they make an output broken, which is found
+    later. Scores without labels may be logits of a DETR, and the message names the option
+    that states this.
 
     Args:
         values: scores, of any shape.
         has_labels: whether each box has a label and a single score.
     """
-    is_too_low = values < -TOLERANCE  # also minus infinity, as in logits
+    is_too_low = values < -TOLERANCE  # also minus infinity, which logits may be
     is_too_high = (values > 1.0 + TOLERANCE) & values.isfinite()
     if not bool((is_too_low | is_too_high).any()):
         return
@@ -757,12 +772,12 @@ def _remove_padding(
     """Return the components of an image without rows of padding.
 
     If some of the removed rows are all NaN, their count is added as "n_nan_rows": an
-    output with nothing else may be broken.
+    output without other rows may be broken.
 
     Args:
         components: components of one image, with a row for each box.
         is_padding: which rows are padding, (D,) bool.
-        values: numbers of each box other than its coordinates, (D, K).
+        values: scores of each box, or its score and label, (D, K).
     """
     if not bool(is_padding.any()):
         return components
@@ -794,14 +809,17 @@ def resolve_detections(
         ValueError: the values do not show the order, or contradict it.
     """
     if "grid" in detections or "logits" in detections:
-        if classes is None:  # such an output can't be read: name the expected ones
+        if classes is None:
+            # Without the number of classes it can't be read. The message lists the outputs
+            # that can.
             raise ValueError(EXPECTED)
         order = order or infer_order([detections], classes)
         return _check_detections(_split_by_class_count(detections, classes, order))
     if "score_or_label" in detections:
         order = order or infer_order([detections], classes)
         return _resolve_pairs(detections, order)
-    # Scores and labels are known already.
+    # Scores and labels are known already. The channels of feature maps are only needed to
+    # identify them.
     return {name: value for name, value in detections.items() if name != "map_channels"}
 
 
@@ -848,11 +866,10 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
                 "the output does not show which of a box's two numbers is its score; "
                 f"{ORDER_ADVICE}"
             )
-        order = SCORES_FIRST  # any order will do, since no box counts
+        order = SCORES_FIRST  # no box has a score, so that the order does not matter
     if order in HEAD_ORDERS:
         # Both are scores of classes; or the first is objectness, the probability of any
-        # object in the box, and the score of the only class is their product. There are
-        # no feature maps with such pairs.
+        # object in the box, and the score of the only class is their product.
         has_objectness = order.startswith(OBJECTNESS_HEAD)
         scores = pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
         return _check_detections({"boxes": detections["boxes"], "scores": scores})
@@ -876,10 +893,11 @@ def infer_order(
 ) -> str:
     """Infer from values and sizes in which order a network returns scores and classes.
 
-    For logits and grids the number of classes shows it. Without that it is unknown. If a
-    box has two numbers, their values show it (`_infer_pair_order`): a class is an
-    integer, and a score is in [0, 1] and does not rise from box to box, since suppression
-    sorts by score. If neither is a class, both are scores.
+    The order of logits and grids follows from the number of classes, and is unknown
+    without that. The order of two numbers of a box follows from their values
+    (`_infer_pair_order`): a class is an integer, and a score is in [0, 1] and does not
+    rise from box to box, since suppression sorts by score. If neither is a class, both
+    are scores.
 
     Args:
         detections_of_images: detections of images.
@@ -899,7 +917,8 @@ def infer_order(
     if classes is not None:
         logits = [x["logits"] for x in detections_of_images if "logits" in x]
         if logits:
-            return _infer_logit_order(logits[0].shape[1], classes, head)
+            n_logits = logits[0].shape[1]  # the same for all images
+            return _infer_logit_order(n_logits, classes, head)
         grids = [x for x in detections_of_images if "grid" in x]
         if grids:
             return _infer_grid_order(grids, classes, head)
@@ -925,7 +944,8 @@ def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
     order = head
     if not order:
         order = SOFTMAX_QUERIES if has_nothing_logit else SIGMOID_QUERIES
-    # With a softmax, the class for no object may also be one of the labels.
+    # With a softmax there is a class for no object. It may be one of the labels, and is
+    # then counted in `classes`; otherwise there is one logit more than classes.
     allows_nothing_logit = order == SOFTMAX_QUERIES
     if n_logits == classes or (allows_nothing_logit and has_nothing_logit):
         return order
@@ -956,14 +976,11 @@ def _infer_grid_order(grids: Sequence[Detections], classes: int, head: str) -> s
     Raises:
         ValueError: no order fits all of them, or several do.
     """
-    orders_of_images = [
-        set(
-            find_head_orders(
-                detections["grid"], detections["map_channels"].tolist(), classes, head
-            )
-        )
-        for detections in grids
-    ]
+    orders_of_images = []
+    for detections in grids:
+        map_channels = detections["map_channels"].tolist()
+        fitting = find_head_orders(detections["grid"], map_channels, classes, head)
+        orders_of_images.append(set(fitting))
     orders = set.intersection(*orders_of_images)
     if not orders:
         raise ValueError("the numbers of different pictures have different orders")
@@ -1009,14 +1026,16 @@ def _infer_pair_order(
             if order:
                 return order
         if classes is not None:
-            # The number of classes may be wrong: try without it.
+            # An index may be too large because the number of classes is wrong: try without
+            # that number.
             return _infer_pair_order(detections_of_images, classes=None)
         raise ValueError(
             "expected for each box a score in [0, 1] and the index of a "
             "class, got other numbers"
         )
     if fits_scores_first and fits_labels_first:
-        # Numbers such as 0 and 1 may be scores or classes.
+        # Numbers such as 0 and 1 may be scores or classes. Then the column that falls has
+        # the scores.
         fits_scores_first = _is_falling(pairs_of_images, column=0)
         fits_labels_first = _is_falling(pairs_of_images, column=1)
         if fits_scores_first == fits_labels_first:  # both columns fall, or none does
@@ -1102,20 +1121,23 @@ def find_head_orders(
         Orders such as "boxes scores channels first".
 
     Raises:
-        ValueError: it has none of them; the message states what it seems to be.
+        ValueError: it has none of them, or it may be the output of an OBB head; the
+            message states what it seems to be.
     """
     orders = list[str]()
-    # Why an order of the right size does not fit. An angle is the best explanation, and
-    # otherwise the first one is reported.
+    # Why no order fits, for the message: an angle if possible, otherwise the first reason.
     problem = ""
     for name in _list_orders_of_size(returned.shape, map_channels, classes, order):
         _, scores = split_grid(returned, classes, name, multiply_objectness=False)
         scores = scores.detach()
         is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
-        if not bool((is_outside & scores.isfinite()).any()):
+        # scores that are not finite make an output broken, in any order
+        fits = not bool((is_outside & scores.isfinite()).any())
+        is_only_last_outside = not bool(is_outside[:, :-1].any())
+        if fits:
             orders.append(name)
-        elif name == _OBB_LIKE_ORDER and not bool(is_outside[:, :-1].any()):
-            # Only the last channel is outside of [0, 1]: it is an angle.
+        elif name == _OBB_LIKE_ORDER and is_only_last_outside:
+            # The last channel is no score but an angle.
             problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
         elif not problem:
             problem = (
@@ -1123,8 +1145,9 @@ def find_head_orders(
                 f"{float(scores.max()):.3g} if it is read as '{name}'; "
                 "expected probabilities in [0, 1]: apply a sigmoid to them"
             )
-    # The angle of an OBB head may be in [0, 1] as well. So this order is accepted only if
-    # the user states it.
+    # An OBB head (box, scores, angle) has as many channels as a head with objectness (box,
+    # objectness, scores). If its angle is in [0, 1], both look the same. So this order is
+    # accepted only if the user states it.
     if orders == [_OBB_LIKE_ORDER] and not order:
         raise ValueError(
             f"its {5 + classes} channels may be those of an OBB head (with an angle), "
@@ -1152,11 +1175,13 @@ def _list_orders_of_size(
         classes: number of classes.
         order: one of `HEADS`, with or without a layout, to try alone; "" for all.
     """
+    # The first layout has channels on the first axis, the second on the last.
     for layout, n_channels in zip(LAYOUTS, shape, strict=True):
-        for head, first_score in HEADS.items():
+        for head, n_channels_before_scores in HEADS.items():
             name = f"{head} {layout}"
-            n_left_over = n_channels - first_score - classes
-            if order in ("", head, name) and n_left_over in (0, *map_channels):
+            is_tried = order in ("", head, name)
+            n_left_over = n_channels - n_channels_before_scores - classes
+            if is_tried and n_left_over in (0, *map_channels):
                 yield name
 
 
@@ -1169,6 +1194,7 @@ def _make_channel_error(shape: tuple[int, int], classes: int) -> ValueError:
         classes: number of classes.
     """
     n_channels = min(shape)
+    # With channels as the last axis, boxes are rows.
     is_channels_last = shape[0] >= shape[1]
     advice = _advise_on_channels(n_channels, classes, may_be_rows=is_channels_last)
     noun = "classes" if classes > 1 else "class"
@@ -1197,12 +1223,12 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
     # sets of labels with as many classes as there are channels from the first score on
     fitting = [
         f"`labels={name}`"
-        for first_score in HEADS.values()
-        for name in list_sets_of_size(n_channels - first_score)
+        for n_channels_before_scores in HEADS.values()
+        for name in list_sets_of_size(n_channels - n_channels_before_scores)
     ]
     if fitting:
         return f"; {' or '.join(fitting)} would fit"
-    # OBB heads have 1 more channel, YOLO's masks 32, and each keypoint 3.
+    # OBB heads have 1 channel in excess (an angle), YOLO's masks 32, and a keypoint 3.
     if 1 in excess_channels:
         return f", as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
     if 32 in excess_channels:

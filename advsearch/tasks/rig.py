@@ -151,6 +151,7 @@ class Rig(tasks.JointTask):
             # Such a score is minus a loss: that of the target, or that of the truth. The
             # rule combines losses, so the sign is changed before and after it.
             return -self._combine(-scores)
+        # Otherwise the score is a loss itself: over 0 for a wrong prediction.
         return self._combine(scores)
 
     @staticmethod
@@ -186,10 +187,12 @@ class Rig(tasks.JointTask):
         n_images = values.shape[1]
         # index of the deciding loss, if losses are in ascending order
         rank_by_rule = {
-            "any": 0,  # over 0 only if no image is right
-            "all": n_images - 1,  # over 0 unless all images are right
-            # Over 0 unless more than half of the images are right. For four images it is
-            # the third loss: three images have to be right.
+            # The rig is right if any image is: the smallest loss decides.
+            "any": 0,
+            # It is right if all images are: the largest loss decides.
+            "all": n_images - 1,
+            # It is right if more than half of the images are. For four images the third
+            # loss decides: if it is not over 0, three images are right.
             "vote": n_images // 2,
         }
         return values.sort(dim=1).values[:, rank_by_rule[self.rule]]
@@ -277,8 +280,9 @@ class Rig(tasks.JointTask):
         """
         if self.rule == "mean":
             return min(judgements, key=lambda judgement: judgement.margin)
-        # Under other rules the rig's margin is the margin of one of its images. With a
-        # margin of NaN the outcome is not stored.
+        # Under other rules the rig's margin is the margin of one of its images: the image
+        # with the smallest difference, which is 0. If the margin is NaN, this is any
+        # image, and the outcome is not stored.
         return min(judgements, key=lambda judgement: abs(judgement.margin - margin))
 
     def marks(

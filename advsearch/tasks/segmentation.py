@@ -135,7 +135,8 @@ class Segmentation(tasks.ClassTask):
             """
             return -tasks.compute_target_margin(logits, labels)
 
-        # A loss, as if the target were the truth; the score is minus this loss.
+        # At most 0 if enough pixels get a target class, and over 0 otherwise: a loss, as if
+        # the target were the truth.
         target_loss = self._compute_deciding_margin(
             output, truth, compute_target_shortfall, self.target
         )
@@ -170,8 +171,9 @@ class Segmentation(tasks.ClassTask):
         The object's pixels are sorted by margin, in ascending order. The deciding pixel
         is the last one of the first fraction `accuracy` of them, such as pixel 80 of
         100 for 0.8. So its margin is at most 0 exactly if enough pixels have a margin
-        of at most 0. The result is NaN if a margin is not finite, and -1 (a right
-        prediction) if the object is out of view.
+        of at most 0. Here margins are like losses: at most 0 for a right pixel. The
+        result is NaN if a margin is not finite, and -1 (a right prediction) if the object
+        is out of view.
 
         Args:
             output: logits (N, classes, h, w).
@@ -212,6 +214,9 @@ class Segmentation(tasks.ClassTask):
     def _rank_classes(self, logits: Tensor, count: int) -> tuple[tasks.Prediction, ...]:
         """Return the `count` most frequent classes of the pixels of an image.
 
+        Classes that stand for nothing, such as "background", are left out. If there are
+        no others, the prediction is "nothing".
+
         Args:
             logits: (classes, h, w), without a graph.
             count: how many; there may be fewer.
@@ -236,8 +241,8 @@ class Segmentation(tasks.ClassTask):
         )
         if predictions:
             return predictions
-        # all pixels have classes that stand for nothing, or NaN
-        label = "nothing" if len(class_of_pixel) else tasks.NOT_A_NUMBER
+        has_any_number = len(class_of_pixel) > 0
+        label = "nothing" if has_any_number else tasks.NOT_A_NUMBER
         return (tasks.Prediction(label),)
 
     def describe(
@@ -257,12 +262,13 @@ class Segmentation(tasks.ClassTask):
         results: list[tasks.PredictionWithPayload] = []
         mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):
-            # of a batch with this image only
-            pixels = self._select_object_logits(logits[None], truth)
+            # (P, classes) of the object's pixels, from a batch with this image only
+            batch = logits[None]
+            pixels = self._select_object_logits(batch, truth)
             if pixels is None:
                 results.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
                 continue
-            # in the full image: the pixels with a right class
+            # (h, w) which pixels of the full image have a right class
             is_right_class = self._find_right_pixels(logits, truth)
             accuracy = float(is_right_class[mask].float().mean())
             iou = float((is_right_class & mask).sum() / (is_right_class | mask).sum())

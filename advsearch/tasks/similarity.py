@@ -161,13 +161,15 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
         # All images of a batch have the same size. `groupby` keeps the order of the
         # files: it joins neighbors of the same size.
         for _, same_size in itertools.groupby(images, key=lambda image: image.shape):
+            # the next images of this size, until there are none
             while batch := list(itertools.islice(same_size, BATCH_SIZE)):
-                batches.append(model(torch.stack(batch)))
-                if batches[-1].dim() != 2:
+                batch_features = model(torch.stack(batch))
+                if batch_features.dim() != 2:
                     raise InputError(
                         f"model {model.name}: expected features (N, D), "
-                        f"got {tuple(batches[-1].shape)}; use another task"
+                        f"got {tuple(batch_features.shape)}; use another task"
                     )
+                batches.append(batch_features)
     features = torch.cat(batches)
     is_non_finite = ~features.isfinite().all(dim=1)
     if bool(is_non_finite.any()):
@@ -402,7 +404,8 @@ class Similarity(tasks.Classification):
         """
         if self.references:
             return super().find_right_classes(facts)
-        if facts.label is not None:
+        is_label_set_by_user = facts.label is not None
+        if is_label_set_by_user:
             raise InputError(
                 "label: with a `threshold` there are no names, and the clean picture "
                 "is the truth; leave it out"
@@ -417,11 +420,11 @@ class Similarity(tasks.Classification):
         self, output: Tensor, truth: tasks.Labels | None
     ) -> Similarity:
         """Store the features of the clean image, with which others are compared."""
-        # not with references, or if they are stored already
+        # With references no features are compared; and they are stored only once.
         if not self.calibrates:
             return self
         features = functional.normalize(output.detach().float(), dim=1)
-        return replace(self, clean_features=features[0])
+        return replace(self, clean_features=features[0])  # of the only image
 
     def read(self, returned: Any, count: int) -> Tensor:
         """Read features (count, D) from what a network returned.

@@ -201,10 +201,9 @@ class EnsembleTask(JointTask):
             InputError: the model is not from `join_models`, or has not one model per
                 task.
         """
-        is_ensemble = isinstance(model.module, Ensemble)
-        models = model.module.models if is_ensemble else ()
+        models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
-            n_models = len(models) if is_ensemble else 1
+            n_models = len(models) or 1  # a model that is no ensemble is a single one
             raise InputError(
                 f"model: expected {len(self.parts)}, one for each task, got {n_models}"
             )
