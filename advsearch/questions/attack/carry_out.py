@@ -328,16 +328,16 @@ def make_task_and_objective(
     Raises:
         InputError: the objective does not fit the task or the goal.
     """
-    made_task = make_task(task)
+    unbound_task = make_task(task)
     if objective is None:
-        objective = made_task.objective
+        objective = unbound_task.objective
     check_objective(
         objective,
-        made_task.name,
+        unbound_task.name,
         targeted=config.target is not None,
         minimise=config.minimise,
     )
-    return made_task, objective
+    return unbound_task, objective
 
 
 def load_ensemble(

@@ -381,7 +381,8 @@ class AttackConfig(DerivativeConfig):
         options = {
             option: value for option, value in policy.items() if option != "steps"
         }
-        # Read again: without `steps` there may be no options left, but the name alone.
+        # Read again: without `steps`, the mapping may have only the name, which then
+        # becomes a text.
         return {**data, **steps, "policy": read_policy(options)}
 
     @property

@@ -274,8 +274,7 @@ class GradientCheck:
         )
         for row in derivatives:
             # A coordinate of a vector is "center.0"; its group is the full vector.
-            parameter, _, _ = row.parameter.partition(".")
-            group_name = f"{row.control}.{parameter}"
+            group_name = f"{row.control}.{row.parameter.partition('.')[0]}"
             yield part.make_row(row, factor=step_factors.get(group_name, 1.0))
 
     def _choose_estimators(

@@ -312,7 +312,7 @@ def _verdict(result: CheckResult) -> str:
 def _reason_texts(result: CheckResult) -> list[str]:
     """Return why a search takes its estimators and steps: each reason once."""
     groups = result.plan.groups if result.plan else []
-    # all estimators come first, then the steps
+    # (name of the group, what was chosen, why): all estimators first, then the steps
     choices = [(group.name, group.estimator, group.reason) for group in groups]
     choices += [
         (group.name, "step", group.step_reason) for group in groups if group.step_reason
@@ -349,8 +349,8 @@ def find_inadequate(rows: Sequence[CheckedRow]) -> list[str]:
 
     For each parameter and loss only the best row counts, as a plan may use that
     estimator alone. For the model's loss, gradients of full controls count and single
-    derivatives do not: an attack needs the direction of the gradient. If the reference
-    is unusable, nothing is known against the estimator: it is not reported.
+    derivatives do not: an attack needs the direction of the gradient. A parameter whose
+    best estimator has an unusable reference is not reported, as its errors are unknown.
     """
     order = ("ok", "reference unusable", "noisy", "biased")  # the best first
     best_rows: dict[tuple[str, ...], CheckedRow] = {}

@@ -551,8 +551,8 @@ class Hardening:
         # The name of a model is "NETWORK" or "NETWORK@WEIGHTS".
         network_name = self.config.model.partition("@")[0].strip()
         # A name with a colon, such as "mypackage:network", names the code of a network.
-        is_made_by_code = network_name == "reference" or ":" in network_name
-        if is_made_by_code:
+        can_be_loaded = network_name == "reference" or ":" in network_name
+        if can_be_loaded:
             return f"{network_name}@{self.run.path / WEIGHTS_FILE}"
         return None
 

@@ -226,9 +226,8 @@ def join_patches(
         rectangles: where the chart of each patch is in the atlas.
         side: side of the atlas, in texels.
     """
-    vertex_counts = [len(patch.vertices) for patch in patches]
     # index of the first vertex of each patch in the mesh
-    first_vertex = np.cumsum([0, *vertex_counts[:-1]])
+    first_vertex = np.cumsum([0] + [len(patch.vertices) for patch in patches[:-1]])
     all_faces = [
         patch.faces + first for patch, first in zip(patches, first_vertex, strict=True)
     ]

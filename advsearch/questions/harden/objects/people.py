@@ -205,15 +205,15 @@ def _face(t: Texels, color: Array, hair: Array) -> Array:
     skin = np.clip(color * mottling[:, None], 0.0, 1.0)
 
     # how far inside an ellipse, as a fraction; -1 at the back of the head
-    lip_radius = np.hypot(y / 0.025, (z - 1.563) / 0.011)  # 1 at the edge
-    in_lips = np.where(is_front, 1.0 - lip_radius, -1.0)
+    in_lips = np.where(is_front, 1.0 - np.hypot(y / 0.025, (z - 1.563) / 0.011), -1.0)
     lip_color = color * np.array([0.86, 0.62, 0.6])
     skin = blend_colors(
         skin, lip_color, 0.75 * compute_soft_step(in_lips, 0.0, soft=0.25)
     )
 
-    cheek_radius = np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02)
-    in_cheeks = np.where(is_front, 1.0 - cheek_radius, -1.0)
+    in_cheeks = np.where(
+        is_front, 1.0 - np.hypot((abs_y - 0.042) / 0.022, (z - 1.605) / 0.02), -1.0
+    )
     cheek_color = color * np.array([1.0, 0.84, 0.8])
     skin = blend_colors(
         skin, cheek_color, 0.5 * compute_soft_step(in_cheeks, 0.0, soft=0.6)

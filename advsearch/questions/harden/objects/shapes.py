@@ -606,18 +606,10 @@ def make_vessel(
     lip = _round_lip(outside, wall, normal)
     max_radius = float(outside[:, 0].max())
     fillet = min(1.5 * wall, 0.3 * max_radius)  # radius between wall and floor
-    ascending_inner = inner[::-1]
-    floor_radius = radius_at_height(ascending_inner, floor)
-    floor_edge = np.array([floor_radius, floor])
-    # The fillet replaces the edge between wall and floor. It ends on the floor.
-    fillet_end = np.array([max(floor_radius - fillet, 0.4 * floor_radius), floor])
-    is_above_fillet = inner[:, 1] > floor + fillet
     is_open = inner[:, 0] > 0.05 * max_radius  # not where a narrow inside closes
-    inner_wall = inner[is_above_fillet & is_open]
-    rounding = _bezier(inner_wall[-1], floor_edge, fillet_end)
-    inside = np.concatenate([inner_wall, rounding])
-    inside_start = inner_wall[:1]
-    outside_with_lip = np.concatenate([outside, lip, inside_start])
+    inside = _round_floor_edge(inner, is_open, fillet, floor)
+    fillet_end = inside[-1]
+    outside_with_lip = np.concatenate([outside, lip, inside[:1]])
     base = _hollow_base(outside[0], wall, floor)
     pieces = [
         ("base", subdivide(base, longest=3 * step)),
@@ -626,6 +618,27 @@ def make_vessel(
         ("inside", subdivide([fillet_end, (0.0, floor)], longest=3 * step)),
     ]
     return revolve_profile(pieces, columns=columns)
+
+
+def _round_floor_edge(
+    inner: Array, is_open: assets.BoolArray, fillet: float, floor: float
+) -> Array:
+    """Return the profile of a container's wall inside, rounded where it meets the floor.
+
+    Args:
+        inner: profile (K, 2) of the inside without a floor, from the lip downwards.
+        is_open: whether the container is open at each of its points (K,).
+        fillet: radius of the rounding.
+        floor: height of the floor.
+    """
+    ascending_inner = inner[::-1]
+    floor_radius = radius_at_height(ascending_inner, floor)
+    floor_edge = np.array([floor_radius, floor])
+    fillet_end = np.array([max(floor_radius - fillet, 0.4 * floor_radius), floor])
+    is_above_fillet = inner[:, 1] > floor + fillet
+    inner_wall = inner[is_above_fillet & is_open]
+    rounding = _bezier(inner_wall[-1], floor_edge, fillet_end)
+    return np.concatenate([inner_wall, rounding])
 
 
 def _hollow_base(
@@ -1184,8 +1197,7 @@ def _split_faces(
         face_values = value[face]
         is_uncut = face_values.min() >= 0.0 or face_values.max() <= 0.0
         if is_uncut:
-            first, second, third = map(int, face)
-            faces.append((first, second, third))
+            faces += _divide_polygon(face.tolist())  # the triangle itself
             is_inside.append(bool(face_values.sum() > 0.0))
             continue
         outline = _outline_with_cuts(face, value, cut_of_edge)

@@ -392,7 +392,8 @@ def make_facing_mask(
         degrees: azimuth about z of the middle of the label.
         half_width: how far it reaches to both sides, in degrees.
         low, high: heights.
-        soft: width of the ramp at its lower and upper edge.
+        soft: width of the ramp at its lower and upper edge. At both sides the ramp is 2
+            degrees wide.
     """
     weight = band_mask(t.xyz[:, 2], low, high, soft=soft)
     in_band = np.nonzero(weight)[0]

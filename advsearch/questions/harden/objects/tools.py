@@ -297,13 +297,17 @@ def _hammer_handle(
     relative_scale = 1.0 + grip - waist
     rounding = _handle_rounding(t)
     # half the extent along y, the first axis of the section, and along the second axis
-    scale_y = half_width * relative_scale * rounding
-    scale_z = half_thickness * relative_scale * rounding
-    scale = np.stack([scale_y, scale_z], axis=1)
+    scale = np.stack(
+        [
+            half_width * relative_scale * rounding,
+            half_thickness * relative_scale * rounding,
+        ],
+        axis=1,
+    )
     scale[0] *= 0.9  # a bevel at the head
     top_x = half_head * 1.18  # the end that sticks out of the head
-    path_x = top_x - (length + top_x) * t  # from there to -`length`
-    path = np.stack([path_x, 0 * t, 0 * t], axis=1)
+    # from there to -`length`
+    path = np.stack([top_x - (length + top_x) * t, 0 * t, 0 * t], axis=1)
     # Sections reach from -1 to 1, and are multiplied by `scale`.
     if sampler.sample_bool(0.6, canonical=True):
         section = shapes.ellipse(1.0, 1.0, count=24)
@@ -386,7 +390,7 @@ def _hammer_handle_paint(
     return timber
 
 
-def _weights(
+def _make_weight(
     sampler: ParameterSampler, style: str, start: float, length: float, radius: float
 ) -> list[Patch]:
     """Create the weight at the upper end of a dumbbell whose bar is along z.
@@ -486,15 +490,14 @@ def dumbbell(sampler: ParameterSampler) -> Instance:
     half_grip = sampler(5.6, low=5.0, high=7.0)  # half the bar between the weights
     length = sampler(5.6, low=3.8, high=7.0)  # length of a weight
     bar = _dumbbell_bar(sampler, half_grip)
-    weight = _weights(sampler, style, half_grip, length, radius)
+    weight = _make_weight(sampler, style, half_grip, length, radius)
     other_weight = shapes.transform_patches(
         weight, shapes.make_rotation_matrix("y", 180.0)
     )
     upright = bar + weight + other_weight
-    # laid down, and turned
+    lying = shapes.transform_patches(upright, shapes.make_rotation_matrix("y", 90.0))
     patches = shapes.transform_patches(
-        shapes.transform_patches(upright, shapes.make_rotation_matrix("y", 90.0)),
-        shapes.make_rotation_matrix("z", sampler(118.0, low=90.0, high=150.0)),
+        lying, shapes.make_rotation_matrix("z", sampler(118.0, low=90.0, high=150.0))
     )
     paints = _dumbbell_paints(sampler, style, half_grip, length, radius)
     return Instance(
@@ -528,7 +531,7 @@ def _dumbbell_paints(
 
     Args:
         sampler: samples the paints.
-        style: style of the weights, as for `_weights`.
+        style: style of the weights, as for `_make_weight`.
         half_grip: half the length of the bar between the weights.
         length, radius: length and radius of a weight.
     """
@@ -544,7 +547,7 @@ def _dumbbell_paints(
         amount=sampler(0.08, low=0.0, high=0.2),
     )
     # z of the outer side of a weight. A globe has a radius of 0.95 `radius`, and its
-    # center is 0.8 `radius` outside of the grip: see `_weights`.
+    # center is 0.8 `radius` outside of the grip: see `_make_weight`.
     weight_length = 1.75 * radius if style == "globe" else length
     tip = half_grip + weight_length
     accent = sampler.sample_color("c9ccd0", "f2f2f0", "d9a02b", "c23b4a")
