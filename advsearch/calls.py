@@ -69,6 +69,7 @@ def make_unexpected_error(
     for name in keywords:
         if name in known:
             continue
+        # the keyword that the literature calls so, or why there is none
         suggestions, reason = suggest_keyword(name, known)
         # No keyword chooses a device, so a similarly spelled one would be a wrong
         # suggestion for `device`.

@@ -181,6 +181,7 @@ class RunContext(ExitStack, Generic[Settings]):
         for name in ("objects", "controls"):
             if name in shared:
                 shared[name] = list(shared[name])
+        # a total in `fields` replaces this one
         seconds = {
             "total": time.perf_counter() - self._start_time,
             **fields.pop("seconds", {}),

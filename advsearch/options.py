@@ -45,6 +45,7 @@ def group_mitsuba_keys(controls: Mapping[str, object]) -> dict[str, object]:
     for name, options in controls.items():
         kind, colon, key = str(name).partition(":")
         is_mitsuba_key = kind == MITSUBA_CONTROL and bool(colon)
+        # a control without options has None, {} or ""
         has_range = options is not None and options not in ({}, "")
         if not is_mitsuba_key:
             plain[name] = _with_parameter(str(name), options)

@@ -265,8 +265,7 @@ class LineProgress:
         with self._lock:
             now = self._clock()
             elapsed = now - self._stage_started
-            is_announced = self._printed_at is not None
-            if not is_announced:
+            if self._printed_at is None:  # the stage is not announced yet
                 # the name is empty before the first stage
                 if self._name and elapsed >= ANNOUNCE_SECONDS:
                     self._printed_at = now

@@ -85,7 +85,7 @@ def draw_chart_page(title: str, paper: tuple[float, float], convert: Any) -> Fig
             )
         )
 
-    # an image of one row, since PIL converts images only
+    # an image with one row of pixels, since PIL converts images only
     colors = Image.fromarray(np.round(255.0 * CHART_COLORS[None]).astype(np.uint8))
     printed = colors if convert is None else ImageCms.applyTransform(colors, convert)
     levels = np.asarray(printed)[0] / 255.0

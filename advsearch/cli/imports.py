@@ -81,7 +81,7 @@ def _describe_mesh_file(file: str, contents: FileContents) -> Understood:
         contents: the object, nodes, lights and cameras in it.
     """
     mesh_object = contents.object
-    materials = mesh_object.mesh.materials  # indices of faces by name
+    materials = mesh_object.mesh.materials  # indices of the faces of each, by name
     clips, joints, targets = _list_motions(mesh_object.mesh.rig)
     slow_features = _explain_slow_features(mesh_object)  # a sentence for each
     facts = {

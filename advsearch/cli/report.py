@@ -98,6 +98,7 @@ def report(args: argparse.Namespace) -> int:
     exposure = {} if args.exposure is None else read_exposure(args.exposure)
     if args.photographs is not None:
         _add_photographs(args.photographs, args.runs[0])
+    # the claims of all runs; and images by the name of their file
     evidence, images = collect_evidence(
         args.runs,
         criterion=args.criterion,

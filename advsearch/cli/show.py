@@ -82,8 +82,8 @@ def show(args: argparse.Namespace) -> int:
             return _show_declared(kind, name, args.json)
         # An experiment with a list of named choices, such as "recipe NAME".
         case [command, name] if _find_choice_description(command) is not None:
-            describe = load_attribute(_find_choice_description(command))
-            text, facts = describe(name)
+            describe_choice = load_attribute(_find_choice_description(command))
+            text, facts = describe_choice(name)
             return output.print_answer(args.json, {command: name, **facts}, text)
         case [name]:
             try:
@@ -183,8 +183,9 @@ def _show_unfinished(run: ListedRun, as_json: bool) -> int:
     Returns:
         The exit status.
     """
+    is_stopped = run.state == "stopped"
     resume_command = None
-    if run.started and run.state == "stopped":
+    if run.started and is_stopped:
         resume_command = output.make_resume_command(run.path)
     subject = run.command
     if run.object:
@@ -200,7 +201,7 @@ def _show_unfinished(run: ListedRun, as_json: bool) -> int:
     ]
     if resume_command is not None:
         lines += ["", f"Go on with: {resume_command}"]
-    elif run.state == "stopped":
+    elif is_stopped:
         lines += ["", "It has no run.yaml, so it can't be resumed; start again."]
     return output.print_answer(
         as_json,

@@ -467,8 +467,10 @@ class DaskExecutor(WorkerExecutor):
                     if failed_starts == MAX_TRIES:
                         raise self._make_start_error(error) from error
             finally:
-                if client.status == "running":
+                if client.status == "running":  # the scheduler may forget the call
                     future.release()
+            # The call is repeated: its worker or its result was lost, or the worker was
+            # unfit.
             self.stats.retried += 1
             await asyncio.sleep(LOOK_SECONDS)
         raise BrokenExecutor(f"{self.description}: the scheduler has gone")

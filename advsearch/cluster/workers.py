@@ -92,7 +92,7 @@ class PoolWorkers:
         ended: queue.SimpleQueue[Future[Reply]] = queue.SimpleQueue()
         # seconds per item of the last batches, for the deadline of the next
         item_seconds = deque[float](maxlen=MEDIAN_WINDOW)
-        counted_at = self._clock()
+        counted_at = self._clock()  # time of the last count of workers
         try:
             while True:
                 INTERRUPTS.raise_pending()
@@ -109,7 +109,7 @@ class PoolWorkers:
                         run_batch, self._task, items, deadline
                     )
                     running[future] = items
-                    future.add_done_callback(ended.put)
+                    future.add_done_callback(ended.put)  # puts the future itself
                 self.stats.max_running = max(self.stats.max_running, len(running))
                 if not running and not queued.has_next():
                     return

@@ -136,10 +136,11 @@ class Result(Fields):
         facts = {}
         for name, field in self.get_described_fields().items():
             extra = field.json_schema_extra
+            if not isinstance(extra, dict) or "fact" not in extra:
+                continue
             value = getattr(self, name)
-            is_fact = isinstance(extra, dict) and "fact" in extra
             is_nan = value != value
-            if is_fact and value is not None and not is_nan:
+            if value is not None and not is_nan:
                 # `make_fact_schema` has stored a format, such as "{:.2f} s"
                 facts[name.replace("_", " ")] = str(extra["fact"]).format(value)
         return facts

@@ -306,6 +306,7 @@ def make_sweep_frame(
     # units of measurement by column, which `_make_cells` fills while `cells` is
     # iterated
     units = dict[str, str]()
+    get_extra_columns: Callable[[Row], Mapping[str, float]]
     get_extra_columns = extra_columns or (lambda row: {})
     cells = (
         {**_make_cells(row, number, units), **get_extra_columns(row)}

@@ -303,8 +303,8 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
 
     Args:
         path: path of the file.
-        above: files that name this one as their base, directly or not; by these a file
-            that is a base of itself is found.
+        above: files that name this one as their base, directly or not. If this file is
+            among them, it is a base of itself, which is an error.
 
     Raises:
         FileFormatError: the file is missing, not YAML, or not a mapping from names.
@@ -325,7 +325,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
         raise FileFormatError(
             f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch"
         )
-    bases = _read_bases(path, data.pop("base", None), len(above))
+    bases = _read_bases(path, data.pop("base", None), depth=len(above))
     resolved_path = Path(path).resolve()
     if bases and resolved_path in above:
         raise FileFormatError(
@@ -406,7 +406,7 @@ def set_dotted(data: dict[str, object], name: str, value: object) -> None:
         inner = {key: None for key in previous}
     elif isinstance(previous, dict):
         inner = dict(previous)
-    if first in ("set", "grid"):
+    if first in ("set", "grid"):  # the rest is the name of a parameter
         inner[rest] = value
     else:
         set_dotted(inner, rest, value)

@@ -65,8 +65,10 @@ def make_document(
         footer: a sentence at the end, by default the title.
     """
     code = _join_scripts(scripts)
-    # The policy of the page lets only scripts with these digests run.
-    digests = [pages.compute_script_digest(code.encode())] if code else []
+    # By the policy of the page, only scripts with these digests run.
+    digests: list[str] = []
+    if code:
+        digests = [pages.compute_script_digest(code.encode())]
     policy = pages.make_page_policy(digests, connects=connects)
     head = _make_head(title, f"{policy}; form-action 'self'")
     footer_html = make_element("footer", f"advsearch {__version__}, {footer or title}")
