@@ -265,14 +265,15 @@ class LineProgress:
         with self._lock:
             now = self._clock()
             elapsed = now - self._stage_started
-            if self._printed_at is None:  # the stage is not announced yet
+            printed_at = self._printed_at
+            if printed_at is None:  # the stage is not announced yet
                 # the name is empty before the first stage
                 if self._name and elapsed >= ANNOUNCE_SECONDS:
                     self._printed_at = now
                     self._print(self._stage_title)
                 return
             interval = max(LINE_INTERVAL, LINE_FRACTION * elapsed)
-            if now - self._printed_at >= interval:
+            if now - printed_at >= interval:
                 self._printed_at = now
                 self._print(f"{self._name}: {self._format_state()}")
 

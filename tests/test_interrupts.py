@@ -59,7 +59,7 @@ def in_a_library() -> None:
 def alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Handler, hook and counts are as before afterwards."""
     monkeypatch.setattr(sys, "unraisablehook", report_unraisable_error)
-    for name in ("n_received", "n_handled", "is_work_done", "_last"):
+    for name in ("n_received", "n_handled", "is_work_done", "_last_signal"):
         monkeypatch.setattr(INTERRUPTS, name, vars(Interrupts())[name])
     yield
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -81,7 +81,7 @@ def test_one_that_is_lost_is_raised_at_the_next_look_and_answered_once(lost: Cal
     INTERRUPTS.raise_pending()  # answered
     with pytest.raises(KeyboardInterrupt):
         with reraise_lost_interrupt():
-            INTERRUPTS._last = -1.0  # another Ctrl-C, later
+            INTERRUPTS._last_signal = -1.0  # another Ctrl-C, later
             lost()
     with reraise_lost_interrupt():
         INTERRUPTS.raise_pending()
@@ -237,7 +237,8 @@ def test_an_interrupt_that_an_import_swallows_is_not_lost(where: dict[str, str],
 
 def test_an_interrupted_process_ends_without_the_interpreters_own_end() -> None:
     """What an interrupt inside native code leaves behind aborts there: status 134 and a dump of threads."""
-    code = "import atexit, os; from advsearch.cli import main; main._run_to_status = lambda given: print('answer') or 130; "
+    code = "import atexit, os; from advsearch.cli import main; "
+    code += "main._run_to_status = lambda given: print('answer') or 130; "
     code += "atexit.register(os.abort); from advsearch.__main__ import start; start()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stdout, done.stderr) == (130, "answer\n", "")

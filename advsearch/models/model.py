@@ -395,7 +395,8 @@ class Model:
         """
         if self.cameras == 1:
             return images
-        return images.unflatten(2, (self.cameras, -1)).movedim(2, 1).flatten(0, 1)
+        images_by_camera: Tensor = images.unflatten(2, (self.cameras, -1))
+        return images_by_camera.movedim(2, 1).flatten(0, 1)
 
     def _group_by_image(self, output: Any) -> list[tuple[Any, ...]]:
         """Return a tuple for each image, with the output for each of its cameras.

@@ -138,11 +138,12 @@ class Result(Fields):
             extra = field.json_schema_extra
             if not isinstance(extra, dict) or "fact" not in extra:
                 continue
+            # `make_fact_schema` has stored a format, such as "{:.2f} s"
+            value_format = str(extra["fact"])
             value = getattr(self, name)
             is_nan = value != value
             if value is not None and not is_nan:
-                # `make_fact_schema` has stored a format, such as "{:.2f} s"
-                facts[name.replace("_", " ")] = str(extra["fact"]).format(value)
+                facts[name.replace("_", " ")] = value_format.format(value)
         return facts
 
     @property

@@ -564,8 +564,8 @@ def _interpolate_spline(
         fraction: () 0 at the first key and 1 at the second.
         span: () seconds between the keys.
     """
-    _, start_value, tangent_after_start = start_key
-    tangent_before_end, end_value, _ = end_key
+    _, start_value, tangent_after_start = start_key.unbind()
+    tangent_before_end, end_value, _ = end_key.unbind()
     square = fraction**2
     cube = fraction**3
     return (

@@ -201,7 +201,8 @@ class EnsembleTask(JointTask):
             InputError: the model is not from `join_models`, or has not one model per
                 task.
         """
-        models = model.module.models if isinstance(model.module, Ensemble) else ()
+        network = model.module
+        models = network.models if isinstance(network, Ensemble) else ()
         if len(models) != len(self.parts):
             n_models = len(models) or 1  # a model that is no ensemble is a single one
             raise InputError(

@@ -188,7 +188,10 @@ sys.exit(__main__.start())
 @pytest.mark.medium
 @pytest.mark.parametrize(
     "where, status",
-    [("main._run_to_status", 130), ("main._run_and_report_errors", 130), ("main.signal.signal", 2), ("main.end_output", 2)],
+    [
+        ("main._run_to_status", 130), ("main._run_and_report_errors", 130), ("main.signal.signal", 2),
+        ("main.end_output", 2),
+    ],
 )
 def test_an_interrupt_at_either_end_leaves_no_traceback(where: str, status: int, tmp_path: Path) -> None:
     """Before a command begins, inside it, and when it is over: then its own status stands."""
