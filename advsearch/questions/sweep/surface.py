@@ -183,7 +183,7 @@ def _compute_strength(parts: pd.DataFrame) -> Float64Array:
     distance_from_0 = np.maximum(parts.low, -parts.high)
     has_interval = parts.low.notna()
     strength = np.where(has_interval, distance_from_0, parts.difference.abs())
-    strength_or_0: NDArray[np.float64] = np.nan_to_num(np.maximum(strength, 0.0))
+    strength_or_0: Float64Array = np.nan_to_num(np.maximum(strength, 0.0))
     return strength_or_0
 
 
