@@ -807,8 +807,7 @@ def grow_trees(
     ]
     for index, column in enumerate(columns):
         # only a column that is measured from another zero has a `turn`
-        is_shifted_angle = column.full_condition.turn > 0.0
-        if is_shifted_angle:
+        if column.full_condition.turn > 0.0:
             # A tree of all columns would first split another column of the same angle.
             tree = make_tree(**limits).fit(data[:, [index]], is_right).tree_
             trees.append((tree, [column]))

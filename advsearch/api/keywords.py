@@ -354,8 +354,8 @@ def _make_docstring(
     """
     summary, _, argument_text = inspect.cleandoc(text).partition("\n\nArgs:\n")
     # Some docstrings have the sentence below already, with details of their own.
-    summary_on_one_line = " ".join(summary.split())
-    mentions_settings = "other arguments are the settings of" in summary_on_one_line
+    summary_line = " ".join(summary.split())
+    mentions_settings = "other arguments are the settings of" in summary_line
     if not mentions_settings:
         summary += (
             "\n\nAll other arguments are the settings of `advsearch "

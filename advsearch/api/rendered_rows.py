@@ -255,8 +255,8 @@ def _render_attack(
     for row in rows:
         u = configuration_of_kind[row.kind]
         seed = max(0, row.seed or 0)  # a row may lack its seed
-        spp = row.spp or problem.search_spp  # a row may lack it, too
-        picture = problem.picture(u, seed, spp)
+        # a row may lack its samples, too
+        picture = problem.picture(u, seed, row.spp or problem.search_spp)
         # `u` followed by the conditions that the seed samples
         full_u = problem.make_full_configuration(u, seed)
         is_right = problem.judge(picture, full_u).right

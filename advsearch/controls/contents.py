@@ -118,8 +118,8 @@ def find_vessel(asset: assets.ObjectAsset) -> Vessel | None:
         return None
     # Through the liquid, mostly the lower half of the wall is visible.
     lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
-    was_hit = lower_faces >= 0  # the index is -1 for a ray that hit no face
-    wall_color = _mean_face_color(asset, lower_faces[was_hit])
+    # the index is -1 for a ray that hit no face
+    wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
     return Vessel(axis, heights, radii, wall_color)
 
 

@@ -196,8 +196,8 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     extended = weights @ (functions / np.maximum(eigenvalues, MIN_EIGENVALUE))
     # p positions, s scalar functions, c axes, k fields
     fields = np.einsum("ps,sck->pck", extended, combination)
-    largest_length = np.linalg.norm(fields, axis=1).max(axis=0)  # of each field
-    return np.asarray(fields / largest_length)
+    # each field is divided by its largest length
+    return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
 
 
 def _compute_kernel(
@@ -290,9 +290,8 @@ def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
         if n_cells <= MAX_LANDMARKS:
             break
         cell_size *= 1.15
-    n_members = np.bincount(cell_index)
-    means = [np.bincount(cell_index, pool[:, axis]) / n_members for axis in range(3)]
-    return np.stack(means, axis=1), cell_size
+    sums = [np.bincount(cell_index, pool[:, axis]) for axis in range(3)]
+    return np.stack(sums, axis=1) / np.bincount(cell_index)[:, None], cell_size
 
 
 def _combine_without_rotation(

@@ -87,8 +87,8 @@ class PoseControl(Control):
         # Height of the lowest point relative to the center, which is negative.
         if self.choice_values["on_ground"] in ("yes", True):  # text, or a YAML boolean
             # of the turned and scaled mesh, so that its lowest point is on the floor
-            linear_to_height = linear[2]  # the row for z
-            lowest = ((vertices - center) @ linear_to_height).amin()
+            # the row 2 of the linear map gives the height, z
+            lowest = ((vertices - center) @ linear[2]).amin()
         else:
             # of the mesh before, so that the center keeps its height
             lowest = floor - center[2]

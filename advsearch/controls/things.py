@@ -246,15 +246,15 @@ class ThingsControl(Control):
             pitch, roll = base.new_zeros(2)
             turn = geometry.make_euler_rotation(values[f"{name}.heading"], pitch, roll)
             # () index of the option of "presence": 0 for "there", 1 for "away"
-            is_away = values[f"{name}.presence"]
-            if bool(is_away):
+            is_absent = values[f"{name}.presence"]
+            if bool(is_absent):
                 turn = ABSENT_SCALE * turn
             # without derivatives
             position = base.new_tensor([*stand.position, stand.height])
             absent_depth = base.new_tensor(
                 [0.0, 0.0, ABSENT_DEPTH / self.scene.size_in_metres]
             )
-            depth = absent_depth * is_away
+            depth = absent_depth * is_absent
             translation = position - depth - turn @ foot
             inputs[f"{name}.to_world"] = geometry.make_affine(turn, translation) @ base
         return inputs

@@ -804,8 +804,7 @@ class Problem:
             values = self._compute_objective(output, image[None], truth, inputs)
             objective = values[0]
             # `inputs.used` is set once the objective has read an input
-            is_at_u = len(calls) == 1
-            if inputs.used and is_at_u:
+            if inputs.used and len(calls) == 1:  # the call at u itself
                 input_gradient = _differentiate_by_inputs(objective, variable_u)
             return objective
 
@@ -824,14 +823,14 @@ class Problem:
                     value = loss(renderer(full_u, seed=seed, spp=spp))
         image, output = calls[0]  # at u itself
         (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
-        # at least 1, since a renderer that predicts counts no renders
-        n_renders = max(1, renderer.n_renders - renders_before)
         evaluation = Evaluation(
             objective=float(value),
             gradient=gradient,
             success=judgement.success,
             n_non_finite=renderer.n_non_finite - non_finite_before,
-            cost=n_renders * query.samples,  # each counts `samples` times
+            # Each render counts `samples` times. There is at least 1, since a renderer
+            # that predicts counts none.
+            cost=max(1, renderer.n_renders - renders_before) * query.samples,
             judgement=judgement,
             picture=round_to_8_bit(image) if query.includes_image else None,
         )

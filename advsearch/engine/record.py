@@ -116,8 +116,8 @@ class RunState:
         better_method_refusal = self.predictor_refusal or self.surface_light_refusal
         # If the predictor was given up, its summary has that as the reason, which
         # stays.
-        was_given_up = bool(summary.reason)
-        if was_given_up or not better_method_refusal:
+        # a reason is there if predictions were given up
+        if summary.reason or not better_method_refusal:
             return summary
         return summary.model_copy(update={"reason": str(better_method_refusal)})
 

@@ -139,8 +139,7 @@ def blur_along_line(
     weights = weights / weights.sum()
     height, width = image.shape[:2]
     # enough on all four sides for lines in any direction
-    padding = (count, count, count, count)
-    padded = F.pad(images.to_planes(image), padding, mode="replicate")
+    padded = F.pad(images.to_planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
     for index, weight in enumerate(weights):
         top = count + round(index * math.sin(angle))

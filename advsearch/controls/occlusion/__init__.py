@@ -378,8 +378,8 @@ def _find_covering_angle(
     if coverage >= EASE_IN_COVERAGE:
         return passage.find_angle(coverage, angle_outside)
     end_of_ease_in = passage.find_angle(EASE_IN_COVERAGE, angle_outside)
-    way_inside = end_of_ease_in - angle_outside
-    return angle_outside + way_inside * coverage / EASE_IN_COVERAGE
+    angle_inside = end_of_ease_in - angle_outside
+    return angle_outside + angle_inside * coverage / EASE_IN_COVERAGE
 
 
 def _make_hidden_placement(size: float, distance: float) -> Placement:

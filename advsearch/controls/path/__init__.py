@@ -916,8 +916,7 @@ class PathControl(Control):
         # On "pass" it is to the right of its position in the scene at first (over 0),
         # then to the left (under 0).
         to_right = distance * reach * (1.0 - 2.0 * progress)
-        right = _level_direction(-left)
-        return right * to_right[..., None], no_turn
+        return _level_direction(-left) * to_right[..., None], no_turn
 
 
 @geometry.cache_per_scene
