@@ -118,7 +118,9 @@ class ParallelEvaluator:
             for result in results:
                 index = index_of_item[id(result.items[0])]
                 if result.failure_reason:
-                    evaluation = make_lost_evaluation(queries[index], result.failure_reason)
+                    evaluation = make_lost_evaluation(
+                        queries[index], result.failure_reason
+                    )
                 else:
                     evaluation = result.value[0]
                 waiting[index] = replace(evaluation, machine=result.machine)

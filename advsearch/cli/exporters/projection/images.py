@@ -88,7 +88,9 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
             # several projectors have a folder each
             folder = out / control.name_in_files if len(projectors) > 1 else out
             folder.mkdir(parents=True)
-            notes += write_projector(folder, adversarial, control, control.compute_values(u))
+            notes += write_projector(
+                folder, adversarial, control, control.compute_values(u)
+            )
     return notes
 
 
@@ -188,7 +190,9 @@ def describe_marks(control: Any, marked_texels: Sequence[MarkedTexel]) -> list[s
         right_of_middle = 2 * texel.x - 1
         above_middle = 1 - 2 * texel.y
         right = math.degrees(math.atan(right_of_middle * half_width))
-        up = math.degrees(math.atan(above_middle * half_width / control.projector_part.aspect))
+        up = math.degrees(
+            math.atan(above_middle * half_width / control.projector_part.aspect)
+        )
         lines.append(
             f"{index}: row {texel.row}, column {texel.column}; {right:.2f} degrees to "
             f"the right of the middle, {up:.2f} up"
