@@ -191,7 +191,7 @@ class SceneConfig(Config):
     object: str = setting(
         ...,
         "scene",
-        "the object that the model should recognize",
+        "the object that the model should recognise",
         f"the name of an object or a {join_alternatives(MESHES)} file",
     )
     environment: str | None = setting(

@@ -185,7 +185,7 @@ class SweepConfig(SceneConfig):
     must_change: str | None = setting(
         None,
         "sweep",
-        "repeat each prediction with the picture black, covered (one even color) or "
+        "repeat each prediction with the picture black, covered (one even colour) or "
         "without the object, and count how often it changes, as it must",
         f"names among {', '.join(BLIND)}, separated by commas",
         otherwise="none",
