@@ -426,7 +426,13 @@ def _make_clean_prediction(
         control_group = make_control_group(findings.clean_trials, findings.spp)
     # values of the scene that were outside of a control's range, and were replaced
     adjusted_values = [
-        MovedValue.from_values(value) for value in problem.space.adjusted_defaults
+        MovedValue(
+            parameter=value.parameter_name,
+            unit=value.unit,
+            scene=value.scene_value,
+            used=value.used_value,
+        )
+        for value in problem.space.adjusted_defaults
     ]
     # `CleanPrediction` has the fields of `PicturedPrediction` and some more.
     picture_fields = vars(_make_prediction(picture.judgement, picture.trial))
