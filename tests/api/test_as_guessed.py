@@ -103,7 +103,7 @@ def test_an_adversarial_scene_is_rendered_under_another_view(attacked: AttackRes
     clean = advsearch.render("mug", Bright(), **plain)
     assert (clean.views[0].picture - same.views[0].picture).abs().max() > 4.0 / 255.0
     other = pickle.loads(pickle.dumps(attacked))
-    with pytest.raises(InputError, match=r"load_run\(FOLDER\) has it"):
+    with pytest.raises(InputError, match=r"load_run\(FOLDER\) loads one"):
         other.render()
 
 

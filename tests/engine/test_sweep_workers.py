@@ -54,9 +54,9 @@ class Disorder:
         for count, items in enumerate(pieces):
             if count == self.stop:
                 raise KeyboardInterrupt
-            if self.lose in [query.index for _, _, query in items]:
+            if self.lose in [query.row_index for _, _, query in items]:
                 for one in items:
-                    lost = "no answer: 3 workers died of it" if one[2].index == self.lose else ""
+                    lost = "no answer: 3 workers died of it" if one[2].row_index == self.lose else ""
                     yield BatchResult([one], None if lost else self.call([one]), failure_reason=lost)
             else:
                 yield BatchResult(items, self.call(items), f"worker {count % 2}")

@@ -335,7 +335,7 @@ def test_an_attack_that_is_stopped_by_a_limit_goes_on_and_asks_nothing_twice(
     command += ["--model", server.url, "--labels", "mug,bowl", "--label", "mug", "--json"]
     assert main([*command, "--run", "whole"]) == 0
     whole, asked = json.loads(capsys.readouterr().out), [one["image"] for *_, one in server.came]
-    assert f"was asked {len(asked)} times" in whole["warnings"][-1]
+    assert f"was called {len(asked)} times" in whole["warnings"][-1]
     server.came.clear()
     assert main([*command, "--run", "part", "--ask", "calls=7"]) == 2
     assert "7 calls are spent, and --ask allows 7" in capsys.readouterr().err and len(server.came) == 7

@@ -351,9 +351,11 @@ def _describe_scenes(
         return {"object": ",".join(names)}
     # The settings that are not replaced below are the same in all scenes.
     settings: dict[str, object] = dict(loading.scene_to_settings(loaded[0].scene))
-    for name in ("object", "environment"):
-        values = dict.fromkeys(getattr(scene, name) for scene in loaded)
-        settings[name] = ",".join(values)
+    # each name once, in the order of the scenes
+    object_names = dict.fromkeys(scene.object_name for scene in loaded)
+    environment_names = dict.fromkeys(scene.environment_name for scene in loaded)
+    settings["object"] = ",".join(object_names)
+    settings["environment"] = ",".join(environment_names)
     if len(loaded) > 1:
         # Size and `set` (values of the scene's parameters) differ between scenes, and
         # no setting can state several.
