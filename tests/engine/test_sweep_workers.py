@@ -102,7 +102,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
     class Two(Disorder):
         def compute(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
             for done in super().compute(batches):
-                yield replace(done, machine="ab12" if done.items[0][2].index < 4 else None)
+                yield replace(done, machine="ab12" if done.items[0][2].row_index < 4 else None)
 
     job = load_job(CONFIG)
     stats = WorkerStats(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})

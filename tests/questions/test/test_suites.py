@@ -185,10 +185,10 @@ def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictur
     first = carry_out(config)
     assert first.is_unfinished and {one.reason for one in first.claims} == {"it was interrupted"}
     done, last = 0, front + 4  # in the middle of `no-worse`
-    again = carry_out(config, resumed=tmp_path / "run")
+    again = carry_out(config, resumed_directory=tmp_path / "run")
     assert again.is_unfinished and [one.verdict for one in again.claims] == ["held", "undecided", "undecided"]
     done, last = 0, -1
-    ended = carry_out(config, resumed=tmp_path / "run")
+    ended = carry_out(config, resumed_directory=tmp_path / "run")
     assert {one.name: (one.verdict, one.reason, one.interval) for one in ended.claims} == whole
     if workers is None:
         judged = sum(one.pictures * (1 + (one.kind == "no_worse")) for one in ended.claims)
