@@ -80,18 +80,18 @@ class Drawn:
     rate: float
     root: int
     over: bool = False
-    spp: int = 16
-    n_draws: int = 1
+    search_spp: int = 16
+    conditions_per_evaluation: int = 1
     steps: int = 100
     seed: int = field(init=False)
-    rule: VerificationRule = field(init=False)
+    verification_rule: VerificationRule = field(init=False)
     conditions: Any = field(init=False)
     domain: Domain = DOMAIN
     searched_space: ClassVar[Any] = SimpleNamespace(controls=())
 
     def __post_init__(self) -> None:
         self.seed, self.conditions = self.root, object() if self.over else None
-        self.rule = OVER_CONDITIONS if self.over else WORST_CASE
+        self.verification_rule = OVER_CONDITIONS if self.over else WORST_CASE
         self._middle = float(ndtri(self.rate))
 
     def evaluate(self, query: Query) -> Evaluation:

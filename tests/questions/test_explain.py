@@ -133,7 +133,7 @@ def test_of_predictions_without_a_law_it_is_said_that_nothing_decides_and_how_ma
 class Read:
     """Features that tell the lighter pictures from the darker ones."""
 
-    source = "twelve numbers"
+    source_description = "twelve numbers"
 
     def __call__(self, images: torch.Tensor) -> torch.Tensor:
         sides = (images[:, 0, 0, :1] - 0.5) * torch.linspace(-8.0, 8.0, 12)

@@ -338,13 +338,13 @@ def make_harden_view(result: HardenResult) -> ShownResult:
             ROUND_COLUMNS,
             title="The training",
             note=TRAINING_NOTE,
-            only="page",
+            only_medium="page",
         ),
         ResultPart.make_table(
             result.split.items(),
             SPLIT_COLUMNS,
             title="What it was trained and measured on",
-            only="page",
+            only_medium="page",
         ),
     ]
     return ShownResult(
