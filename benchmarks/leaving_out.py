@@ -307,7 +307,9 @@ def _time_gradients(
     for number in range(repeats):
         for way, results in zip(ways, found, strict=True):
             begun = time.process_time()
-            estimate = way.gradient(loss, u, seeds.derive_seed(2, "working", number), spp)[1]
+            estimate = way.gradient(
+                loss, u, seeds.derive_seed(2, "working", number), spp
+            )[1]
             seconds = time.process_time() - begun
             results.append((seconds, float((estimate - truth).square().sum())))
     times = [statistics.median(one[0] for one in results) for results in found]

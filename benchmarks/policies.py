@@ -224,7 +224,9 @@ def choices(rng: np.random.Generator, d: int) -> tuple[Domain, Function]:
         return np.asarray(value)
 
     rest = (Block(d - ways),) if d > ways else ()
-    return box(rng, d, *(Block(1, n_options=count) for count in counts), *rest), function
+    return box(
+        rng, d, *(Block(1, n_options=count) for count in counts), *rest
+    ), function
 
 
 KINDS: dict[str, Callable[[np.random.Generator, int], tuple[Domain, Function]]] = {

@@ -169,7 +169,9 @@ def row(
     light(renderer.start)
     first = time.process_time() - begun
     wholes = views(renderer, args.views)
-    inputs = [renderer.scene.input_assembler(renderer.space.inputs(one)) for one in wholes]
+    inputs = [
+        renderer.scene.input_assembler(renderer.space.inputs(one)) for one in wholes
+    ]
     others = [milliseconds(lambda one=one: light.compute_light(one)) for one in inputs]  # type: ignore[misc]
     taken: tuple[list[float], list[float]] = ([], [])
     for number in range(args.repeats + 1):
@@ -261,7 +263,9 @@ def swept(scene: str, rows: int, label: str | None) -> None:
     error = (
         ""
         if told.error is None
-        else (f"{told.error.levels:.2f} levels off, {told.error.margin_bias:+.2f} logits; ")
+        else (
+            f"{told.error.levels:.2f} levels off, {told.error.margin_bias:+.2f} logits; "
+        )
     )
     print(f"  {error}{told.reason or 'all predicted'}", flush=True)
 
@@ -338,7 +342,8 @@ def compare(
     inputs = renderer.scene.input_assembler(renderer.space.inputs(whole))
     lit = light.compute_light(inputs)
     brighter = [
-        replace(lit, object_irradiance=lit.object_irradiance * factor) for factor in (1.0, 1.1, 1.25)
+        replace(lit, object_irradiance=lit.object_irradiance * factor)
+        for factor in (1.0, 1.1, 1.25)
     ]
     pictures = []
     for light.fixed_light in brighter:

@@ -249,7 +249,9 @@ def over_table() -> int:
         (chance * n for (_, n), (chance, _) in ends.items()), np.zeros_like(rates)
     )
     for rate, chance, count in zip(rates, chances, trials, strict=True):
-        before = stats.binom.sf(OVER_CONDITIONS.count_needed_successes(200) - 1, 200, rate)
+        before = stats.binom.sf(
+            OVER_CONDITIONS.count_needed_successes(200) - 1, 200, rate
+        )
         print(
             f"| {rate:.2f} | {100 * before:.2f} | {100 * chance:.2f} | 200 | "
             f"{count:.0f} |"
@@ -501,7 +503,10 @@ def rendered_table(config: AttackConfig, epsilons: Sequence[float]) -> None:
             evaluate = Counted(problem.evaluate)
             said = verdict(evaluate, problem.domain, answer.best_u, 0, before=before)
             rate = said.adversarial_counts
-            what = said.ending.value, f"{rate.n_successes}/{rate.n_trials} at {rate.spp}"
+            what = (
+                said.ending.value,
+                f"{rate.n_successes}/{rate.n_trials} at {rate.spp}",
+            )
             for column, text in zip(
                 told,
                 (*what, str(evaluate.samples), f"{evaluate.seconds:.1f}"),

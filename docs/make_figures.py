@@ -415,7 +415,11 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
 
 
 ASKED = "environment controls object objects model policy objective".split()
-EVERYWHERE = {**StudyResult.get_described_fields(), **SceneResult.get_described_fields(), "objective": None}
+EVERYWHERE = {
+    **StudyResult.get_described_fields(),
+    **SceneResult.get_described_fields(),
+    "objective": None,
+}
 """Fields that are told once for all results: ASKED, and those that say how the run
 went.
 """

@@ -377,7 +377,11 @@ def made() -> Iterator[str]:
 def _looks() -> tuple[int, int, int]:
     """Trials that all have to succeed, and what is needed of how many else."""
     first, last = verification.TRIAL_LOOKS
-    return WORST_CASE.count_needed_successes(first), WORST_CASE.count_needed_successes(last), last
+    return (
+        WORST_CASE.count_needed_successes(first),
+        WORST_CASE.count_needed_successes(last),
+        last,
+    )
 
 
 def _exceptions(samples: int) -> float:

@@ -91,7 +91,9 @@ def pictures(count: int, seed: int) -> tuple[Tensor, Tensor]:
             float((columns * (torch.arange(SIDE) + 0.5)).sum() / columns.sum()) / SIDE
             - 0.5
         )
-        radiance = renderer.radiance(u, seeds.derive_seed(seed, f"picture {len(seen)}"), SPP)
+        radiance = renderer.radiance(
+            u, seeds.derive_seed(seed, f"picture {len(seen)}"), SPP
+        )
         seen.append(
             round_to_8_bit(
                 space.apply_to_image(u, renderer.formation.map_to_display(radiance))

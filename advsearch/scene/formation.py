@@ -688,7 +688,7 @@ def divide_exposure(
 
 AOVS: Mapping[str, str] = {
     "mask": "1 where the object is visible, else 0",
-    "depth": "distance from the camera along the ray, meters (object sizes if the "
+    "depth": "distance from the camera along the ray, metres (object sizes if the "
     "object's size is not known); "
     "infinite where there is nothing",
     "normal": "unit shading normal, world space (z up); 0 where there is nothing",

@@ -189,7 +189,9 @@ sys.exit(__main__.start())
 @pytest.mark.parametrize(
     "where, status",
     [
-        ("main._run_to_status", 130), ("main._run_and_report_errors", 130), ("main.signal.signal", 2),
+        ("main._run_to_status", 130),
+        ("main._run_and_report_errors", 130),
+        ("main.signal.signal", 2),
         ("main.end_output", 2),
     ],
 )

@@ -130,7 +130,8 @@ def test_a_worker_imports_nothing_from_the_current_folder(tmp_path: Path) -> Non
         "print('imported', flush=True)\n"
         "from advsearch.cluster import WorkerTask\n"
         "from advsearch.cluster.workers import open_workers\n"
-        "with open_workers(WorkerTask('cluster_work:squares', {}), workers=1, cluster=None, report_message=print) as workers:\n"
+        "task = WorkerTask('cluster_work:squares', {})\n"
+        "with open_workers(task, workers=1, cluster=None, report_message=print) as workers:\n"
         "    print([done.value for done in workers.compute([range(3)])])\n"
     )
     environ = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
