@@ -86,7 +86,7 @@ def test_rays_are_refracted_by_snells_law_and_lose_what_fresnel_says() -> None:
 
 def test_what_is_true_of_a_picture_is_so_of_the_scene_without_drops() -> None:
     wet, dry = renderer_of(40), renderer_of(0)
-    ours, theirs = (one.surfaces(one.start).visible_mask("object") for one in (wet, dry))
+    ours, theirs = (one.find_surfaces(one.start).visible_mask("object") for one in (wet, dry))
     assert (ours != theirs).float().mean() < 0.002  # the ray through a pixel's middle is looked up, not worked out
     pictures = [one.radiance(one.start, seed=1, spp=16) for one in (wet, dry)]
     assert float((pictures[0] - pictures[1]).abs().mean()) > 0.02 * float(pictures[1].mean())
