@@ -194,7 +194,7 @@ def interrupted():
     except KeyboardInterrupt:
         print("swallowed", flush=True)
 
-def carry_out(config, *, progress, resumed):
+def carry_out(config, *, progress, resumed_directory):
     import heavy
     {loading}
     print("searched", flush=True)
