@@ -271,6 +271,23 @@ class Domain:
         """Number of elements of u."""
         return self.start.numel()
 
+    def check_dim(self, max_dim: int, policy: str, advice: str) -> None:
+        """Check that a policy can search so many numbers.
+
+        Args:
+            max_dim: largest number of elements of u that the policy can search.
+            policy: name of the policy, for the message.
+            advice: end of the message, such as "use pgd or auto".
+
+        Raises:
+            InputError: u has more elements.
+        """
+        if self.dim > max_dim:
+            raise InputError(
+                f"policy '{policy}': expected at most {max_dim} numbers, got "
+                f"{self.dim}; {advice}"
+            )
+
     @property
     def element_names(self) -> list[str]:
         """The name of each element of u.

@@ -37,17 +37,14 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
 
     def construct_yaml_int(self, node: yaml.Node) -> int:
         """Return an integer; raise a YAMLError if it has too many digits."""
-        # raised below if the number is too long
-        error = _make_yaml_error(node, f"a number of more than {DIGITS} digits")
         # The length is checked first because converting a long text takes long. In
         # binary, a number has up to 3.3 times as many digits as in decimal, and there
         # may be a sign, a prefix and underscores: 4 times is enough for usual ones.
-        if len(node.value) > 4 * DIGITS:
-            raise error
-        number = int(super().construct_yaml_int(node))
-        if abs(number) >= 10**DIGITS:
-            raise error
-        return number
+        if len(node.value) <= 4 * DIGITS:
+            number = int(super().construct_yaml_int(node))
+            if abs(number) < 10**DIGITS:
+                return number
+        raise _make_yaml_error(node, f"a number of more than {DIGITS} digits")
 
 
 _Loader.yaml_implicit_resolvers = {

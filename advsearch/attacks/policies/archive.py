@@ -389,11 +389,7 @@ class MapElites(Policy[ArchiveState]):
         Raises:
             InputError: the domain has too many numbers, or the archive too many cells.
         """
-        if domain.dim > MAX_DIM:
-            raise InputError(
-                f"policy 'archive': expected at most {MAX_DIM} numbers, got "
-                f"{domain.dim}; use pgd or auto"
-            )
+        domain.check_dim(MAX_DIM, "archive", "use pgd or auto")
         seed = policies.draw_seed(generator)
         measure_indices = self._find_measure_indices(domain)
         # A choice has a cell for each option. A number has 0 options, and `cells`

@@ -451,11 +451,7 @@ class CMAES(Policy[CMAESState]):
             InputError: the domain has more than `MAX_DIM` numbers.
         """
         d = domain.dim
-        if d > MAX_DIM:
-            raise InputError(
-                f"policy 'cmaes': expected at most {MAX_DIM} numbers, got "
-                f"{d}; use policy pgd, auto or nes"
-            )
+        domain.check_dim(MAX_DIM, "cmaes", "use policy pgd, auto or nes")
         population = self.population or 4 + int(3 * math.log(d))
         seed = draw_seed(generator)
         strategy = self._make_strategy(d, population, seed)

@@ -473,11 +473,7 @@ class Mixture(Policy[MixtureState]):
         Raises:
             InputError: the domain has more than `MAX_DIM` numbers.
         """
-        if domain.dim > MAX_DIM:
-            raise InputError(
-                f"policy 'mixture': expected at most {MAX_DIM} numbers, got "
-                f"{domain.dim}; use pgd or auto"
-            )
+        domain.check_dim(MAX_DIM, "mixture", "use pgd or auto")
         ranges = Ranges(domain.option_counts, policies.find_periodic(domain))
         no_points = torch.empty(0, domain.dim, dtype=torch.float64)
         state = MixtureState(
