@@ -523,12 +523,13 @@ def prose(path: Path) -> str:
 
 
 def anchors(path: Path) -> set[str]:
-    """Return what `#...` may name in a page: its headings as GitHub spells them."""
+    """Return what `#...` may name in a page: headings that GitHub and MkDocs spell alike."""
     headings = re.findall(r"^#+ (.*)$", read(path), re.M)
-    return {
+    on_github = {
         re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
         for heading in headings
     }
+    return {anchor for anchor in on_github if "--" not in anchor}
 
 
 def links() -> Iterator[str]:
