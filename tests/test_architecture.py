@@ -271,6 +271,22 @@ def test_every_picture_is_opened_as_one_of_some_formats() -> None:
     assert len(opened) > 8 and [text for text in opened if "formats=" not in text] == []
 
 
+IMPORT_LINE = re.compile(r"\s*import \w+(, \w+)*$", re.MULTILINE)
+
+
+def test_scripts_that_other_programs_run_are_python() -> None:
+    """Blender and child processes run them, and stand-ins take their place in tests."""
+    scripts = list[tuple[str, str]]()
+    for name, path in python_files():
+        nodes = list(ast.walk(ast.parse(path.read_text("utf-8"))))
+        pieces = {id(value) for node in nodes if isinstance(node, ast.JoinedStr) for value in node.values}
+        texts = [node.value for node in nodes if isinstance(node, ast.Constant) and id(node) not in pieces]
+        scripts += [(name, text) for text in texts if isinstance(text, str) and IMPORT_LINE.match(text)]
+    assert {name.split(".")[-1] for name, _ in scripts} >= {"cycles", "blender", "llvm"}
+    for name, script in scripts:
+        compile(script, name, "exec")
+
+
 def test_everything_imported_is_a_declared_dependency() -> None:
     declared = {canonicalize_name(one.name) for one in requirements("install_requires")}
     for module, path in python_files():

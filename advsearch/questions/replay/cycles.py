@@ -142,15 +142,25 @@ scene.world = world
 world.use_nodes = True
 add_environment(world)
 
-render = scene.render render.engine = "CYCLES" render.resolution_x = settings["width"]
-render.resolution_y = settings["height"] render.resolution_percentage = 100
-render.use_file_extension = False render.use_compositing = False
-render.image_settings.file_format = "OPEN_EXR" render.image_settings.color_depth = "32"
-cycles = scene.cycles cycles.device = "CPU" cycles.pixel_filter_type = "BOX"
-cycles.filter_width = 1.0 cycles.use_adaptive_sampling = False cycles.use_denoising =
-settings["denoise"] cycles.sample_clamp_direct = 0.0 cycles.sample_clamp_indirect = 0.0
-cycles.blur_glossy = 0.0 for kind in ("max_bounces", "diffuse_bounces",
-"glossy_bounces", "transmission_bounces"):
+render = scene.render
+render.engine = "CYCLES"
+render.resolution_x = settings["width"]
+render.resolution_y = settings["height"]
+render.resolution_percentage = 100
+render.use_file_extension = False
+render.use_compositing = False
+render.image_settings.file_format = "OPEN_EXR"
+render.image_settings.color_depth = "32"
+cycles = scene.cycles
+cycles.device = "CPU"
+cycles.pixel_filter_type = "BOX"
+cycles.filter_width = 1.0
+cycles.use_adaptive_sampling = False
+cycles.use_denoising = settings["denoise"]
+cycles.sample_clamp_direct = 0.0
+cycles.sample_clamp_indirect = 0.0
+cycles.blur_glossy = 0.0
+for kind in ("max_bounces", "diffuse_bounces", "glossy_bounces", "transmission_bounces"):
     setattr(cycles, kind, settings["bounces"])
 
 for line in sys.stdin:
