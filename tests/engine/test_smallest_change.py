@@ -37,7 +37,7 @@ def finding(trial: Callable[[str, int, Tensor], Any]) -> Any:
     searches: Any = SimpleNamespace(
         problem=problem, run_state=findings, policy=None, begin_stage=said, run_search=search
     )
-    verifier: Any = SimpleNamespace(begin_stage=said, try_configurations=trials, n_trials=20)
+    verifier: Any = SimpleNamespace(problem=problem, begin_stage=said, try_configurations=trials, n_trials=20)
     with suppress(KeyboardInterrupt):
         find_smallest(searches, searches.policy, verifier)
     return findings
