@@ -366,7 +366,7 @@ def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
 
 def _round_to_float32(values: Float64Array) -> Float32Array:
     """Return values as float32, without -0.0, whose bits are not those of 0.0."""
-    return values.astype(np.float32) + np.float32(0.0)
+    return np.asarray(values.astype(np.float32) + np.float32(0.0))
 
 
 # ---- Winding ----
@@ -1053,7 +1053,7 @@ def _compute_doubled_polygon_areas(flat: Float64Array) -> Float64Array:
     """
     successors = np.roll(flat, -1, axis=1)
     doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
-    return np.abs(doubled_areas.sum(axis=1))
+    return np.asarray(np.abs(doubled_areas.sum(axis=1)))
 
 
 class _EarCutter:
