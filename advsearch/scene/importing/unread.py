@@ -53,9 +53,9 @@ class TrackedKeys(Generic[T]):
         self._read: set[str] = set()
         self._nested: dict[str, TrackedKeys[Any]] = {}
         for key, value in values.items():
-            self._store(key, value)
+            self._add_value(key, value)
 
-    def _store(self, key: str, value: T) -> None:
+    def _add_value(self, key: str, value: T) -> None:
         """Store the value of a key, which replaces that of an equal folded key."""
         folded = self._fold(key)
         if folded in self._spelling:
