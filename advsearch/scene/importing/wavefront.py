@@ -738,31 +738,30 @@ class ObjLines:
                 continue
             # This changes `corners`, of which `kind_indices` is a view.
             self._resolve_relative(kind_indices, kind, rows, sizes)
-            if kind_indices.max() > counts[kind]:
-                corner = int(kind_indices.argmax())
-                face = np.searchsorted(np.cumsum(sizes), corner, side="right")
-                line_number = rows[face] + 1
-                largest = kind_indices[corner]
-                raise self._make_missing_row_error(
-                    kind, counts[kind], largest, line_number
-                )
+            self._check_rows_exist(kind_indices, kind, counts[kind], rows, sizes)
         return corners - 1, sizes, rows  # the file counts from 1, and has 0 for none
 
-    def _make_missing_row_error(
-        self, kind: str, count: int, index: int, line_number: int
-    ) -> FileFormatError:
-        """Return the error for a face that refers to a missing row of a table.
+    def _check_rows_exist(
+        self, index: IntArray, kind: str, count: int, rows: IntArray, sizes: IntArray
+    ) -> None:
+        """Raise FileFormatError if a face refers to a missing row of a table.
 
         Args:
+            index: (C,) indices of all corners, from 1.
             kind: keyword of the table.
             count: number of its rows.
-            index: number of the missing row, from 1.
-            line_number: line of the face, from 1.
+            rows: (P,) the row of each face's line in the file.
+            sizes: (P,) the number of corners of each face.
         """
-        return self.notes.damaged(
-            f"at least {index} {kind!r} lines",
-            f"{count}, and a face on line {line_number} that refers "
-            f"to number {index} (is the file cut short?)",
+        largest = index.max()
+        if largest <= count:
+            return
+        corner = int(index.argmax())
+        face = np.searchsorted(np.cumsum(sizes), corner, side="right")
+        raise self.notes.damaged(
+            f"at least {largest} {kind!r} lines",
+            f"{count}, and a face on line {rows[face] + 1} that refers "
+            f"to number {largest} (is the file cut short?)",
         )
 
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:

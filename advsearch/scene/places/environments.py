@@ -53,14 +53,9 @@ def import_place(spec: str) -> EnvironmentAsset:
         light = file.lights[light_name]
         place = read_place(path, file, light.variant)
         environment = _load_light_map(path, light)
-    asset_name = place.name
-    if requested_light is not None:
-        # `make_safe_name` leaves out the suffix of a file. The name of a light may have
-        # a dot in it, so that a suffix is added.
-        asset_name = make_safe_name(Path(f"{place.name}-{light_name}.x"))
     return replace(
         environment,
-        name=asset_name,
+        name=_make_asset_name(place.name, requested_light),
         source=spec,
         warnings=(*environment.warnings, *place.notes),
         # The ground is that of the place, not one that belongs to the map.
@@ -69,6 +64,15 @@ def import_place(spec: str) -> EnvironmentAsset:
         candelas=_compute_candelas(path, light_name, light, environment),
         place=place,
     )
+
+
+def _make_asset_name(name: str, requested_light: str | None) -> str:
+    """Return the name of a place, with that of the light if one is requested."""
+    if requested_light is None:
+        return name
+    # `make_safe_name` leaves out the suffix of a file. The name of a light may have a
+    # dot in it, so that a suffix is added.
+    return make_safe_name(Path(f"{name}-{requested_light}.x"))
 
 
 def _find_light_name(path: Path, file: PlaceFile, requested: str | None) -> str:

@@ -734,17 +734,8 @@ def _collect(
     """
     # The renderer counts the values of all calls; those of this call are the increase.
     non_finite_before = renderer.n_non_finite
-    # This also replaces the depth of a photograph by what is in front of the object.
-    inputs = renderer.replace_photograph_depth(
-        renderer.scene.input_assembler(renderer.space.inputs(u))
-    )
-    image_inputs, scene_inputs = _split_inputs(inputs)
-    scene_inputs |= dict(light)
-    if names is None:
-        names = find_linear_inputs(renderer)
-    linearized_at = {
-        name: value.clone() for name, value in scene_inputs.items() if name in names
-    }
+    image_inputs, scene_inputs = _assemble_inputs(renderer, u, light)
+    linearized_at = _copy_linear_inputs(renderer, scene_inputs, names)
     transports = _make_transports(_get_traced_size(renderer), linearized_at, quick)
     has_backdrop = "backdrop.color" in image_inputs
     if transports:
@@ -770,15 +761,35 @@ def _collect(
     )
 
 
-def _split_inputs(inputs: Inputs) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Return the inputs of the finished image, and those of the scene."""
+def _assemble_inputs(
+    renderer: Renderer, u: Tensor, light: Inputs
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return the inputs of the finished image, and those of the scene.
+
+    They are those of a configuration (d,), but `light` replaces inputs of the scene.
+    """
+    # This also replaces the depth of a photograph by what is in front of the object.
+    inputs = renderer.replace_photograph_depth(
+        renderer.scene.input_assembler(renderer.space.inputs(u))
+    )
     image_inputs = {
         name: value for name, value in inputs.items() if name in IMAGE_INPUTS
     }
     scene_inputs = {
         name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
     }
-    return image_inputs, scene_inputs
+    return image_inputs, scene_inputs | dict(light)
+
+
+def _copy_linear_inputs(
+    renderer: Renderer, scene_inputs: Inputs, names: OptionalNames
+) -> dict[str, Tensor]:
+    """Return copies of the scene inputs that get a matrix; None for all base colors."""
+    if names is None:
+        names = find_linear_inputs(renderer)
+    return {
+        name: value.clone() for name, value in scene_inputs.items() if name in names
+    }
 
 
 def _make_transports(

@@ -688,15 +688,9 @@ class Conversion:
         Raises:
             FileFormatError: an attribute has fewer values than the mesh needs.
         """
-        corner_rows = mesh_faces.triangles[is_selected].reshape(-1)
-        corner_points = mesh_faces.point_of_corner[corner_rows]
-        index_by_interpolation = {
-            "vertex": corner_points,
-            "varying": corner_points,
-            "faceVarying": corner_rows,
-            "uniform": mesh_faces.face_of_triangle[is_selected].repeat(3),
-        }
-        constant_index = np.zeros(len(corner_rows), np.int64)
+        index_by_interpolation = _index_corners(mesh_faces, is_selected)
+        corner_points = index_by_interpolation["vertex"]
+        constant_index = np.zeros(len(corner_points), np.int64)
         columns = [corner_points]
         for attribute in attributes.values():
             index = constant_index
@@ -926,6 +920,25 @@ class Conversion:
         xformable = UsdGeom.Xformable(skeleton.GetPrim())
         to_world = xformable.ComputeLocalToWorldTransform(FIRST_TIME)
         return np.array(to_world), skinned
+
+
+def _index_corners(mesh_faces: MeshFaces, is_selected: Array) -> dict[str, Array]:
+    """Return the indices (3 T,) of values at selected triangles' corners.
+
+    They are by the interpolation of the values, for those that are not constant.
+
+    Args:
+        mesh_faces: the faces of the mesh.
+        is_selected: which of its triangles are selected.
+    """
+    corner_rows = mesh_faces.triangles[is_selected].reshape(-1)
+    corner_points = mesh_faces.point_of_corner[corner_rows]
+    return {
+        "vertex": corner_points,
+        "varying": corner_points,
+        "faceVarying": corner_rows,
+        "uniform": mesh_faces.face_of_triangle[is_selected].repeat(3),
+    }
 
 
 def _find_parent(path: Any, xformable: Any, node_of_path: dict[Any, int]) -> int:
