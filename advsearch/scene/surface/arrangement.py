@@ -92,18 +92,12 @@ class SurfaceView:
         """
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
-        height, width = self.base_radiance.shape[:2]
-        n_pixels = height * width
+        n_pixels = self.base_radiance.shape[0] * self.base_radiance.shape[1]
         n_cells = shape[0] * shape[1]
         selected = _find_camera_samples(samples, camera_index, n_pixels)
         first_ray = camera_index * n_pixels * RAYS_PER_PIXEL
         pixel = (samples.ray_index[selected] - first_ray) // RAYS_PER_PIXEL
-        # Each look-up reads four cells: `columns` and `fractions` are (n, 4).
-        columns, fractions = find_bilinear_weights(samples.uv[selected].numpy(), shape)
-        # The columns of the back follow the `n_cells` columns of the front.
-        is_back = samples.is_back[selected].numpy()
-        columns += np.int32(n_cells) * is_back[:, None]
-        weights = fractions * samples.diffuse_weight[selected].numpy()[:, None]
+        columns, weights = _find_cell_weights(samples, selected, shape)
         # The samples are sorted by pixel, and each has four entries. So the entries of
         # row p begin at 4 times the number of samples in the pixels before p.
         row_starts = np.searchsorted(pixel.numpy(), np.arange(n_pixels + 1)) * 4
@@ -143,6 +137,24 @@ def _find_camera_samples(
     first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
     start, end = torch.searchsorted(samples.ray_index, first_rays).tolist()
     return slice(start, end)
+
+
+def _find_cell_weights(
+    samples: ViewSamples, selected: slice, shape: tuple[int, int]
+) -> tuple[Ints, Float32Array]:
+    """Return the four cells of the fine grid that each sample reads, and their weights.
+
+    Both are (n, 4). The cells of the back follow those of the front.
+
+    Args:
+        samples: samples of all cameras.
+        selected: the n samples of one camera.
+        shape: rows and columns of the fine grid.
+    """
+    cells, fractions = find_bilinear_weights(samples.uv[selected].numpy(), shape)
+    is_back = samples.is_back[selected].numpy()
+    cells += np.int32(shape[0] * shape[1]) * is_back[:, None]
+    return cells, fractions * samples.diffuse_weight[selected].numpy()[:, None]
 
 
 def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:

@@ -577,18 +577,13 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     """
     radiance = padded[:, 1:-1].detach()
     sine = _compute_texel_sines(radiance.shape[0], radiance.shape[1])
-    luminance = radiance @ LUMINANCE_WEIGHTS
-    mean_luminance = float((luminance * sine).sum() / sine.sum())
-    # the fraction of each texel's light that is above the limit
-    hot_fraction = (
-        1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
-    ).clamp_min(0.0)
-    hot_power = hot_fraction * luminance * sine
+    hot_fraction = _find_hot_fraction(radiance, sine)
     hot_directions = torch.zeros(0, 3)
     hot_light = torch.zeros(0, 3)
     remaining = radiance
-    if float(hot_power.sum()) > MIN_HOT_FRACTION * mean_luminance * float(sine.sum()):
+    if hot_fraction is not None:
         hot_radiance = radiance * hot_fraction[..., None]
+        hot_power = hot_fraction * (radiance @ LUMINANCE_WEIGHTS) * sine
         hot_directions, hot_light = _sample_hot(hot_radiance, hot_power)
         remaining = radiance * (1.0 - hot_fraction[..., None])
     return SkyLight(
@@ -598,6 +593,26 @@ def prepare_sky(padded: Tensor) -> SkyLight:
         hot_directions=hot_directions,
         hot_light=hot_light,
     )
+
+
+def _find_hot_fraction(radiance: Tensor, sine: Tensor) -> Tensor | None:
+    """Return the fraction (H, W) of each texel's light that is above the limit.
+
+    The result is None if no more than `MIN_HOT_FRACTION` of all light is.
+
+    Args:
+        radiance: (H, W, 3) radiance of the texels.
+        sine: (H, W) their solid angles, in any unit.
+    """
+    luminance = radiance @ LUMINANCE_WEIGHTS
+    mean_luminance = float((luminance * sine).sum() / sine.sum())
+    hot_fraction = (
+        1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
+    ).clamp_min(0.0)
+    hot_power = float((hot_fraction * luminance * sine).sum())
+    if hot_power > MIN_HOT_FRACTION * mean_luminance * float(sine.sum()):
+        return hot_fraction
+    return None
 
 
 def _compute_texel_sines(n_rows: int, n_columns: int) -> Tensor:
