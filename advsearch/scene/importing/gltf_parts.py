@@ -152,14 +152,14 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
             not material.shares_layout(material.normalTexture) for material in materials
         ),
         "emission texture{s} with other coordinates than the base colour: left out, "
-        "with the emission": (map(_has_unreadable_emission, materials)),
+        "with the emission": map(_has_unreadable_emission, materials),
         "material{s} with an alphaMode that glTF does not have: opaque": (
             material.alphaMode not in ("OPAQUE", *TRANSPARENT_MODES)
             for material in materials
         ),
         "further scene{s}: left out": (True for _ in header.scenes[1:]),
-        "node{s} with a mesh outside of its scene: left out": (
-            _list_has_mesh_outside(header)
+        "node{s} with a mesh outside of its scene: left out": _list_has_mesh_outside(
+            header
         ),
     }
 
@@ -824,10 +824,12 @@ def _average_where_visible(
     if not mapped_parts:
         return np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
     # v points down in the file, and up in `average_over_faces`: it becomes 1 - v.
-    uvs = [uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped_parts]
+    corner_uvs = [
+        uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped_parts
+    ]
     corners = [part.vertices[part.faces] for part, _ in mapped_parts]
     areas = np.linalg.norm(compute_area_vectors(np.concatenate(corners)), axis=1)
-    return average_over_faces(image, np.concatenate(uvs), areas)
+    return average_over_faces(image, np.concatenate(corner_uvs), areas)
 
 
 def _edges_differ(image: Float32Array, axis: int) -> bool:
