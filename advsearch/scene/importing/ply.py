@@ -916,7 +916,7 @@ class _Properties:
         first_corner = np.cumsum(counts) - counts
         # Polygons without corners at the end would begin past the last corner.
         first_corner = np.minimum(first_corner, len(corners) - 1)
-        return numbers[corners[first_corner]]
+        return np.asarray(numbers[corners[first_corner]])
 
     def _find_element_with_texture_number(self) -> str | None:
         """Return which element has a `texnumber`: faces, else vertices, or none."""

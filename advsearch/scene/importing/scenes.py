@@ -502,7 +502,7 @@ def _find_visible_corners(part: ImportedPart) -> Float64Array:
     doubled_area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
     extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
     has_area = doubled_area > MIN_DOUBLED_AREA * extent**2
-    return triangles[has_area].reshape(-1, 3)
+    return np.asarray(triangles[has_area].reshape(-1, 3))
 
 
 def _choose_light_unit(
