@@ -304,13 +304,7 @@ class _LayerCheck:
             content: its bytes.
             depth: 1 for a package in a folder, 2 for a package in a package, and so on.
         """
-        stored_files.check_most(
-            self.file.name,
-            depth,
-            MAX_PACKAGE_DEPTH,
-            "packages nested at most {} deep",
-            "more",
-        )
+        self._check_depth(depth)
         with open_package(name, content) as archive:
             _check_without_gaps(name, archive, content)
             entries = {
@@ -328,6 +322,16 @@ class _LayerCheck:
                 elif suffix in LAYER_SUFFIXES:
                     self._count_layer(size=0)
                     self._check_packaged_layer(name, inner_path, entry, entries)
+
+    def _check_depth(self, depth: int) -> None:
+        """Raise FileFormatError if packages are nested more than `MAX_PACKAGE_DEPTH`."""
+        stored_files.check_most(
+            self.file.name,
+            depth,
+            MAX_PACKAGE_DEPTH,
+            "packages nested at most {} deep",
+            "more",
+        )
 
     def _check_packaged_layer(
         self, package: str, path: str, entry: str, entries: set[str]

@@ -401,11 +401,7 @@ class Conversion:
         if converted is None:
             return
         entry, intensity = converted
-        if not _is_valid_power(np.array([*color, intensity])):
-            raise errors.FileFormatError(
-                f"{self.source}: expected the light {node['name']} to have a power of "
-                "at least 0"
-            )
+        self._check_power(node["name"], np.array([*color, intensity]))
         node["extensions"] = {"KHR_lights_punctual": {"light": len(self.lights)}}
         self.lights.append(
             {
@@ -415,6 +411,17 @@ class Conversion:
                 "intensity": intensity,
             }
         )
+
+    def _check_power(self, name: str, powers: Array) -> None:
+        """Raise FileFormatError if the color or the intensity of a light is invalid.
+
+        `powers` are the numbers of both, (N,).
+        """
+        if not _is_valid_power(powers):
+            raise errors.FileFormatError(
+                f"{self.source}: expected the light {name} to have a power of "
+                "at least 0"
+            )
 
     def _convert_light(
         self, prim: Any, radiance: float

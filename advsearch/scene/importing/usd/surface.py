@@ -1170,22 +1170,33 @@ class PreviewSurface:
         # Without a texture the factor is the color. If a missing image is replaced by
         # the fallback of one of its channels, the color is a grey.
         factor: Sequence[float] = list(map(float, np.broadcast_to(plain_color, 3)))
-        if use is not None and _is_scaled_texel(use, max_scale=math.inf):
-            texture = self.surfaces.add_texture(use.data, use.sampler)
-            entry["emissiveTexture"] = self._make_slot(texture, use.layout)
-            factor = use.scale[:3]
-        elif use is not None:
-            values = self.surfaces.compute_values(use)
-            if values is None:
+        if use is not None:
+            texture_and_factor = self._add_emission_texture(use)
+            if texture_and_factor is None:
                 return
-            # The image is divided by its largest value, which becomes the factor.
-            largest = max(float(np.maximum(np.nan_to_num(values), 0.0).max()), 1e-6)
-            texture = self.surfaces.add_image(
-                _normalize_emission(values, largest), use.sampler
-            )
+            texture, factor = texture_and_factor
             entry["emissiveTexture"] = self._make_slot(texture, use.layout)
-            factor = [largest] * 3
         _write_emission_factor(entry, [max(channel, 0.0) for channel in factor])
+
+    def _add_emission_texture(
+        self, use: UsdTextureUse
+    ) -> tuple[int, Sequence[float]] | None:
+        """Add the image of the emission; see `_add_emission`.
+
+        Returns:
+            The index of its texture, and the factor (3,) of its colors; None if it
+            cannot be decoded.
+        """
+        if _is_scaled_texel(use, max_scale=math.inf):
+            texture = self.surfaces.add_texture(use.data, use.sampler)
+            return texture, use.scale[:3]
+        values = self.surfaces.compute_values(use)
+        if values is None:
+            return None
+        # The image is divided by its largest value, which becomes the factor.
+        largest = max(float(np.maximum(np.nan_to_num(values), 0.0).max()), 1e-6)
+        levels = _normalize_emission(values, largest)
+        return self.surfaces.add_image(levels, use.sampler), [largest] * 3
 
 
 def _normalize_emission(values: Array, largest: float) -> Array:
