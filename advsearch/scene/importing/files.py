@@ -124,7 +124,6 @@ def _fill_format_advice(path: Path) -> str | None:
         if suffix in suffixes:
             return f"{kind}: {instructions.format(**names)}"
     return None
-    return None
 
 
 def _make_buffer_advice(path: Path) -> str:

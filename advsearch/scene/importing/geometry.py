@@ -345,16 +345,13 @@ def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     is None. Corners become one vertex of the mesh if they have the same point, normal
     and UV, and also the same stored vertex if that is known.
     """
-    corners = soup.faces.reshape(-1)
     normals = _round_to_float32(soup.normals).reshape(-1, 3)
     uvs = _round_to_float32(soup.uvs).reshape(-1, 2)
-    # Floats are compared by their bits, as integers.
-    keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
-    if soup.stored_vertices is not None:
-        keys = np.column_stack([keys, soup.stored_vertices.reshape(-1)])
+    keys = _make_corner_keys(soup, normals, uvs)
     first_corner, vertex_of_corner = find_unique_rows(keys)
+    point_of_vertex = soup.faces.reshape(-1)[first_corner]
     mesh = Mesh(
-        vertices=soup.points[corners[first_corner]].astype(np.float32),
+        vertices=soup.points[point_of_vertex].astype(np.float32),
         faces=vertex_of_corner.reshape(-1, 3).astype(np.uint32),
         normals=normals[first_corner],
         uvs=uvs[first_corner],
@@ -364,9 +361,29 @@ def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     return mesh, soup.stored_vertices.reshape(-1)[first_corner]
 
 
+def _make_corner_keys(
+    soup: TriangleSoup, normals: Float32Array, uvs: Float32Array
+) -> npt.NDArray[Any]:
+    """Return a row of integers (3 F, k) for each corner, equal for the same vertex.
+
+    Floats are compared by their bits, as integers.
+
+    Args:
+        soup: the faces.
+        normals: (3 F, 3) normal at each corner.
+        uvs: (3 F, 2) UVs at each corner.
+    """
+    corners = soup.faces.reshape(-1)
+    keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
+    if soup.stored_vertices is not None:
+        keys = np.column_stack([keys, soup.stored_vertices.reshape(-1)])
+    return keys
+
+
 def _round_to_float32(values: Float64Array) -> Float32Array:
     """Return values as float32, without -0.0, whose bits are not those of 0.0."""
-    return np.asarray(values.astype(np.float32) + np.float32(0.0))
+    rounded: Float32Array = values.astype(np.float32) + np.float32(0.0)
+    return rounded
 
 
 # ---- Winding ----
@@ -528,11 +545,8 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     component_turned = component[1::2]
     is_turned = _select_windings(component_as_is, component_turned, area)
     has_moebius_strip = bool((component_as_is == component_turned).any())
-    return (
-        is_turned,
-        _number_shells(component_as_is, component_turned),
-        has_moebius_strip,
-    )
+    shell = _number_shells(component_as_is, component_turned)
+    return is_turned, shell, has_moebius_strip
 
 
 def _number_shells(component_as_is: IntArray, component_turned: IntArray) -> IntArray:
@@ -706,30 +720,45 @@ def _compute_signed_volumes(
 def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with a normal on the front of its face at every corner.
 
-    If the file's normals are on the front of their faces on almost all of the surface
-    (`MIN_NORMAL_AGREEMENT`), they are used. If they are on the back on almost all of
-    it, they are all reversed. Otherwise all are computed.
-
-    A single normal that is missing, or on the back of its face, is computed too. A
-    computed normal is smooth, or in a part with flat shading that of the face.
+    A normal of the file is used if `_turn_normals` finds it on the front. A normal that
+    is missing, or on the back of its face, is computed. A computed normal is smooth, or
+    in a part with flat shading that of the face.
     """
     vectors = soup.compute_area_vectors()
     is_known = np.isfinite(soup.normals).all(axis=2)
-    is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
-    normals = soup.normals
-    if is_known.any():
-        front_fraction = _compute_front_fraction(is_known, is_front, vectors)
-        if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:  # most are on the back
-            notes.warn("its normals pointed inwards and were turned around")
-            normals = -normals
-            is_front = is_known & ~is_front
-        elif front_fraction < MIN_NORMAL_AGREEMENT:
-            notes.warn("its normals contradict its faces and were computed anew")
-            is_front = np.zeros_like(is_front)  # no normal of the file is used
+    normals, is_front = _turn_normals(soup, vectors, is_known, notes)
     if not is_front.all():
         is_used = (is_known & is_front)[:, :, None]
         normals = np.where(is_used, normals, _compute_normals(soup, vectors))
     return replace(soup, normals=normals)
+
+
+def _turn_normals(
+    soup: TriangleSoup, vectors: Float64Array, is_known: BoolArray, notes: Notes
+) -> tuple[Float64Array, BoolArray]:
+    """Return the file's normals (F, 3, 3), and which (F, 3) are on the front of a face.
+
+    If they are on the front of their faces on almost all of the surface
+    (`MIN_NORMAL_AGREEMENT`), they stay as they are. If they are on the back on almost
+    all of it, they are all reversed. Otherwise none counts as being on the front.
+
+    Args:
+        soup: the faces.
+        vectors: (F, 3) normals of the faces, as long as twice the areas.
+        is_known: (F, 3) which corners have a normal.
+        notes: notes about the file, to which changes are added.
+    """
+    is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
+    if not is_known.any():
+        return soup.normals, is_front
+    front_fraction = _compute_front_fraction(is_known, is_front, vectors)
+    if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:  # most are on the back
+        notes.warn("its normals pointed inwards and were turned around")
+        return -soup.normals, is_known & ~is_front
+    if front_fraction < MIN_NORMAL_AGREEMENT:
+        notes.warn("its normals contradict its faces and were computed anew")
+        return soup.normals, np.zeros_like(is_front)
+    return soup.normals, is_front
 
 
 def _compute_front_fraction(
@@ -780,18 +809,24 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     face_normals = normalize_vectors(soup.compute_area_vectors())
     smoothing_group = _find_smoothing_groups(soup, face_normals)
     weighted = face_normals[:, None] * _compute_corner_angles(soup)[:, :, None]
-    normal_sums: Float64Array = np.stack(
-        [
-            np.bincount(smoothing_group, weights=weighted[:, :, axis].ravel())
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
+    unit_sums = normalize_vectors(_sum_by_group(weighted, smoothing_group))
+    smooth_normals = unit_sums[smoothing_group].reshape(-1, 3, 3)
     # A mean that is not on the front of a face is replaced by the face's normal. So is
     # a mean of NaN, where normals cancel.
     cosine = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True)
     return np.where(cosine > 0.0, smooth_normals, face_normals[:, None])
+
+
+def _sum_by_group(vectors: Float64Array, group: IntArray) -> Float64Array:
+    """Return the sum (G, 3) of the vectors of corners (F, 3, 3) in each group.
+
+    `group` (3 F,) is the group of each corner.
+    """
+    coordinate_sums = [
+        np.bincount(group, weights=vectors[:, :, axis].ravel()) for axis in range(3)
+    ]
+    vector_sums: Float64Array = np.stack(coordinate_sums, axis=1)
+    return vector_sums
 
 
 def _find_smoothing_groups(soup: TriangleSoup, face_normals: Float64Array) -> IntArray:
@@ -898,10 +933,7 @@ def triangulate_and_note(
         The corners of the triangles (T, 3), as indices into `points`; and the polygon
         of each triangle (T,).
     """
-    n_degenerate = int((counts < 3).sum())
-    if n_degenerate:
-        plural = "" if n_degenerate == 1 else "s"
-        notes.warn(f"{n_degenerate:,} face{plural} of fewer than 3 corners left out")
+    _note_degenerate_polygons(counts, notes)
     triangles, polygon, n_wrong = triangulate(points, counts)
     if n_wrong:
         notes.warn(
@@ -909,6 +941,14 @@ def triangulate_and_note(
             "divided wrongly"
         )
     return triangles, polygon
+
+
+def _note_degenerate_polygons(counts: IntArray, notes: Notes) -> None:
+    """Note how many polygons, with these numbers of corners (P,), have no triangle."""
+    n_degenerate = int((counts < 3).sum())
+    if n_degenerate:
+        plural = "" if n_degenerate == 1 else "s"
+        notes.warn(f"{n_degenerate:,} face{plural} of fewer than 3 corners left out")
 
 
 def triangulate(
@@ -1052,8 +1092,9 @@ def _compute_doubled_polygon_areas(flat: Float64Array) -> Float64Array:
     The signed areas of the triangles between the origin and each side add up to it.
     """
     successors = np.roll(flat, -1, axis=1)
-    doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
-    return np.asarray(np.abs(doubled_areas.sum(axis=1)))
+    side_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
+    doubled_areas: Float64Array = np.abs(side_areas.sum(axis=1))
+    return doubled_areas
 
 
 class _EarCutter:
@@ -1266,6 +1307,7 @@ def _is_left_of_side(
     y0 = start[:, 1:]
     x1 = end[:, :1]
     y1 = end[:, 1:]
-    is_left = (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
+    is_left: BoolArray = (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
     # A point at a corner of the triangle is not in it.
-    return np.asarray(is_left & ((x != x0) | (y != y0)))
+    is_left &= (x != x0) | (y != y0)
+    return is_left

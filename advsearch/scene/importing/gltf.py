@@ -240,10 +240,7 @@ def _find_json_end(path: Path, data: bytes) -> tuple[int, int]:
     Raises:
         FileFormatError: it is no .glb of version 2, or shorter than it states.
     """
-    has_magic = data.startswith(b"glTF")
-    if not has_magic or len(data) < _JSON_START:
-        got = "the first few bytes of one" if has_magic else describe_content(data)
-        raise damaged(path, "a binary glTF file", got)
+    _check_file_start(path, data)
     version, length, json_size, kind = struct.unpack_from("<4xIII4s", data)
     if version != 2:
         raise damaged(path, "binary glTF of version 2", f"version {version}")
@@ -256,6 +253,14 @@ def _find_json_end(path: Path, data: bytes) -> tuple[int, int]:
             f"{json_size} bytes of {format_name(kind.decode('latin-1'))}",
         )
     return json_end, length
+
+
+def _check_file_start(path: Path, data: bytes) -> None:
+    """Raise FileFormatError unless data begin as a .glb file does, up to its JSON."""
+    has_magic = data.startswith(b"glTF")
+    if not has_magic or len(data) < _JSON_START:
+        got = "the first few bytes of one" if has_magic else describe_content(data)
+        raise damaged(path, "a binary glTF file", got)
 
 
 def _check_stated_length(path: Path, length: int, data: bytes) -> None:
@@ -380,19 +385,20 @@ def _check_data_size(path: Path, header: Header) -> None:
     Both sums are limited. Accessors may share a view, or have none and be zeros, and
     views may also hold images, so neither sum bounds the other.
     """
-    accessor_sizes = (
-        entry.count
-        * entry.width
-        * np.dtype(_COMPONENT_TYPES[entry.componentType]).itemsize
-        for entry in header.accessors
-    )
     view_size = sum(view.byteLength for view in header.bufferViews)
+    accessor_size = sum(map(_compute_accessor_size, header.accessors))
     check_most(
         path,
-        max(view_size, sum(accessor_sizes)),
+        max(view_size, accessor_size),
         MAX_DATA_SIZE,
         "geometry and pictures of at most {} bytes",
     )
+
+
+def _compute_accessor_size(accessor: Accessor) -> int:
+    """Return the number of bytes of all values of an accessor."""
+    kind = np.dtype(_COMPONENT_TYPES[accessor.componentType])
+    return accessor.count * accessor.width * kind.itemsize
 
 
 def _make_unsupported_error(path: Path, names: Iterable[str]) -> FileFormatError:
@@ -473,16 +479,29 @@ def _check_attributes(
         FileFormatError: an attribute has a type that the format excludes, or its number
             of values is not that of the positions.
     """
-    positions = attributes.get("POSITION")
     for name, types in _find_valid_types(header, primitive).items():
-        if name not in attributes:
-            continue
-        accessor = attributes[name]
-        if accessor.type not in types:
-            raise damaged(path, f"{name} of type {' or '.join(types)}", accessor.type)
-        if positions is not None and accessor.count != positions.count:
-            expected = f"as many values of {name} as of POSITION, {positions.count:,}"
-            raise damaged(path, expected, f"{accessor.count:,}")
+        if name in attributes:
+            _check_attribute(path, attributes, name, types)
+
+
+def _check_attribute(
+    path: Path, attributes: dict[str, Accessor], name: str, types: tuple[str, ...]
+) -> None:
+    """Check one attribute of a primitive, with the errors of `_check_attributes`.
+
+    Args:
+        path: path of the file, for messages.
+        attributes: accessors of all attributes, by name.
+        name: the attribute that is checked.
+        types: the types that the format allows for it.
+    """
+    accessor = attributes[name]
+    if accessor.type not in types:
+        raise damaged(path, f"{name} of type {' or '.join(types)}", accessor.type)
+    positions = attributes.get("POSITION")
+    if positions is not None and accessor.count != positions.count:
+        expected = f"as many values of {name} as of POSITION, {positions.count:,}"
+        raise damaged(path, expected, f"{accessor.count:,}")
 
 
 def _find_valid_types(
@@ -547,16 +566,22 @@ def _check_tree_sizes(path: Path, header: Header) -> None:
         sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
         for mesh in header.meshes
     ]
-    primitives_of_mesh = [len(mesh.primitives) for mesh in header.meshes]
-    instanced_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
-    n_instanced_triangles = sum(triangles_of_mesh[mesh] for mesh in instanced_meshes)
+    n_instanced_triangles = _sum_over_nodes(header, triangles_of_mesh)
     check_faces(path, max(n_instanced_triangles, sum(triangles_of_mesh)))
-    n_instanced = sum(primitives_of_mesh[mesh] for mesh in instanced_meshes)
+    primitives_of_mesh = [len(mesh.primitives) for mesh in header.meshes]
+    n_instanced = _sum_over_nodes(header, primitives_of_mesh)
     check_most(
         path,
         max(n_instanced, sum(primitives_of_mesh), len(header.nodes)),
         LARGEST_TREE,
         "glTF of at most {} nodes and primitives",
+    )
+
+
+def _sum_over_nodes(header: Header, count_of_mesh: list[int]) -> int:
+    """Return the sum, over all nodes with a mesh, of a count that each mesh has."""
+    return sum(
+        count_of_mesh[node.mesh] for node in header.nodes if node.mesh is not None
     )
 
 
@@ -752,22 +777,19 @@ class GltfFile:
         Raises:
             FileFormatError: there are too many, or they do not exist.
         """
-        sparse_indices = sparse.indices
+        indices = sparse.indices
         count = sparse.count
         if count > n_rows:
             raise damaged(self.path, f"at most {n_rows:,} sparse values", f"{count:,}")
-        sparse_rows = self._make_array(
-            sparse_indices.bufferView,
-            sparse_indices.byteOffset,
-            (count, 1),
-            np.dtype(_COMPONENT_TYPES[sparse_indices.componentType]),
-        )[:, 0]
-        if sparse_rows.max() >= n_rows:
-            raise damaged(
-                self.path,
-                f"sparse values at rows under {n_rows:,}",
-                f"{int(sparse_rows.max()):,}",
-            )
+        kind = np.dtype(_COMPONENT_TYPES[indices.componentType])
+        column = self._make_array(
+            indices.bufferView, indices.byteOffset, (count, 1), kind
+        )
+        sparse_rows = column[:, 0]
+        max_row = int(sparse_rows.max())
+        if max_row >= n_rows:
+            expected = f"sparse values at rows under {n_rows:,}"
+            raise damaged(self.path, expected, f"{max_row:,}")
         return sparse_rows
 
     def _make_array(

@@ -379,9 +379,23 @@ class GltfSurfaces:
             t of the file becomes scale * t + shift.
         """
         material, name = self._get_named_material(material_index)
+        surface = self._make_unfitted_surface(material, name, pieces)
+        uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
+        return self._fit_images(surface, material, uvs)
+
+    def _make_unfitted_surface(
+        self, material: MaterialEntry, name: str, pieces: Sequence[PrimitiveData]
+    ) -> ImportedSurface:
+        """Return the surface of a material, with its images as the file has them.
+
+        Args:
+            material: the material.
+            name: its name.
+            pieces: all primitives with the material.
+        """
         color, texture = self._make_base_color(material)
         roughness, metallic = self._compute_roughness_and_metallic(material, pieces)
-        surface = ImportedSurface(
+        return ImportedSurface(
             color=color,
             texture=texture,
             roughness=clip_to_unit(roughness),
@@ -390,9 +404,6 @@ class GltfSurfaces:
             emission=self._make_emission(material),
             name=name,
         )
-        uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
-        fitted_surface, scale, shift = self._fit_images(surface, material, uvs)
-        return fitted_surface, scale, shift
 
     def _get_named_material(
         self, material_index: int | None
@@ -413,12 +424,9 @@ class GltfSurfaces:
         plain white and the material names a texture, even if its file is missing.
         """
         factor = _get_base_color_factor(material)
-        color_factor = factor[:3]
-        # Factors are linear in glTF.
-        color = linear_to_srgb(color_factor)
-        texture = self._load_base_texture(material, color)
-        if texture is not None and (color_factor != 1.0).any():
-            texture = _multiply_colors(texture, color_factor)
+        opacity_factor = factor[3:]
+        color = linear_to_srgb(factor[:3])  # factors are linear in glTF
+        texture = self._make_base_texture(material, color, factor[:3])
         base_color: Float32Array | None = color
         has_texture = material.metallic_roughness.baseColorTexture is not None
         if has_texture and (color > 0.999).all():
@@ -426,9 +434,21 @@ class GltfSurfaces:
         if material.alphaMode in TRANSPARENT_MODES:
             # "BLEND" keeps partial opacity, "MASK" cuts out what is below the cutoff.
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
-            base_color = apply_opacity(base_color, factor[3:], cutoff)
-            texture = apply_opacity(texture, factor[3:], cutoff)
+            base_color = apply_opacity(base_color, opacity_factor, cutoff)
+            texture = apply_opacity(texture, opacity_factor, cutoff)
         return base_color, texture
+
+    def _make_base_texture(
+        self, material: MaterialEntry, color: Float32Array, factor: Float32Array
+    ) -> Float32Array | None:
+        """Return the texture of the base color, sRGB, times a linear factor (3,); or None.
+
+        `color` (3,) is the factor in sRGB.
+        """
+        texture = self._load_base_texture(material, color)
+        if texture is None or not (factor != 1.0).any():
+            return texture
+        return _multiply_colors(texture, factor)
 
     def _load_base_texture(
         self, material: MaterialEntry, color: Float32Array
@@ -562,11 +582,10 @@ class GltfSurfaces:
             )
             return None
         entry = self.file.header.images[image_index]
-        is_embedded = entry.uri is None or entry.uri.startswith("data:")
-        name = "(embedded)" if is_embedded else str(entry.uri)
         # Several textures may show the same image, a file or a buffer view. It is
         # decoded once.
         key = (entry.uri, entry.bufferView)
+        name = _name_image(entry)
         load_content = partial(self._load_image_content, entry)
         return self._images.load_image(key, load_content, kind, name, note_template)
 
@@ -604,22 +623,20 @@ class GltfSurfaces:
         Returns:
             The surface, and the scale (2,) and shift (2,) of texture coordinates.
         """
-        # An empty array is added, since none at all cannot be concatenated.
-        all_uvs = np.concatenate([*uvs, np.zeros((0, 2))])
         scale = np.ones(2)
         shift = np.zeros(2)
         images = list(surface.images)
-        if not images or not len(all_uvs) or not np.isfinite(all_uvs).all():
+        uv_bounds = _compute_uv_bounds(uvs)
+        if not images or uv_bounds is None:
             return surface, scale, shift
         wraps_by_axis = self._list_wraps_by_axis(material)
         for axis, wraps in enumerate(wraps_by_axis):
-            axis_uvs = all_uvs[:, axis]
             # u, the first coordinate, runs along the second axis of an image.
             images, scale[axis], shift[axis] = self._fit_axis(
                 images,
                 axis=1 - axis,
                 wraps=wraps,
-                bounds=(float(axis_uvs.min()), float(axis_uvs.max())),
+                bounds=uv_bounds[axis],
                 normals_index=_find_normals_index(surface),
             )
         return surface.with_images(images), scale, shift
@@ -734,14 +751,35 @@ class GltfSurfaces:
             return images, 1.0, 0.0
         borders = _list_borders(len(images), normals_index, has_border)
         padded = []
-        for image, size, border in zip(images, sizes, borders, strict=True):
-            before = units_before * (size // n_units)
-            after = units_after * (size // n_units)
-            padded.append(_pad(image, axis, before, after, border))
+        for image, border in zip(images, borders, strict=True):
+            unit = image.shape[axis] // n_units  # in texels of this image
+            pads = (units_before * unit, units_after * unit)
+            padded.append(_pad(image, axis, *pads, border))
         # The old image covers `n_units` of the padded one, after `units_before`.
         scale = n_units / padded_units
         shift = units_before / padded_units
         return padded, scale, shift
+
+
+def _name_image(entry: gltf_entries.Image) -> str:
+    """Return the URI of an image's file, or "(embedded)" if the image is in the file."""
+    is_embedded = entry.uri is None or entry.uri.startswith("data:")
+    return "(embedded)" if is_embedded else str(entry.uri)
+
+
+def _compute_uv_bounds(
+    uvs: Sequence[Float64Array],
+) -> list[tuple[float, float]] | None:
+    """Return the smallest and the largest u, and the smallest and the largest v.
+
+    `uvs` are texture coordinates (V, 2) of several primitives. The result is None if
+    there are none, or if one is NaN or infinite.
+    """
+    # An empty array is added, since none at all cannot be concatenated.
+    all_uvs = np.concatenate([*uvs, np.zeros((0, 2))])
+    if not len(all_uvs) or not np.isfinite(all_uvs).all():
+        return None
+    return [(float(column.min()), float(column.max())) for column in all_uvs.T]
 
 
 def _list_borders(
@@ -764,7 +802,8 @@ def _get_base_color_factor(material: MaterialEntry) -> Float32Array:
     stated_factor = material.metallic_roughness.baseColorFactor
     if stated_factor is None:
         stated_factor = [1.0] * 4
-    return np.asarray(np.array(stated_factor, np.float32).clip(0, 1))
+    factor: Float32Array = np.array(stated_factor, np.float32)
+    return factor.clip(0, 1)
 
 
 def _find_normals_index(surface: ImportedSurface) -> int | None:
@@ -890,8 +929,9 @@ def _interpolate_texels(picture: Float32Array, axis: int, factor: int) -> Float3
     shape[axis] = -1
     fraction = (position - lower).reshape(shape).astype(np.float32)
     upper = np.minimum(lower + 1, size - 1)
-    from_lower = np.take(picture, lower, axis) * (1.0 - fraction)
-    return np.asarray(from_lower + np.take(picture, upper, axis) * fraction)
+    enlarged: Float32Array = np.take(picture, lower, axis) * (1.0 - fraction)
+    enlarged = enlarged + np.take(picture, upper, axis) * fraction
+    return enlarged
 
 
 # ---- Primitives ----
@@ -1067,13 +1107,17 @@ def _note_pieces(
     transparent_meshes = {
         mesh for (mesh, _), piece in with_faces.items() if piece.has_transparent_colors
     }
+    _note_meshes(transparent_meshes, TRANSPARENT_COLORS_NOTE, notes)
     meshes_without_material = {
         mesh for (mesh, _), piece in with_faces.items() if piece.material_index is None
     }
-    if transparent_meshes:
-        notes.warn(_format_count(len(transparent_meshes), TRANSPARENT_COLORS_NOTE))
-    if meshes_without_material:
-        notes.warn(_format_count(len(meshes_without_material), DEFAULT_MATERIAL_NOTE))
+    _note_meshes(meshes_without_material, DEFAULT_MATERIAL_NOTE, notes)
+
+
+def _note_meshes(meshes: set[int], phrase: str, notes: Notes) -> None:
+    """Note the number of meshes, if any, with a phrase as `_format_count` takes it."""
+    if meshes:
+        notes.warn(_format_count(len(meshes), phrase))
 
 
 def _note_without_faces(
@@ -1127,7 +1171,8 @@ def _convert_uvs(
     """
     if uvs is None:
         return None
-    return np.asarray((uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0])
+    converted_uvs: Float64Array = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
+    return converted_uvs
 
 
 def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose]:
@@ -1191,10 +1236,7 @@ def _pose_parts(
     for node, mesh, pose in instances:
         skin_index = file.header.nodes[node].skin
         skin = None if skin_index is None else skins[skin_index]
-        for primitive_index in range(len(file.header.meshes[mesh].primitives)):
-            key = (mesh, primitive_index)
-            if key not in parts_by_key:
-                continue  # it has no faces
+        for key in _list_keys_with_faces(file.header, mesh, parts_by_key):
             piece = with_faces[key]
             part = parts_by_key[key]
             if skeleton is not None:
@@ -1202,6 +1244,14 @@ def _pose_parts(
             posed = _pose_part(file.path, part, piece.vertex_joints, skin, pose)
             parts.append(replace(posed, node=node))
     return parts
+
+
+def _list_keys_with_faces(
+    header: Header, mesh: int, parts_by_key: Mapping[PrimitiveKey, ImportedPart]
+) -> list[PrimitiveKey]:
+    """Return the keys of the primitives of a mesh that are parts, in the file's order."""
+    indices = range(len(header.meshes[mesh].primitives))
+    return [(mesh, index) for index in indices if (mesh, index) in parts_by_key]
 
 
 def _pose_part(
@@ -1235,26 +1285,45 @@ def _make_movable(
         skin: skin of the node; None if it has none.
         skeleton: skeleton of the file.
     """
-    rest_weights = gltf_skeleton.read_rest_weights(file, node, len(piece.morph_targets))
-    n_vertices = len(part.vertices)
-    # Without a skin, all vertices are bound to the node itself.
-    movable = Movable(
+    targets = piece.morph_targets
+    rest_weights = gltf_skeleton.read_rest_weights(file, node, len(targets))
+    movable = _bind_to_node(part.vertices, targets, rest_weights, node, skeleton)
+    if skin is not None and piece.vertex_joints is not None:
+        movable = _bind_to_skin(movable, skin, piece.vertex_joints)
+    morphed = gltf_skeleton.apply_morph_targets(
+        part, targets, piece.normal_offsets, rest_weights
+    )
+    return replace(morphed, movable=movable)
+
+
+def _bind_to_node(
+    vertices: Float64Array,
+    targets: tuple[MorphTarget, ...],
+    rest_weights: Float64Array,
+    node: int,
+    skeleton: Skeleton,
+) -> Movable:
+    """Return the data that moves a part without a skin: its node is its only joint.
+
+    Args:
+        vertices: (V, 3) in the node's coordinates.
+        targets: T morph targets.
+        rest_weights: (T,) weights of the targets at rest.
+        node: index of the node.
+        skeleton: skeleton of the file.
+    """
+    n_vertices = len(vertices)
+    return Movable(
         skeleton=skeleton,
         node=node,
-        vertices=part.vertices,
+        vertices=vertices,
         joint_nodes=np.array([node]),
         inverse_binds=np.eye(4)[None],
         joints=np.zeros((n_vertices, 1), np.int64),
         weights=np.ones((n_vertices, 1)),
-        targets=piece.morph_targets,
+        targets=targets,
         rest_weights=rest_weights,
     )
-    if skin is not None and piece.vertex_joints is not None:
-        movable = _bind_to_skin(movable, skin, piece.vertex_joints)
-    morphed = gltf_skeleton.apply_morph_targets(
-        part, piece.morph_targets, piece.normal_offsets, rest_weights
-    )
-    return replace(morphed, movable=movable)
 
 
 def _bind_to_skin(
@@ -1350,15 +1419,11 @@ def read_primitive(
         return None
     used, faces = _find_used_vertices(file, primitive)
     positions = file.read_float_rows(attributes["POSITION"], used)
-    material = MaterialEntry()
-    if primitive.material is not None:
-        material = file.header.materials[primitive.material]
+    material = _get_primitive_material(file.header, primitive)
     uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
     roughness_uvs = _read_roughness_coordinates(file, attributes, material, used)
     colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
-    normals = None
-    if "NORMAL" in attributes:
-        normals = file.read_float_rows(attributes["NORMAL"], used)
+    normals = _read_stated_normals(file, attributes, used)
     vertex_joints = None
     if is_skinned:
         vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used)
@@ -1375,6 +1440,25 @@ def read_primitive(
         normal_offsets=normal_offsets,
         roughness_uvs=roughness_uvs,
     )
+
+
+def _get_primitive_material(header: Header, primitive: Primitive) -> MaterialEntry:
+    """Return the material of a primitive; the format's default if it names none."""
+    if primitive.material is None:
+        return MaterialEntry()
+    return header.materials[primitive.material]
+
+
+def _read_stated_normals(
+    file: GltfFile, attributes: Mapping[str, int], used: IntArray
+) -> Float64Array | None:
+    """Return the normals (V, 3) of used vertices (V,); None if the primitive has none.
+
+    `attributes` are the indices of its accessors, by name.
+    """
+    if "NORMAL" not in attributes:
+        return None
+    return file.read_float_rows(attributes["NORMAL"], used)
 
 
 def _make_part_without_surface(
@@ -1414,6 +1498,18 @@ def _find_used_vertices(
     Raises:
         FileFormatError: a face refers to a vertex that does not exist.
     """
+    order = _read_vertex_order(file, primitive)
+    triangles = _make_triangles(order, primitive.mode)
+    used_vertices, corners = np.unique(triangles, return_inverse=True)
+    return used_vertices, corners.reshape(-1, 3).astype(np.int64)
+
+
+def _read_vertex_order(file: GltfFile, primitive: Primitive) -> IntArray:
+    """Return the vertices in the order in which a primitive lists them.
+
+    Raises:
+        FileFormatError: one does not exist.
+    """
     count = file.header.accessors[primitive.attributes["POSITION"]].count
     order = np.arange(count)
     if primitive.indices is not None:
@@ -1424,9 +1520,7 @@ def _find_used_vertices(
             "faces of its own vertices",
             "a face that refers to a vertex that does not exist",
         )
-    triangles = _make_triangles(order, primitive.mode)
-    used_vertices, corners = np.unique(triangles, return_inverse=True)
-    return used_vertices, corners.reshape(-1, 3).astype(np.int64)
+    return order
 
 
 def _read_texture_coordinates(

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -171,12 +172,15 @@ def _read_joint_set(
         FileFormatError: there are not four joints and four weights for each vertex.
     """
     attributes = primitive.attributes
+    accessors = file.header.accessors
     joints_index = attributes[f"JOINTS_{index}"]
     weights_index = attributes.get(f"WEIGHTS_{index}")
-    n_vertices = file.header.accessors[attributes["POSITION"]].count
-    if weights_index is None or not (
-        _is_vec4(file.header.accessors[joints_index], n_vertices)
-        and _is_vec4(file.header.accessors[weights_index], n_vertices)
+    n_vertices = accessors[attributes["POSITION"]].count
+    has_joints = _is_vec4(accessors[joints_index], n_vertices)
+    if (
+        weights_index is None
+        or not has_joints
+        or not _is_vec4(accessors[weights_index], n_vertices)
     ):
         raise damaged(
             file.path, "four joints and four weights of each vertex", "others"
@@ -272,7 +276,8 @@ def _transform_normals(normals: Float64Array, linear: Float64Array) -> Float64Ar
     i + 1 and i + 2.
     """
     cofactors = np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
-    return np.asarray(np.einsum("vij,vj->vi", cofactors, normals))
+    transformed: Float64Array = np.einsum("vij,vj->vi", cofactors, normals)
+    return transformed
 
 
 def read_morph_targets(
@@ -298,14 +303,25 @@ def read_morph_targets(
     normal_offsets = list[Float64Array | None]()
     for name, attributes in zip(names, primitive.targets, strict=True):
         offsets = _read_offsets(file, primitive, attributes, "POSITION", used)
-        if offsets is None:  # the target moves normals alone
-            offsets = np.zeros((len(used), 3))
-        moved_vertices = np.flatnonzero(offsets.any(axis=1))
-        targets.append(MorphTarget(name, moved_vertices, offsets[moved_vertices]))
+        targets.append(_make_morph_target(name, offsets, len(used)))
         normal_offsets.append(
             _read_offsets(file, primitive, attributes, "NORMAL", used)
         )
     return tuple(targets), tuple(normal_offsets)
+
+
+def _make_morph_target(
+    name: str, offsets: Float64Array | None, n_vertices: int
+) -> MorphTarget:
+    """Return a morph target with only the vertices that it moves.
+
+    `offsets` (V, 3) are those of all vertices; None for a target that moves only
+    normals.
+    """
+    if offsets is None:
+        offsets = np.zeros((n_vertices, 3))
+    moved_vertices = np.flatnonzero(offsets.any(axis=1))
+    return MorphTarget(name, moved_vertices, offsets[moved_vertices])
 
 
 def _name_targets(count: int, extras: object) -> list[str]:
@@ -546,7 +562,8 @@ def _compute_quaternions(nodes: Sequence[Node]) -> Float64Array:
     """Return the unit quaternions (N, 4), x y z w, of nodes; the identity by default."""
     quaternions = np.array([node.rotation or [0.0, 0.0, 0.0, 1.0] for node in nodes])
     lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    return np.asarray(quaternions / np.maximum(lengths, 1e-12))
+    unit_quaternions: Float64Array = quaternions / np.maximum(lengths, 1e-12)
+    return unit_quaternions
 
 
 def _count_key_numbers(
@@ -617,13 +634,9 @@ def _find_moving_channels(
     moving_nodes = with_ancestors(header.parent_of_node, {*target_counts, *joints})
     moving_channels = []
     for animation in header.animations:
-        moving_channels.append(
-            [
-                channel
-                for channel in animation.channels
-                if _is_moving(channel, target_counts, moving_nodes)
-            ]
-        )
+        channels = animation.channels
+        is_moving = [_is_moving(each, target_counts, moving_nodes) for each in channels]
+        moving_channels.append(list(compress(channels, is_moving)))
     return moving_channels
 
 
@@ -731,10 +744,8 @@ def _read_keys(
     count = n_keys * values_per_key * n_targets
     output = file.header.accessors[index]
     if output.count != count or output.width != width:
-        expected = (
-            f"{count:,} values of {_count_numbers(width)} for "
-            f"{n_keys:,} keys of a {property_name}"
-        )
+        values_text = f"{count:,} values of {_count_numbers(width)}"
+        expected = f"{values_text} for {n_keys:,} keys of a {property_name}"
         raise damaged(file.path, expected, f"{output.count:,} of {output.width}")
     values = file.read_float_rows(index, np.arange(count))
     finite_values = _require_finite(file.path, "the keys of a clip", values)

@@ -23,7 +23,7 @@ import OpenEXR
 
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.pictures import MAX_PIXELS, check_pixels
-from advsearch.scene.assets import Float32Array
+from advsearch.scene.assets import Float32Array, Float64Array
 from advsearch.scene.importing.files import damaged, describe_content, format_name
 from advsearch.trust.stored_files import check_most
 
@@ -166,14 +166,19 @@ def _read_layer(
         _check_size(file, exr_file)
     with OpenEXR.File(io.BytesIO(data), separate_channels=True) as exr_file:
         parts = [(dict(part.header), dict(part.channels)) for part in exr_file.parts]
-        is_incomplete = any(
-            len(channels) != len(header["channels"]) for header, channels in parts
-        )
-        if not parts or is_incomplete:
-            raise ValueError("pixels that end early")
+        _check_complete(parts)
         header, channels, notes = _select_layer(file, parts)
         planes = {name: channel.pixels for name, channel in channels.items()}
         return header, planes, notes
+
+
+def _check_complete(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    """Raise ValueError unless each part, a header and channels, has all its channels."""
+    is_incomplete = any(
+        len(channels) != len(header["channels"]) for header, channels in parts
+    )
+    if not parts or is_incomplete:
+        raise ValueError("pixels that end early")
 
 
 def _check_planes(
@@ -291,6 +296,12 @@ class _Layer(NamedTuple):
         lacks_colors = "R" not in self.channels
         return name_rank, lacks_colors
 
+    @property
+    def color_channels(self) -> dict[str, Any]:
+        """Colors, or luminance with its chroma if there is one, by name."""
+        names = ("R", "G", "B") if "R" in self.channels else ("Y", "RY", "BY")
+        return {name: self.channels[name] for name in names if name in self.channels}
+
 
 def _select_layer(
     file: Path, parts: list[tuple[dict[str, Any], dict[str, Any]]]
@@ -312,14 +323,8 @@ def _select_layer(
     if not layers:
         raise _make_no_colors_error(file, parts)
     selected = min(layers, key=lambda layer: layer.rank)  # the first of equal ones
-    # colors, or luminance with its chroma if there is one
-    channel_names = ("R", "G", "B") if "R" in selected.channels else ("Y", "RY", "BY")
-    channels = {
-        name: selected.channels[name]
-        for name in channel_names
-        if name in selected.channels
-    }
-    return selected.header, channels, _describe_other_layers(selected, layers)
+    notes = _describe_other_layers(selected, layers)
+    return selected.header, selected.color_channels, notes
 
 
 def _make_no_colors_error(
@@ -626,17 +631,27 @@ def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     factors = np.ones(3)
     notes = list[str]()
     for text in re.findall(rb"^COLORCORR=(.*)$", header, re.MULTILINE)[:100]:
-        numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
-        corrected = np.full(3, np.nan)  # not in range
-        if len(numbers) == 3 and (numbers > 0.0).all():
-            corrected = factors / numbers
-        is_in_range = ((corrected > 1e-20) & (corrected < 1e20)).all()
-        if is_in_range:
+        corrected = _divide_by_correction(factors, text)
+        if corrected is not None:
             factors = corrected
         else:
             line = "COLORCORR=" + text.decode("latin-1")
             notes.append(f"its line {format_name(line)} is left out")
     return factors.astype(np.float32), notes
+
+
+def _divide_by_correction(factors: Float64Array, text: bytes) -> Float64Array | None:
+    """Return factors (3,) divided by those of a COLORCORR line; None if it is invalid.
+
+    A valid `text` has three positive numbers. They must not take the result near the
+    limits of float32, which are about 1e-38 and 3e38.
+    """
+    numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
+    if len(numbers) != 3 or not (numbers > 0.0).all():
+        return None
+    corrected: Float64Array = factors / numbers
+    is_in_range = ((corrected > 1e-20) & (corrected < 1e20)).all()
+    return corrected if is_in_range else None
 
 
 def decode_rgbe(pixels: Bytes) -> Float32Array:

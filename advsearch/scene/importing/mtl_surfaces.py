@@ -32,6 +32,7 @@ IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
 highlights.
 """
 NORMAL_MAPS = ("norm", "map_kn", "map_bump", "bump")
+COLOR_MAPS = ("map_kd", "map_ke")
 UV_MAPS = ("map_kd", "map_d", *NORMAL_MAPS, "map_ke")
 """Maps that are sampled at texture coordinates. All have the layout (scale and offset of
 texture coordinates) of the first of them that a material has.
@@ -179,9 +180,7 @@ class MtlReader:
                 all squares, is left out of the result.
         """
         material = self._find_material(name)
-        if material is None:
-            return []
-        numbered_name = self._find_numbered_name(material)
+        numbered_name = self._find_numbered_name(material) if material else None
         if numbered_name is None:
             return []
         squares = [square for square in candidates if square]
@@ -262,12 +261,8 @@ class MtlReader:
         opaque_surface = ImportedSurface(color, texture, name=material.name)
         return replace(
             self._apply_opacity(material, uses.get("map_d"), opaque_surface),
-            roughness=self._read_fraction(
-                material, "pr", uses.get("map_pr"), name, square
-            ),
-            metallic=self._read_fraction(
-                material, "pm", uses.get("map_pm"), name, square
-            ),
+            roughness=self._read_fraction(material, "pr", uses, name, square),
+            metallic=self._read_fraction(material, "pm", uses, name, square),
             normal_map=self._make_normal_map(material, uses),
             emission=self._make_emission(material, uses.get("map_ke")),
         )
@@ -285,17 +280,15 @@ class MtlReader:
             use = self._parse_use(material, key)
             if use is not None:
                 uses[key] = use
-        material.tracked_statements.mark_read(
-            *(key for key in uses if key not in NORMAL_MAPS)
-        )
+        read_keys = [key for key in uses if key not in NORMAL_MAPS]
         # `_note_unread` notes some values of illum, but not the statement itself.
-        material.tracked_statements.mark_read("illum")
-        if square:
-            uses = {
-                key: replace(use, name=replace_square(use.name, square))
-                for key, use in uses.items()
-            }
-        return uses
+        material.tracked_statements.mark_read(*read_keys, "illum")
+        if not square:
+            return uses
+        return {
+            key: replace(use, name=replace_square(use.name, square))
+            for key, use in uses.items()
+        }
 
     def _drop_other_layouts(
         self,
@@ -439,16 +432,9 @@ class MtlReader:
             key: keyword of the statement with the image, such as "map_kd".
             use: the image and its options.
         """
-        has_colors = key in ("map_kd", "map_ke")
-        read_options = ["s", "o", "mm", "clamp"]  # scale, offset, value range, clamping
-        if key in NORMAL_MAPS:
-            read_options.append("bm")  # bump multiplier
-        elif not has_colors:
-            read_options.append("imfchan")  # channel of the image
         options = TrackedKeys(use.options)
-        options.mark_read(*read_options)
-
-        is_without_effect = partial(_is_default_option, has_colors)
+        options.mark_read(*_list_read_options(key))
+        is_without_effect = partial(_is_default_option, key in COLOR_MAPS)
         for option in options.find_unread(is_without_effect):
             self.notes.record(
                 "texture option", f"-{option} of {material.spelling[key]}"
@@ -474,20 +460,15 @@ class MtlReader:
         )
         if image is None and factor == 1.0:
             return surface
-        color = surface.color
-        texture = surface.texture
-        # A surface without a color would have no opacity either: it becomes grey.
-        color_or_grey = np.full(3, NEUTRAL_GREY, np.float32) if color is None else color
+        opacity = None
         if use is not None and image is not None:
             opacity = _select_channel(image, use)
-            texture = _append_opacity(texture, color_or_grey, opacity)
-        elif texture is None:
-            color = color_or_grey
+        surface = _prepare_opacity(surface, opacity)
         factor_array = np.array([factor], np.float32)
         return replace(
             surface,
-            color=apply_opacity(color, factor_array, cutoff=None),
-            texture=apply_opacity(texture, factor_array, cutoff=None),
+            color=apply_opacity(surface.color, factor_array, cutoff=None),
+            texture=apply_opacity(surface.texture, factor_array, cutoff=None),
         )
 
     def _read_opacity(self, material: MtlMaterial) -> float:
@@ -536,7 +517,7 @@ class MtlReader:
         self,
         material: MtlMaterial,
         key: str,
-        use: MapStatement | None,
+        uses: dict[str, MapStatement],
         name: str,
         square: int,
     ) -> float | None:
@@ -548,10 +529,11 @@ class MtlReader:
         Args:
             material: the material.
             key: "pr" or "pm".
-            use: its map, or None.
+            uses: the maps of the material by keyword, such as "map_pr".
             name: name by which the mesh file uses the material.
             square: the UDIM square.
         """
+        use = uses.get(f"map_{key}")
         # Only notes about a map use the keyword; without a map it is None.
         keyword = material.spelling.get(f"map_{key}")
         note_template = f"{keyword} {{name}} {{why}}; it is left out"
@@ -563,9 +545,9 @@ class MtlReader:
             "textures of roughness and metallic are replaced by their means"
         )
         uvs, areas = self.find_mapped_faces(name, square)
-        channel = _select_channel(image, use)[:, :, None]
-        mean = average_over_faces(channel, uvs * use.scale + use.offset, areas)
-        return float(mean[0])
+        values = _select_channel(image, use)[:, :, None]
+        (mean,) = average_over_faces(values, uvs * use.scale + use.offset, areas)
+        return float(mean)
 
     def _make_normal_map(
         self, material: MtlMaterial, uses: dict[str, MapStatement]
@@ -580,9 +562,7 @@ class MtlReader:
             uses: its maps by keyword.
         """
         note_template = "the normal map {name} {why}; it is left out"
-        for key in NORMAL_MAPS:
-            if key not in uses:
-                continue
+        for key in (key for key in NORMAL_MAPS if key in uses):
             use = uses[key]
             image = self._load_image(use, "numbers", note_template)
             same_image = [other for other in uses if uses[other].name == use.name]
@@ -709,6 +689,35 @@ def _is_default_option(has_colors: bool, option: str, value: str) -> bool:
 def _is_clamped(use: MapStatement) -> bool:
     """Return whether an image must not repeat beyond its edges."""
     return use.options.get("clamp", "").lower() == "on"
+
+
+def _list_read_options(key: str) -> list[str]:
+    """Return the options that are read of an image with a keyword such as "map_kd"."""
+    read_options = ["s", "o", "mm", "clamp"]  # scale, offset, value range, clamping
+    if key in NORMAL_MAPS:
+        read_options.append("bm")  # bump multiplier
+    elif key not in COLOR_MAPS:
+        read_options.append("imfchan")  # channel of the image
+    return read_options
+
+
+def _prepare_opacity(
+    surface: ImportedSurface, opacity: Float32Array | None
+) -> ImportedSurface:
+    """Return a surface with an opacity map (h, w) as fourth channel of its texture.
+
+    Without a map, the surface only gets a color if it has neither a color nor a
+    texture: it could have no opacity either. It becomes grey.
+    """
+    color = surface.color
+    if color is None:
+        color = np.full(3, NEUTRAL_GREY, np.float32)
+    if opacity is not None:
+        texture = _append_opacity(surface.texture, color, opacity)
+        return replace(surface, texture=texture)
+    if surface.texture is None:
+        return replace(surface, color=color)
+    return surface
 
 
 def _append_opacity(

@@ -540,7 +540,8 @@ def _enlarge_by_repeating(image: Float32Array, size: tuple[int, int]) -> Float32
     rows, columns = image.shape[:2]
     source_rows = np.arange(height) * rows // height
     source_columns = np.arange(width) * columns // width
-    return np.asarray(image[source_rows][:, source_columns])
+    resized: Float32Array = image[source_rows][:, source_columns]
+    return resized
 
 
 TOUCHING_HEIGHT = 0.02

@@ -199,11 +199,8 @@ def apply_opacity(
     """
     if color is None:
         return None
-    alpha = color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])
-    opacity = alpha * factor
-    if cutoff is not None:
-        opacity = (opacity >= cutoff).astype(np.float32)
     rgb = color[..., :3]
+    opacity = _compute_opacity(color, factor, cutoff)
     if opacity.min() >= 1.0:  # opaque everywhere
         return rgb
     is_cut_out = opacity[..., 0] == 0.0
@@ -211,6 +208,17 @@ def apply_opacity(
     if is_image and not is_cut_out.all():
         rgb = _fill_cut_out_texels(rgb, is_cut_out)
     return np.concatenate([rgb, opacity], axis=-1)
+
+
+def _compute_opacity(
+    color: Float32Array, factor: Float32Array, cutoff: float | None
+) -> Float32Array:
+    """Return the opacity (..., 1) of a base color (..., 3 or 4); see `apply_opacity`."""
+    alpha = color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])
+    opacity: Float32Array = alpha * factor
+    if cutoff is not None:
+        opacity = (opacity >= cutoff).astype(np.float32)
+    return opacity
 
 
 def _fill_cut_out_texels(rgb: Float32Array, is_cut_out: BoolArray) -> Float32Array:
@@ -222,7 +230,8 @@ def _fill_cut_out_texels(rgb: Float32Array, is_cut_out: BoolArray) -> Float32Arr
     nearest_visible = distance_transform_edt(
         is_cut_out, return_distances=False, return_indices=True
     )
-    return np.asarray(rgb[tuple(nearest_visible)])
+    extended: Float32Array = rgb[tuple(nearest_visible)]
+    return extended
 
 
 def clip_to_unit(value: float | None) -> float | None:

@@ -92,18 +92,29 @@ def load_display_image(
         OSError, ValueError, SyntaxError: its pixels are truncated or corrupt.
     """
     check_decodable(image, path)
-    width, height = image.size
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about large images and odd metadata
         image.load()
-        # factor of the size; the image is not enlarged
-        shrink = 1.0 if limit is None else limit / max(height, width)
-        if shrink >= 1.0:
+        target_shape = _compute_smaller_shape(image.size, limit)
+        if target_shape is None:
             return np.asarray(_VALUE_OF_LEVEL[to_8bit_levels(image, alpha=keep_alpha)])
-        target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
         if is_raw:
             return _average_numbers(image, target_shape)
         return _average_colors(image, target_shape, keep_alpha=keep_alpha)
+
+
+def _compute_smaller_shape(
+    size: tuple[int, int], limit: int | None
+) -> tuple[int, int] | None:
+    """Return the height and width of an image whose longest side becomes the limit.
+
+    The result is None if the image, of a width and height, is not above the limit.
+    """
+    width, height = size
+    shrink = 1.0 if limit is None else limit / max(height, width)
+    if shrink >= 1.0:
+        return None
+    return max(1, round(height * shrink)), max(1, round(width * shrink))
 
 
 # (256,) the values in [0, 1] of 8-bit levels: a table replaces a computation per pixel
@@ -400,7 +411,7 @@ class FileImages:
     def _note_smaller(
         self, name: str, size: tuple[int, int], texture_size: tuple[int, int]
     ) -> None:
-        """Note an image whose texture has another width and height, unless it has not."""
+        """Note an image whose texture has another width and height than itself."""
         if texture_size != size:
             label = f"the texture {format_name(name)}" if name else "a texture"
             self.notes.warn(

@@ -105,19 +105,25 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
     )
     notes.check_faces(elements["face"].count if "face" in elements else 0)
     body = data[header_end.end() :]
-    # `cells` are the bytes from which rows are read. The numbers of an ASCII file are
-    # first parsed to float64; then their bytes are read as those of a binary file.
-    is_binary = byte_order != ""
-    if is_binary:
-        cells = np.frombuffer(body, np.uint8)
-    else:
-        cells = parse_number_array(body, np.float64).view(np.uint8)
+    text = b"" if byte_order else body  # an ASCII file has no byte order
+    cells = _read_cells(body, is_ascii=not byte_order)
     position = 0
     for element in elements.values():
-        reader = _RowReader(notes, element, cells, text=b"" if is_binary else body)
+        reader = _RowReader(notes, element, cells, text)
         # This fills in the element, and returns its end, where the next one begins.
         position = reader.read(position)
     return elements, comments
+
+
+def _read_cells(body: bytes, *, is_ascii: bool) -> npt.NDArray[np.uint8]:
+    """Return the bytes from which rows are read.
+
+    The numbers of an ASCII file are first parsed to float64; then their bytes are read
+    as those of a binary file.
+    """
+    if is_ascii:
+        return parse_number_array(body, np.float64).view(np.uint8)
+    return np.frombuffer(body, np.uint8)
 
 
 def _find_header_end(data: bytes, notes: Notes) -> re.Match[bytes]:
@@ -255,20 +261,19 @@ class _RowReader:
 
     def __post_init__(self) -> None:
         """Make the views of the bytes, and find the sizes of scalars and counts."""
-        element = self.element
-        self.values = {
-            name: self._view_from_any_byte(kind)
-            for name, kind in element.type_by_property.items()
-        }
-        self.counts = {
-            name: self._view_from_any_byte(kind)
-            for name, kind in element.count_types.items()
-        }
+        self.values = self._view_all(self.element.type_by_property)
+        self.counts = self._view_all(self.element.count_types)
         # A list begins with its count. A property without counts is a scalar.
         self.widths = {
             name: self.counts.get(name, values).itemsize
             for name, values in self.values.items()
         }
+
+    def _view_all(
+        self, types: Mapping[str, np.dtype[np.generic]]
+    ) -> dict[str, Numbers]:
+        """Return `_view_from_any_byte` for each property, by its type."""
+        return {name: self._view_from_any_byte(kind) for name, kind in types.items()}
 
     def read(self, position: int) -> int:
         """Read all rows, and return the position of the byte after them.
@@ -289,14 +294,20 @@ class _RowReader:
         # rows would end beyond the file, or the lists at these positions differ in
         # length, that is wrong, and rows are walked one by one.
         starts, end = self._find_even_rows(position)
-        rows_differ = end > len(self.cells) or any(
-            np.ptp(count_at_byte[starts[name]]) != 0
-            for name, count_at_byte in self.counts.items()
-        )
-        if rows_differ:
+        if end > len(self.cells) or self._have_lists_other_lengths(starts):
             starts, end = self._walk_rows(position, self.element.count)
         self._store_values(starts)
         return end
+
+    def _have_lists_other_lengths(self, starts: Mapping[str, IntArray]) -> bool:
+        """Return whether some property has lists of different lengths.
+
+        `starts` are, by property, the bytes (rows,) at which it begins in each row.
+        """
+        return any(
+            np.ptp(count_at_byte[starts[name]]) != 0
+            for name, count_at_byte in self.counts.items()
+        )
 
     def _view_from_any_byte(self, kind: np.dtype[np.generic]) -> Numbers:
         """View the bytes as numbers of a type, one for each byte.
@@ -337,20 +348,29 @@ class _RowReader:
         starts = {name: list[int]() for name in self.widths}
         byte = position
         for _ in range(n_rows):
-            for name, width in self.widths.items():
+            for name in self.widths:
                 starts[name].append(byte)
-                self._check_end(byte + width)
-                is_list = name in self.counts
-                if is_list:  # `width` is that of its count, which is before its values
-                    length = self._read_length(name, byte)
-                    byte += self.values[name].itemsize * length
-                byte += width
+                byte = self._find_property_end(name, byte)
         self._check_end(byte)
         arrays = {
             name: np.array(positions, dtype=np.int64)
             for name, positions in starts.items()
         }
         return arrays, byte
+
+    def _find_property_end(self, name: str, byte: int) -> int:
+        """Return the byte after a property that begins at a byte.
+
+        Raises:
+            FileFormatError: the file ends within the scalar or the count of the list,
+                or the list has an impossible length.
+        """
+        end = byte + self.widths[name]
+        self._check_end(end)
+        is_list = name in self.counts
+        if is_list:  # its values follow its count
+            end += self.values[name].itemsize * self._read_length(name, byte)
+        return end
 
     def _read_length(self, name: str, byte: int) -> int:
         """Return the length of the list that begins at a byte."""
@@ -532,8 +552,6 @@ def _make_parts(
     texture = polygon_textures[polygon]
     colors = reader.read_colors(position.row_of_corner, polygon)
     surfaces = reader.make_surfaces(texture_names, has_no_colors=colors is None)
-    # Faces without a texture have the index -1, that of the last surface.
-    surfaces.append(ImportedSurface())
     parts = list[ImportedPart]()
     for group in group_faces(texture, _find_mapped_triangles(uvs, len(triangles))):
         surface = surfaces[texture[group[0]]]
@@ -548,7 +566,8 @@ def _find_mapped_triangles(uvs: IndexedValues | None, n_triangles: int) -> BoolA
     """Return which triangles (T,) have texture coordinates at all corners."""
     if uvs is None:
         return np.zeros(n_triangles, np.bool_)
-    return np.asarray((uvs.row_of_corner >= 0).all(axis=1))
+    is_mapped: BoolArray = (uvs.row_of_corner >= 0).all(axis=1)
+    return is_mapped
 
 
 def _parse_texture_names(comments: Sequence[str]) -> list[str]:
@@ -821,8 +840,7 @@ class _Properties:
         values = self.read_columns(element, COLOR_NAMES)
         if values is None:
             return None
-        color_type = self._find_color_type(element)
-        full_brightness = _find_scale(values, color_type)
+        full_brightness = _find_scale(values, self._find_color_type(element))
         display = np.clip(np.nan_to_num(values / full_brightness), 0.0, 1.0)
         linear = srgb_to_linear(display.astype(np.float32))
         neutral = srgb_to_linear(np.full((1, 3), NEUTRAL_GREY, np.float32))
@@ -881,7 +899,11 @@ class _Properties:
             self._note_single_texture(names)
             return np.zeros(len(counts), np.int64)
         texture = self._read_texture_numbers(element, corners, counts)
-        is_wrong = (texture < -1) | (texture >= len(names))
+        return self._remove_wrong_numbers(texture, len(names))
+
+    def _remove_wrong_numbers(self, texture: IntArray, n_textures: int) -> IntArray:
+        """Return indices of textures (P,), -1 for those that do not exist, with a note."""
+        is_wrong = (texture < -1) | (texture >= n_textures)
         n_wrong = int(is_wrong.sum())
         if n_wrong:
             self.notes.warn(
@@ -916,7 +938,8 @@ class _Properties:
         first_corner = np.cumsum(counts) - counts
         # Polygons without corners at the end would begin past the last corner.
         first_corner = np.minimum(first_corner, len(corners) - 1)
-        return np.asarray(numbers[corners[first_corner]])
+        texture_numbers: IntArray = numbers[corners[first_corner]]
+        return texture_numbers
 
     def _find_element_with_texture_number(self) -> str | None:
         """Return which element has a `texnumber`: faces, else vertices, or none."""
@@ -929,9 +952,10 @@ class _Properties:
     def make_surfaces(
         self, names: Sequence[str], *, has_no_colors: bool
     ) -> list[ImportedSurface]:
-        """Return the surface of each texture.
+        """Return the surface of each texture, and one without texture as the last.
 
-        The alpha of textures is left out, with a note if it is not opaque.
+        The last one is also found by the index -1 of faces without a texture. The alpha
+        of textures is left out, with a note if it is not opaque.
 
         Args:
             names: names of the texture files.
@@ -942,18 +966,18 @@ class _Properties:
         pictures = FileImages(
             materials=len(names), references=references, notes=self.notes
         )
-        surfaces = {}
         substitute = "the colours of its vertices or faces are"
         if has_no_colors:
             substitute = "neutral grey is"
+        # The blank makes the file the subject: "chair.ply names the texture ...".
+        note_template = (
+            f" names the texture {{name}}, which {{why}}; {substitute} used instead"
+        )
+        surfaces = {}
         for name in dict.fromkeys(names):
-            # The blank makes the file the subject: "chair.ply names the texture ...".
-            note_template = (
-                f" names the texture {{name}}, which {{why}}; {substitute} used instead"
-            )
             texture = self._load_opaque_texture(pictures, name, note_template)
             surfaces[name] = ImportedSurface(texture=texture, name=name)
-        return [surfaces[name] for name in names]
+        return [*(surfaces[name] for name in names), ImportedSurface()]
 
     def _load_opaque_texture(
         self, pictures: FileImages, name: str, note_template: str
@@ -1057,4 +1081,5 @@ def _find_positions_in_strips(is_end_mark: BoolArray, counts: IntArray) -> IntAr
     # (N,) for each vertex its index, and the index of its strip's first vertex
     index = np.arange(len(is_end_mark))
     strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
-    return np.asarray(index - strip_start)
+    index_in_strip: IntArray = index - strip_start
+    return index_in_strip

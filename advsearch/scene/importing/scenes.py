@@ -256,9 +256,8 @@ def _find_node(
         UnknownNameError: no candidate has the name.
         InputError: several candidates have the name.
     """
-    candidates = sorted(
-        with_ancestors(header.parent_of_node, {part.node for part in parts})
-    )
+    drawing_nodes = {part.node for part in parts}
+    candidates = sorted(with_ancestors(header.parent_of_node, drawing_nodes))
     labels = {index: header.get_node_label(index) for index in candidates}
     matches = [
         index for index, label in labels.items() if name in (label, f"node {index}")
@@ -317,9 +316,8 @@ def _make_surrounding_mesh(
     mesh_to_object = np.eye(4)
     mesh_to_object[:3, :3] *= frame.size / object_frame.size
     mesh_to_object[:3, 3] = object_frame.to_frame(frame.origin)
-    return make_mesh_part(
-        shape.name, shape, mesh_to_object, shape.material
-    ), shape.warnings
+    part = make_mesh_part(shape.name, shape, mesh_to_object, shape.material)
+    return part, shape.warnings
 
 
 def list_node_names(path: Path) -> list[str]:
@@ -408,13 +406,13 @@ def read_file_contents(path: Path) -> FileContents:
     header = gltf.read_header(path, data)
     notes += gltf_parts.describe_changed_lights(header, path.name)
     asset = _make_full_object(path, parts, notes, header)
-    lights = tuple(
+    light_names = tuple(
         light.name or f"light {index}" for index, light in enumerate(header.lights)
     )
-    cameras = tuple(
-        _make_camera_names(header, dict(iterate_node_poses(header))).values()
-    )
-    return FileContents(asset, _measure_nodes(header, parts), lights, cameras)
+    node_poses = dict(iterate_node_poses(header))
+    camera_names = tuple(_make_camera_names(header, node_poses).values())
+    nodes = _measure_nodes(header, parts)
+    return FileContents(asset, nodes, light_names, camera_names)
 
 
 def _make_full_object(
@@ -502,7 +500,8 @@ def _find_visible_corners(part: ImportedPart) -> Float64Array:
     doubled_area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
     extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
     has_area = doubled_area > MIN_DOUBLED_AREA * extent**2
-    return np.asarray(triangles[has_area].reshape(-1, 3))
+    corners: Float64Array = triangles[has_area].reshape(-1, 3)
+    return corners
 
 
 def _choose_light_unit(
@@ -592,11 +591,7 @@ def _make_lamp(
     """
     position, intensity = _position_light(light, candela_per_unit, pose, frame)
     _check_light(path, name, position, intensity)
-    x, y, z = map(float, position)
-    red, green, blue = map(float, intensity)
-    lamp = PointLamp(
-        name, dark=not intensity.any(), position=(x, y, z), intensity=(red, green, blue)
-    )
+    lamp = _make_point_lamp(name, position, intensity)
     if light.type != "spot":
         return lamp
     return SpotLamp(
@@ -604,6 +599,18 @@ def _make_lamp(
         direction=_normalize_axis(frame.rotation @ -pose[:3, 2]),
         cutoff=math.degrees(light.spot.outerConeAngle),
         beam=math.degrees(light.spot.innerConeAngle),
+    )
+
+
+def _make_point_lamp(
+    name: str, position: Float64Array, intensity: Float64Array
+) -> PointLamp:
+    """Return a lamp at a position (3,) with a radiant intensity (3,)."""
+    x, y, z = map(float, position)
+    red, green, blue = map(float, intensity)
+    is_dark = not intensity.any()
+    return PointLamp(
+        name, dark=is_dark, position=(x, y, z), intensity=(red, green, blue)
     )
 
 
@@ -686,20 +693,27 @@ def _make_camera(
             field of view.
     """
     assert camera.perspective is not None
-    # The columns are the camera's axes in our coordinates. The scale of its node has no
-    # effect, so they are made unit vectors.
+    matrix = _compute_camera_pose(pose, frame)
+    fov = _compute_fov_degrees(camera.perspective)
+    problem = _find_camera_problem(matrix, fov)
+    if problem:
+        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
+    return PosedCamera(matrix, fov, upright=camera.perspective.aspectRatio is None)
+
+
+def _compute_camera_pose(pose: Float64Array, frame: FileFrame) -> Float64Array:
+    """Return the pose (4, 4) of a camera in a frame, from the pose of its node in the file.
+
+    The first three columns are the camera's axes, as unit vectors: the scale of its
+    node has no effect.
+    """
     axes = frame.rotation @ pose[:3, :3] @ GLTF_CAMERA_AXES
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
     matrix[:3, :3] = axes
     # `to_frame` moves and scales points that are rotated to our axes already.
     matrix[:3, 3] = frame.to_frame(frame.rotation @ pose[:3, 3])
-    aspect_ratio = camera.perspective.aspectRatio
-    fov = _compute_fov_degrees(camera.perspective)
-    problem = _find_camera_problem(matrix, fov)
-    if problem:
-        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
-    return PosedCamera(matrix, fov, upright=aspect_ratio is None)
+    return matrix
 
 
 def _compute_fov_degrees(perspective: Perspective) -> float:

@@ -47,9 +47,7 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     Raises:
         FileFormatError: the file is corrupt, or has no facets.
     """
-    n_facets = 0
-    if len(data) >= _FACETS_START:
-        (n_facets,) = struct.unpack_from("<I", data, _HEADER_SIZE)
+    n_facets = _read_n_facets(data)
     expected_size = _FACETS_START + _FACET_DTYPE.itemsize * n_facets
     corner_colors = None
     if len(data) == expected_size:
@@ -64,6 +62,14 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             f"{path}: expected a mesh with faces, got none; export triangles"
         )
     return [_make_facets_part(points, corner_colors)]
+
+
+def _read_n_facets(data: bytes) -> int:
+    """Return the number of facets that a binary file states; 0 for a shorter file."""
+    if len(data) < _FACETS_START:
+        return 0
+    n_facets: int = struct.unpack_from("<I", data, _HEADER_SIZE)[0]
+    return n_facets
 
 
 def _make_size_error(data: bytes, expected_size: int, notes: Notes) -> FileFormatError:

@@ -224,9 +224,8 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     size = BAKED_SIZE
     # The negative tolerance leaves out texels on the border of a face, which neighbours
     # share.
-    face, row, column, _ = rasterize_triangles(
-        uvs * size - 0.5, (size, size), tolerance=-1e-6
-    )
+    texels = uvs * size - 0.5
+    face, row, column, _ = rasterize_triangles(texels, (size, size), tolerance=-1e-6)
     # Smallest and largest material on each texel: if they differ, it is shared. Texels
     # without a face have a largest one of -1.
     texel = row * size + column
@@ -563,11 +562,15 @@ def bake(
         part_texels = texels.select(index)
         file_uvs = part_texels.interpolate(soup.uvs)
         color = _sample_base_color(surface, file_uvs, soup, surfaces)
-        tinted_color = _tint(color, factor[index])
-        maps.color[part_texels.row, part_texels.column, : color.shape[1]] = tinted_color
+        _put_colors(maps.color, part_texels, _tint(color, factor[index]))
         if np.isfinite(file_uvs).all():
             _bake_bumps_and_emission(maps, surface, part_texels, file_uvs, soup, uvs)
     return _fill_gaps(maps, texels.make_mask(size))
+
+
+def _put_colors(color_map: Float32Array, texels: _Texels, colors: Float32Array) -> None:
+    """Put colors (T, C) into texels of a map (N, N, C or 4), whose opacity may stay."""
+    color_map[texels.row, texels.column, : colors.shape[1]] = colors
 
 
 def _rasterize(uvs: Float64Array, size: int) -> _Texels:
@@ -597,12 +600,9 @@ def _bake_bumps_and_emission(
     y = texels.row
     x = texels.column
     if maps.normals is not None and surface.normal_map is not None:
+        colors = sample_texture(surface.normal_map, file_uvs)
         maps.normals[y, x] = convert_normals(
-            sample_texture(surface.normal_map, file_uvs),
-            soup,
-            uvs,
-            texels.face,
-            texels.weights,
+            colors, soup, uvs, texels.face, texels.weights
         )
     if maps.emission is not None and surface.emission is not None:
         maps.emission[y, x] = sample_texture(surface.emission, file_uvs)
@@ -799,7 +799,8 @@ def _average_each_face(
     sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs).reshape(-1, 2)
     texels = _sample_nearest(texture, sample_uvs)
     samples = texels.reshape(len(uvs), len(weights), -1)
-    return np.asarray(samples.mean(axis=1, dtype=np.float64))
+    means: Float64Array = samples.mean(axis=1, dtype=np.float64)
+    return means
 
 
 def _compute_sample_weights(steps: int) -> Float64Array:
@@ -1007,7 +1008,8 @@ def _compute_file_bitangents(
         face: (T,) index of a face for each.
     """
     mirror_sign = np.sign(compute_doubled_areas(soup.uvs[face]))[:, None]
-    return np.asarray(np.cross(normal, tangent) * mirror_sign)
+    bitangent: Float64Array = np.cross(normal, tangent) * mirror_sign
+    return bitangent
 
 
 def _compute_tangents(

@@ -182,9 +182,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             that it does not contain, or has no faces.
     """
     lines = ObjLines(data, notes)
-    tables = {kind: lines.read_table(kind) for kind in TABLES}
-    if not len(tables["v"]):
-        raise notes.damaged(EXPECTED, got=data)
+    tables = _read_tables(lines, data)
     faces = lines.read_faces({kind: len(table) for kind, table in tables.items()})
     _, corner_counts, _ = faces
     _check_has_faces(path, corner_counts)
@@ -205,6 +203,19 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         _make_part(triangles, group, reader, names_libraries)
         for group in _group_triangles(triangles)
     ]
+
+
+def _read_tables(lines: ObjLines, data: bytes) -> dict[str, Float64Array]:
+    """Return the points, UVs and normals of a file, by the keywords "v", "vt" and "vn".
+
+    Raises:
+        FileFormatError: a line is wrong, or there are no points, so that `data`, the
+            content of the file, is of another kind.
+    """
+    tables = {kind: lines.read_table(kind) for kind in TABLES}
+    if not len(tables["v"]):
+        raise lines.notes.damaged(EXPECTED, got=data)
+    return tables
 
 
 def _check_has_faces(path: Path, corner_counts: IntArray) -> None:
@@ -415,9 +426,8 @@ def _note_missing_material(
     """
     substitute_text = f"{substitute} is used instead"
     if reader.n_libraries:
-        lacking_files = (
-            "its .mtl file lacks" if reader.n_libraries == 1 else "its .mtl files lack"
-        )
+        is_single = reader.n_libraries == 1
+        lacking_files = "its .mtl file lacks" if is_single else "its .mtl files lack"
         reader.notes.warn_that_file(
             f"uses the material {format_name(name)}, which {lacking_files}; "
             f"{substitute_text}"
@@ -687,12 +697,7 @@ class ObjLines:
         ).astype(np.float64, copy=False)
         if counts.min() < min_count or len(values) != counts.sum():
             self._raise_for_numbers(kind, rows)
-        if (counts == counts[0]).all():
-            # All lines have equally many numbers, as usual: the table is a reshape.
-            table = values.reshape(len(rows), -1)[:, :columns]
-            n_missing = columns - table.shape[1]
-            return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
-        return _fill_table(values, counts, columns, fill)
+        return _make_table(values, counts, columns, fill)
 
     def _raise_for_numbers(self, kind: str, rows: IntArray) -> NoReturn:
         """Raise FileFormatError for the first line whose numbers are wrong."""
@@ -891,11 +896,9 @@ class ObjLines:
             line_number: its line, from 1.
             counts: (3,) number of rows above that line, of each table.
         """
+        where = f"in the face on line {line_number}"
         if not _CORNER.fullmatch(word):
-            raise self.notes.damaged(
-                f"whole numbers in the face on line {line_number}",
-                format_name(word),
-            )
+            raise self.notes.damaged(f"whole numbers {where}", format_name(word))
         # A missing index, as in 1//3, is valid. It is replaced by 1, which is
         # always valid, too.
         indices = [int(text or "1") for text in word.split("/")]
@@ -905,10 +908,8 @@ class ObjLines:
             for index, count in zip(indices, counts, strict=False)
         )
         if is_wrong:
-            raise self.notes.damaged(
-                f"indices that count from 1 in the face on line {line_number}",
-                format_name(word),
-            )
+            expected = f"indices that count from 1 {where}"
+            raise self.notes.damaged(expected, format_name(word))
 
 
 def _normalize_lines(data: bytes) -> bytes:
@@ -938,6 +939,20 @@ def _join_continued_lines(text: bytes) -> bytes:
     # Backslashes at the end of comments join nothing, and are removed first.
     without_continued_comments = _CONTINUED_COMMENT.sub(rb"\1\n", text)
     return _CONTINUATION.sub(b" ", without_continued_comments)
+
+
+def _make_table(
+    values: Float64Array, counts: IntArray, n_columns: int, fill: float
+) -> Float64Array:
+    """Return the numbers of lines as a table (N, columns); see `_fill_table`.
+
+    Usually all lines have equally many numbers. Then the table is a reshape.
+    """
+    if (counts != counts[0]).any():
+        return _fill_table(values, counts, n_columns, fill)
+    table = values.reshape(len(counts), -1)[:, :n_columns]
+    n_missing = n_columns - table.shape[1]
+    return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
 
 
 def _fill_table(

@@ -510,7 +510,8 @@ class Arrangement:
         opacity_row = row * opacity.shape[0] // n_rows
         opacity_column = column * opacity.shape[1] // n_columns
         texel_opacity = opacity[opacity_row, opacity_column]
-        return np.asarray(candidates[texel_opacity >= texel_opacity.max()])
+        opaque_texels: IntArray = candidates[texel_opacity >= texel_opacity.max()]
+        return opaque_texels
 
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
         """Find where the blurred maps, seen from the object's center, show the ground.

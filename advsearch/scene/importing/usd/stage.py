@@ -1130,7 +1130,8 @@ def _average_corners(values: Array, counts: Array) -> Array:
     padded_values = np.concatenate([values, np.zeros((1, values.shape[1]))])
     starts = np.cumsum(counts) - counts
     sums = np.add.reduceat(padded_values, starts)
-    return np.asarray(sums / np.maximum(counts, 1)[:, None])
+    means: Array = sums / np.maximum(counts, 1)[:, None]
+    return means
 
 
 def _compute_illuminance(prim: Any, radiance: float) -> float:
