@@ -697,7 +697,7 @@ class ObjLines:
         ).astype(np.float64, copy=False)
         if counts.min() < min_count or len(values) != counts.sum():
             self._raise_for_numbers(kind, rows)
-        return _make_table(values, counts, columns, fill)
+        return _make_number_table(values, counts, columns, fill)
 
     def _raise_for_numbers(self, kind: str, rows: IntArray) -> NoReturn:
         """Raise FileFormatError for the first line whose numbers are wrong."""
@@ -941,7 +941,7 @@ def _join_continued_lines(text: bytes) -> bytes:
     return _CONTINUATION.sub(b" ", without_continued_comments)
 
 
-def _make_table(
+def _make_number_table(
     values: Float64Array, counts: IntArray, n_columns: int, fill: float
 ) -> Float64Array:
     """Return the numbers of lines as a table (N, columns); see `_fill_table`.

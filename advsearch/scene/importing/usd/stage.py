@@ -191,14 +191,18 @@ class Conversion:
         header["scenes"] = [{"nodes": [0]}]
         if has_splats and not header["meshes"]:
             raise self._make_splats_error()
-        if self.lights:
-            header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
-        notes = self._format_notes(has_splats)
-        header["asset"]["extras"] = {"left_out": notes}
+        self._add_lights_and_notes(has_splats)
         # glTF has no empty lists.
-        return self.buffer.to_bytes(
-            {key: value for key, value in header.items() if value}
-        )
+        filled_header = {key: value for key, value in header.items() if value}
+        return self.buffer.to_bytes(filled_header)
+
+    def _add_lights_and_notes(self, has_splats: bool) -> None:
+        """Add the lights, and the notes on what is left out, to the header."""
+        if self.lights:
+            extensions = {"KHR_lights_punctual": {"lights": self.lights}}
+            self.header["extensions"] = extensions
+        notes = self._format_notes(has_splats)
+        self.header["asset"]["extras"] = {"left_out": notes}
 
     def _make_splats_error(self) -> errors.FileFormatError:
         """Return the error for a stage that has Gaussian splats and no mesh."""
@@ -403,14 +407,8 @@ class Conversion:
         entry, intensity = converted
         self._check_power(node["name"], np.array([*color, intensity]))
         node["extensions"] = {"KHR_lights_punctual": {"light": len(self.lights)}}
-        self.lights.append(
-            {
-                **entry,
-                "name": node["name"],
-                "color": color.tolist(),
-                "intensity": intensity,
-            }
-        )
+        entry |= {"name": node["name"], "color": color.tolist(), "intensity": intensity}
+        self.lights.append(entry)
 
     def _check_power(self, name: str, powers: Array) -> None:
         """Raise FileFormatError if the color or the intensity of a light is invalid.
@@ -467,14 +465,12 @@ class Conversion:
         self._check_corners(prim, len(points), counts, corners)
         skeleton_matrix, points = self._pose_at_rest(prim, points)
         triangles, face = self._triangulate(mesh, points, counts, corners)
-        primitives = self._make_primitives(
-            prim, mesh, MeshFaces(points, counts, corners, triangles, face)
-        )
+        mesh_faces = MeshFaces(points, counts, corners, triangles, face)
+        primitives = self._make_primitives(prim, mesh, mesh_faces)
         if primitives:
             node["mesh"] = len(self.header["meshes"])
-            self.header["meshes"].append(
-                {"name": node["name"], "primitives": primitives}
-            )
+            entry = {"name": node["name"], "primitives": primitives}
+            self.header["meshes"].append(entry)
         return skeleton_matrix
 
     def _make_primitives(
@@ -519,19 +515,17 @@ class Conversion:
             normals: normals of the mesh, or None.
             mesh_faces: all points and faces of the mesh.
         """
+        path = str(prim.GetPath())
         primvars = UsdGeom.PrimvarsAPI(prim)
         primitives = []
-        for material, colors, tinted_faces in self._split_by_tint(
-            bound, primvars, faces, mesh_faces
-        ):
+        tints = self._split_by_tint(bound, primvars, faces, mesh_faces)
+        for material, colors, tinted_faces in tints:
             is_selected = np.isin(mesh_faces.face_of_triangle, tinted_faces)
             if not is_selected.any():
                 continue  # all are holes, or have fewer than 3 corners
             uvs_by_name = self._read_layouts(primvars, bound.layouts)
             attributes = {"NORMAL": normals, "COLOR_0": colors, **uvs_by_name}
-            entry = self._make_primitive(
-                str(prim.GetPath()), mesh_faces, is_selected, attributes
-            )
+            entry = self._make_primitive(path, mesh_faces, is_selected, attributes)
             primitives.append({**entry, "material": material})
         return primitives
 
@@ -595,11 +589,7 @@ class Conversion:
             points: (P, 3) its points.
             triangles: (T, 3) points of its triangles.
         """
-        normals = _flatten_primvar(primvars.GetPrimvar("normals"), 3)
-        if normals is None:
-            values = _to_array(_get_first(mesh, "Normals"), np.float64, 3)
-            if len(values):
-                normals = MeshValues(values, str(mesh.GetNormalsInterpolation()))
+        normals = _read_mesh_normals(mesh, primvars)
         if _get_first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
             self._note(
                 "has a mesh with a subdivision scheme, which is not subdivided, but "
@@ -637,9 +627,8 @@ class Conversion:
             corner_indices, axis=0, return_inverse=True
         )
         accessors = self._add_vertices(mesh_faces.points, vertex_indices, attributes)
-        index_accessor = self.buffer.add_accessor(
-            vertex_of_corner.reshape(-1).astype(np.uint32), "SCALAR"
-        )
+        indices = vertex_of_corner.reshape(-1).astype(np.uint32)
+        index_accessor = self.buffer.add_accessor(indices, "SCALAR")
         triangles_mode = 4  # of glTF
         return {
             "attributes": accessors,
@@ -867,13 +856,17 @@ class Conversion:
         is_of_vertices = opacities.interpolation not in ("constant", "uniform")
         if is_of_vertices and len(np.unique(opacities.values)) > 1:
             self._note("has an opacity of vertices; faces have its mean")
-        if len(np.unique(opacity)) > MAX_TINTS:
-            self._note(
-                f"has more than {MAX_TINTS} opacities of faces, which are replaced by "
-                "their mean"
-            )
-            opacity = np.full_like(opacity, opacity.mean())
-        return opacity
+        return self._limit_opacities(opacity)
+
+    def _limit_opacities(self, opacity: Array) -> Array:
+        """Return opacities (F, 1), or their mean, with a note, if too many are different."""
+        if len(np.unique(opacity)) <= MAX_TINTS:
+            return opacity
+        self._note(
+            f"has more than {MAX_TINTS} opacities of faces, which are replaced by "
+            "their mean"
+        )
+        return np.full_like(opacity, opacity.mean())
 
     def _iterate_materials(
         self, prim: Any, mesh: Any, faces: int
@@ -946,6 +939,17 @@ def _index_corners(mesh_faces: MeshFaces, is_selected: Array) -> dict[str, Array
         "faceVarying": corner_rows,
         "uniform": mesh_faces.face_of_triangle[is_selected].repeat(3),
     }
+
+
+def _read_mesh_normals(mesh: Any, primvars: Any) -> MeshValues | None:
+    """Return the normals (N, 3) that a mesh states, as a primvar or an attribute, or None."""
+    normals = _flatten_primvar(primvars.GetPrimvar("normals"), 3)
+    if normals is not None:
+        return normals
+    values = _to_array(_get_first(mesh, "Normals"), np.float64, 3)
+    if not len(values):
+        return None
+    return MeshValues(values, str(mesh.GetNormalsInterpolation()))
 
 
 def _find_parent(path: Any, xformable: Any, node_of_path: dict[Any, int]) -> int:

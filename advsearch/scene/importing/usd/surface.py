@@ -260,14 +260,7 @@ class GltfMaterialWriter:
         The display color is a primvar of each mesh, so it is not known here: faces are
         tinted when the mesh is converted.
         """
-        surface = {
-            "baseColorFactor": [*DEFAULT_COLOR, 1.0],
-            "metallicFactor": 0.0,
-            "roughnessFactor": DEFAULT_ROUGHNESS,
-        }
-        index = self.add_material(
-            {"name": "displayColor", "pbrMetallicRoughness": surface}
-        )
+        index = self._add_plain_material("displayColor", [*DEFAULT_COLOR, 1.0])
         color = PrimvarUse("displayColor", DEFAULT_COLOR)
         return BoundMaterial(
             index,
@@ -323,14 +316,21 @@ class GltfMaterialWriter:
     def _make_grey_material(self, name: str) -> BoundMaterial:
         """Add a grey material of a name."""
         grey = [0.2140, 0.2140, 0.2140, 1.0]  # linear: 0.5 in sRGB; and opaque
+        return BoundMaterial(self._add_plain_material(name, grey))
+
+    def _add_plain_material(self, name: str, factor: list[float]) -> int:
+        """Add a material without metal and textures, and return its index.
+
+        Args:
+            name: name of the material.
+            factor: (4,) its linear color and its opacity.
+        """
         surface = {
-            "baseColorFactor": grey,
+            "baseColorFactor": factor,
             "metallicFactor": 0.0,
             "roughnessFactor": DEFAULT_ROUGHNESS,
         }
-        return BoundMaterial(
-            self.add_material({"name": name, "pbrMetallicRoughness": surface})
-        )
+        return self.add_material({"name": name, "pbrMetallicRoughness": surface})
 
     # ---- Images ----
 
@@ -388,8 +388,13 @@ class GltfMaterialWriter:
             )
             return None
 
-    def compute_values(self, use: UsdTextureUse) -> Array | None:
-        """Return the values (H, W, C) of an image after scale and bias, or None."""
+    def compute_values(self, use: UsdTextureUse | None) -> Array | None:
+        """Return the values (H, W, C) of an image after scale and bias.
+
+        The result is None for no image, and, with a note, if it cannot be decoded.
+        """
+        if use is None:
+            return None
         texels = self.load_texels(use)
         if texels is None:
             return None
@@ -964,16 +969,13 @@ class PreviewSurface:
             opacity_use: the texture of the opacity, or None.
             factor: (3,) linear color, used if there is no image of it.
         """
-        colors = None if color_use is None else self.surfaces.compute_values(color_use)
-        opacities = (
-            None if opacity_use is None else self.surfaces.compute_values(opacity_use)
-        )
+        colors = self.surfaces.compute_values(color_use)
+        opacities = self.surfaces.compute_values(opacity_use)
         if colors is None:
             if opacities is None:
                 return None
-            colors = np.broadcast_to(
-                np.array(factor, np.float32), (*opacities.shape[:2], 3)
-            )
+            shape = (*opacities.shape[:2], 3)
+            colors = np.broadcast_to(np.array(factor, np.float32), shape)
         display_colors = color.linear_to_srgb(
             np.broadcast_to(colors, (*colors.shape[:2], 3)).astype(np.float32)
         )
@@ -1001,15 +1003,13 @@ class PreviewSurface:
             surface["metallicFactor"] = factor_by_name["metallic"]
             surface["roughnessFactor"] = factor_by_name["roughness"]
             return
-        texture = self.surfaces.add_image(
-            _pack_planes(plane_by_name, factor_by_name), texture_use.sampler
-        )
+        packed = _pack_planes(plane_by_name, factor_by_name)
+        texture = self.surfaces.add_image(packed, texture_use.sampler)
         # Factors multiply the image, which has the numbers already.
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
-        surface["metallicRoughnessTexture"] = self._make_slot(
-            texture, texture_use.layout
-        )
+        slot = self._make_slot(texture, texture_use.layout)
+        surface["metallicRoughnessTexture"] = slot
 
     def _find_planes(
         self,
@@ -1069,7 +1069,7 @@ class PreviewSurface:
         use = self._find_texture(name)
         if isinstance(use, tuple):  # the number that replaces a missing image
             return use[0], None
-        values = None if use is None else self.surfaces.compute_values(use)
+        values = self.surfaces.compute_values(use)
         if use is None or values is None:
             return number, None
         self._note_srgb(name, use)
@@ -1105,12 +1105,7 @@ class PreviewSurface:
         if use is None:
             return
         use = self._complete_normal_scale(use)
-        has_implied_scale = (
-            not use.is_srgb
-            and use.scale[:3] == NORMAL_SCALE[:3]
-            and use.bias[:3] == NORMAL_BIAS[:3]
-        )
-        if has_implied_scale and is_of_8_bits(use.data):
+        if _has_implied_normal_scale(use) and is_of_8_bits(use.data):
             texture = self.surfaces.add_texture(use.data, use.sampler)
             entry["normalTexture"] = self._make_slot(texture, use.layout)
             return
@@ -1197,6 +1192,15 @@ class PreviewSurface:
         largest = max(float(np.maximum(np.nan_to_num(values), 0.0).max()), 1e-6)
         levels = _normalize_emission(values, largest)
         return self.surfaces.add_image(levels, use.sampler), [largest] * 3
+
+
+def _has_implied_normal_scale(use: UsdTextureUse) -> bool:
+    """Return whether a normal map has raw texels, and the scale 2 and bias -1 of glTF."""
+    return (
+        not use.is_srgb
+        and use.scale[:3] == NORMAL_SCALE[:3]
+        and use.bias[:3] == NORMAL_BIAS[:3]
+    )
 
 
 def _normalize_emission(values: Array, largest: float) -> Array:
