@@ -738,26 +738,18 @@ class GltfSurfaces:
             becomes that of the padded one, scale * t + shift.
         """
         sizes = [image.shape[axis] for image in images]
-        # All images have the same texture coordinates, so that their pads must be the
-        # same fraction of an image. A pad must also be an integer number of texels. So
-        # pads are measured in units: each image is divided into the same number of
-        # units, the greatest common divisor of the sizes.
-        n_units = int(np.gcd.reduce(sizes))
-        units_before, units_after = _count_pad_units(n_units, bounds)
-        padded_units = n_units + units_before + units_after
-        max_unit_texels = max(sizes) // n_units
-        if padded_units * max_unit_texels > 2 * self._images.max_side:
+        units = _count_units(sizes, bounds)
+        if units.padded * (max(sizes) // units.image) > 2 * self._images.max_side:
             self.notes.warn_that_file(EDGES_NOTE)
             return images, 1.0, 0.0
         borders = _list_borders(len(images), normals_index, has_border)
         padded = []
         for image, border in zip(images, borders, strict=True):
-            unit = image.shape[axis] // n_units  # in texels of this image
-            pads = (units_before * unit, units_after * unit)
+            unit = image.shape[axis] // units.image  # in texels of this image
+            pads = (units.before * unit, units.after * unit)
             padded.append(_pad(image, axis, *pads, border))
-        # The old image covers `n_units` of the padded one, after `units_before`.
-        scale = n_units / padded_units
-        shift = units_before / padded_units
+        scale = units.image / units.padded
+        shift = units.before / units.padded
         return padded, scale, shift
 
 
@@ -827,21 +819,45 @@ def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Arra
     return np.concatenate([linear_to_srgb(linear), texture[:, :, 3:]], axis=2)
 
 
-def _count_pad_units(n_units: int, bounds: tuple[float, float]) -> tuple[int, int]:
-    """Return how many units the pads before and after an image need.
+class _PadUnits(NamedTuple):
+    """Lengths along an axis of images and their pads, in units.
 
-    An image covers the texture coordinates from 0 to 1, and is divided into units of
-    equal length. Pads reach as far as texture coordinates, and one unit farther, so
-    that filtering does not reach beyond them.
+    All images of a surface have the same texture coordinates, so that their pads must
+    be the same fraction of an image. A pad must also be an integer number of texels. So
+    each image is divided into the same number of units, the greatest common divisor of
+    the sizes.
+
+    Attributes:
+        image: number of units of each image.
+        before: number of units of the pad before it.
+        after: number of units of the pad after it.
+    """
+
+    image: int
+    before: int
+    after: int
+
+    @property
+    def padded(self) -> int:
+        """Number of units of an image with its pads."""
+        return self.image + self.before + self.after
+
+
+def _count_units(sizes: Sequence[int], bounds: tuple[float, float]) -> _PadUnits:
+    """Return the units of images and of the pads that they need.
+
+    An image covers the texture coordinates from 0 to 1. Pads reach as far as texture
+    coordinates, and one unit farther, so that filtering does not reach beyond them.
 
     Args:
-        n_units: number of units of the image.
+        sizes: number of texels of each image along an axis.
         bounds: smallest and largest texture coordinate.
     """
+    n_units = int(np.gcd.reduce(sizes))
     min_uv, max_uv = bounds
     units_before = max(0, int(np.ceil(-min_uv * n_units))) + 1
     units_after = max(0, int(np.ceil((max_uv - 1.0) * n_units))) + 1
-    return units_before, units_after
+    return _PadUnits(n_units, units_before, units_after)
 
 
 def _average_where_visible(

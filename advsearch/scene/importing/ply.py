@@ -541,14 +541,12 @@ def _make_parts(
         texture_names: files of textures that the comments name.
     """
     notes = reader.notes
-    corners, corner_counts = reader.read_polygons(len(points))
-    triangles, polygon = triangulate_and_note(points[corners], corner_counts, notes)
+    corners, counts = reader.read_polygons(len(points))
+    triangles, polygon = triangulate_and_note(points[corners], counts, notes)
     position = IndexedValues(points, corners[triangles])
     normal = reader.read_normals(position.row_of_corner)
-    uvs = reader.read_uvs(corners, corner_counts, triangles)
-    polygon_textures = reader.read_texture_indices(
-        texture_names, corners, corner_counts
-    )
+    uvs = reader.read_uvs(corners, counts, triangles)
+    polygon_textures = reader.read_texture_indices(texture_names, corners, counts)
     texture = polygon_textures[polygon]
     colors = reader.read_colors(position.row_of_corner, polygon)
     surfaces = reader.make_surfaces(texture_names, has_no_colors=colors is None)

@@ -279,13 +279,16 @@ def _select_material(
         return primitive.material
     for mapping in _read_extension(path, _Mappings, extension).mappings:
         if variant in mapping.variants:
-            if mapping.material >= len(header.materials):
-                expected = (
-                    f"glTF with {mapping.material + 1} materials, as it refers to"
-                )
-                raise damaged(path, expected, f"{len(header.materials)}")
+            _check_material_exists(path, header, mapping.material)
             return mapping.material
     return primitive.material
+
+
+def _check_material_exists(path: Path, header: Header, index: int) -> None:
+    """Raise FileFormatError if a file has no material with an index."""
+    if index >= len(header.materials):
+        expected = f"glTF with {index + 1} materials, as it refers to"
+        raise damaged(path, expected, f"{len(header.materials)}")
 
 
 def _list_posed_meshes(header: Header) -> list[tuple[int, Float64Array]]:
@@ -433,13 +436,18 @@ def _fit_surfaces(
         fit_by_material[material] = surfaces.make_surface(material, members)
         surface, _uv_scale, _uv_shift = fit_by_material[material]
         n_texels += _count_texels(surface)
-        check_most(
-            file.path,
-            n_texels,
-            MAX_TEXELS,
-            "textures of at most {} texels, counted for each material",
-        )
+        _check_n_texels(file.path, n_texels)
     return fit_by_material
+
+
+def _check_n_texels(path: Path, n_texels: int) -> None:
+    """Raise FileFormatError if the images of all surfaces have too many texels."""
+    check_most(
+        path,
+        n_texels,
+        MAX_TEXELS,
+        "textures of at most {} texels, counted for each material",
+    )
 
 
 def _group_pieces(

@@ -336,9 +336,10 @@ class SurfaceRenderer(Predictor):
             if light not in reflected_by_light:
                 reflected_by_light[light] = light.compute_reflected(fine_color)
             radiance = lit_view.view.compute_radiance(reflected_by_light[light])
+            # from the stored light to that of the camera's environment
+            radiance = radiance * lit_view.light_factor
             images[camera_index] = self.path_renderer.finish_image(
-                # from the stored light to that of the camera's environment
-                radiance * lit_view.light_factor,
+                radiance,
                 inputs[camera_index],
                 full_configurations[camera_index],
             )

@@ -256,6 +256,19 @@ class _BilateralFilter:
     texel_width: float
     buried: BoolArray
 
+    def weigh_texels(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
+        """Return the texels whose light counts at points, and their weights.
+
+        Returns:
+            Indices of texels, and weights that add up to 1 for each point, both
+            (N, neighbors). Indices with the weight 0 mean nothing.
+        """
+        texel_index, weights = self.weigh_neighbors(points)
+        # Points without any weight are changed in `texel_index` and `weights`.
+        self.use_nearest_texel(points, texel_index, weights)
+        weights /= weights.sum(axis=1, keepdims=True)
+        return texel_index, weights
+
     def weigh_neighbors(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
         """Return the texels around points, and their weights.
 
@@ -364,10 +377,7 @@ def make_lookup_matrix(
     points = _find_cell_points(fine_charts, is_near_chart, vertices, normals, charts)
     texel_width = _compute_texel_width(charts, vertices)
     bilateral_filter = _BilateralFilter(texels, charts, texel_width, buried)
-    texel_index, weights = bilateral_filter.weigh_neighbors(points)
-    # Points without any weight are changed in `texel_index` and `weights`.
-    bilateral_filter.use_nearest_texel(points, texel_index, weights)
-    weights /= weights.sum(axis=1, keepdims=True)
+    texel_index, weights = bilateral_filter.weigh_texels(points)
     _first, n_texels = texels.first_texels[:2]  # of the first surface
     size = (shape[0] * shape[1], n_texels)
     return _make_sparse(np.flatnonzero(is_near_chart), texel_index, weights, size)

@@ -184,11 +184,8 @@ def _measure_effect(
         changes = _find_input_changes(base_inputs, inputs, group.size)
         if changes is None:
             return None
-        for name, change in changes.items():
-            if change is not _Change.NONE:
-                changed.add(name)
-        if changes.get(ENVIRONMENT_INPUT) is _Change.HARMONICS:
-            is_harmonic = True
+        changed |= {name for name in changes if changes[name] is not _Change.NONE}
+        is_harmonic |= changes.get(ENVIRONMENT_INPUT) is _Change.HARMONICS
         if ENVIRONMENT_INPUT in inputs:
             power = float(inputs[ENVIRONMENT_INPUT].sum())
             if power > max_power:
@@ -432,9 +429,7 @@ class LightBasis:
             lighting: groups of coordinates that change light.
             inputs: scene inputs whose light is split.
         """
-        patterns = {
-            name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
-        }
+        patterns = _find_patterns(renderer)
         values = _get_values(renderer, find_light_inputs(renderer) | patterns, inputs)
         dark_values = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
@@ -458,10 +453,9 @@ class LightBasis:
         if ENVIRONMENT_INPUT in changed_lights:
             maps = _make_basis_maps(renderer, lighting, values[ENVIRONMENT_INPUT])
             self._basis_maps = BasisMaps(maps)
-            for basis_map in maps:
-                self.inputs_of_light.append(
-                    {**dark_values, ENVIRONMENT_INPUT: basis_map}
-                )
+            self.inputs_of_light += [
+                {**dark_values, ENVIRONMENT_INPUT: basis_map} for basis_map in maps
+            ]
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
         """Return the factor (lights, 3) of each light, differentiable in the inputs.
@@ -473,6 +467,13 @@ class LightBasis:
         if self._basis_maps is not None:
             weights.append(self._basis_maps.fit_weights(inputs[ENVIRONMENT_INPUT]))
         return torch.cat(weights)
+
+
+def _find_patterns(renderer: Renderer) -> set[str]:
+    """Return the names of a scene's inputs that are patterns of projectors."""
+    return {
+        name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
+    }
 
 
 def _get_values(
@@ -619,15 +620,11 @@ class BasisRenderer(Predictor):
         for index, light_inputs in enumerate(self._lights.inputs_of_light):
             # All projectors are in the first light of `LightBasis`, so that only there
             # their patterns have an effect, and need a matrix.
-            has_projectors = index == 0
+            names = linear_names if index == 0 else base_colors
+            light_seed = seeds.derive_seed(seed, "light", index)
             renderers.append(
                 LinearRenderer(
-                    traced,
-                    u,
-                    seeds.derive_seed(seed, "light", index),
-                    tick,
-                    names=linear_names if has_projectors else base_colors,
-                    light=light_inputs,
+                    traced, u, light_seed, tick, names=names, light=light_inputs
                 )
             )
         return renderers

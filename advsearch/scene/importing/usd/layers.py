@@ -268,11 +268,7 @@ class _LayerCheck:
         if _is_layer_name(outer, inner):
             layer_file = Path(os.path.realpath(path.parent / outer))
         if layer_file is None or not reading.is_inside(layer_file, self._folder):
-            raise errors.FileFormatError(
-                f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
-                "file in its folder and is not read; put it there, or make one file of "
-                "all with usdcat --flatten"
-            )
+            raise self._make_outside_error(name)
         if not layer_file.is_file():
             raise errors.FileFormatError(
                 f"{self.file.name}: needs {name[:100]!r}, which is missing; put that "
@@ -281,6 +277,14 @@ class _LayerCheck:
         if inner:
             self._check_packaged_file(layer_file, inner, name)
         return layer_file
+
+    def _make_outside_error(self, name: str) -> errors.FileFormatError:
+        """Return the error for a named layer that is no USD file in the folder."""
+        return errors.FileFormatError(
+            f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
+            "file in its folder and is not read; put it there, or make one file of "
+            "all with usdcat --flatten"
+        )
 
     def _check_packaged_file(self, package: Path, inner: str, name: str) -> None:
         """Raise FileFormatError if a package does not have the file `inner`.
@@ -316,9 +320,9 @@ class _LayerCheck:
                 # The bytes of an entry were counted with the outermost package.
                 if suffix == PACKAGE_SUFFIX:
                     self._count_layer(size=0)
-                    self._check_package(
-                        f"{name}[{entry}]", inner_path, archive.read(entry), depth + 1
-                    )
+                    label = f"{name}[{entry}]"
+                    inner_content = archive.read(entry)
+                    self._check_package(label, inner_path, inner_content, depth + 1)
                 elif suffix in LAYER_SUFFIXES:
                     self._count_layer(size=0)
                     self._check_packaged_layer(name, inner_path, entry, entries)
@@ -363,9 +367,8 @@ class _LayerCheck:
         from_entry = os.path.normpath(PurePosixPath(entry).parent / outer)
         # A path that does not begin with a dot may be relative to the package.
         from_root = os.path.normpath(outer)
-        is_inside = from_entry in entries or (
-            not outer.startswith(".") and from_root in entries
-        )
+        may_be_from_root = not outer.startswith(".")
+        is_inside = from_entry in entries or (may_be_from_root and from_root in entries)
         suffix = Path(outer).suffix.lower()
         if not is_inside or suffix not in (*LAYER_SUFFIXES, PACKAGE_SUFFIX):
             raise errors.FileFormatError(

@@ -865,6 +865,22 @@ class PreviewSurface:
         opacity_primvar = self._find_primvar("opacity", (READER_OF_NUMBERS,), (1.0,))
         base = self._read_base(color_primvar, opacity_primvar)
         threshold = self.shader.get_number("opacityThreshold", 0.0)
+        has_opacity_map = self._fill_base_color(base, surface)
+        opacity_factor = surface["baseColorFactor"][3]
+        if has_opacity_map or opacity_factor < 1.0 or opacity_primvar is not None:
+            _set_alpha_mode(entry, threshold)
+        return color_primvar, opacity_primvar
+
+    def _fill_base_color(self, base: _BaseInputs, surface: dict[str, Any]) -> bool:
+        """Fill in the texture of color and opacity, and the factor (4,) of both.
+
+        Args:
+            base: the color and the opacity.
+            surface: pbrMetallicRoughness of the glTF material.
+
+        Returns:
+            Whether the texture has the opacity.
+        """
         texture, color_factor = self._add_base_texture(
             base.color_use, base.opacity_use, list(base.color)
         )
@@ -876,9 +892,7 @@ class PreviewSurface:
         opacity_factor = 1.0 if has_opacity_map else base.opacity
         factor = [min(max(part, 0.0), 1.0) for part in (*color_factor, opacity_factor)]
         surface["baseColorFactor"] = factor
-        if has_opacity_map or factor[3] < 1.0 or opacity_primvar is not None:
-            _set_alpha_mode(entry, threshold)
-        return color_primvar, opacity_primvar
+        return has_opacity_map
 
     def _read_base(
         self, color_primvar: PrimvarUse | None, opacity_primvar: PrimvarUse | None
@@ -1038,11 +1052,15 @@ class PreviewSurface:
                 texture_use = use
             else:
                 factor_by_name[name] = float(plane.mean())
-                self.surfaces.note(
-                    f"has a {name} with other texture coordinates, which is replaced by "
-                    "its mean"
-                )
+                self._note_mean(name)
         return factor_by_name, plane_by_name, texture_use
+
+    def _note_mean(self, name: str) -> None:
+        """Note that an image is replaced by its mean, since its coordinates differ."""
+        self.surfaces.note(
+            f"has a {name} with other texture coordinates, which is replaced by "
+            "its mean"
+        )
 
     def _read_number_or_image(
         self, name: str, default: float
@@ -1061,10 +1079,7 @@ class PreviewSurface:
         number = self.shader.get_number(name, default)
         primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
         if primvar is not None:
-            self.surfaces.note(
-                f"has a {name} of the primvar {primvar.name[:50]!r}, which is replaced "
-                "by its fallback"
-            )
+            self._note_fallback(name, primvar)
             return primvar.fallback[0], None
         use = self._find_texture(name)
         if isinstance(use, tuple):  # the number that replaces a missing image
@@ -1074,6 +1089,13 @@ class PreviewSurface:
             return number, None
         self._note_srgb(name, use)
         return number, (use, np.clip(values[:, :, 0], 0.0, 1.0))
+
+    def _note_fallback(self, name: str, primvar: PrimvarUse) -> None:
+        """Note that an input has the fallback of a primvar, which is not read."""
+        self.surfaces.note(
+            f"has a {name} of the primvar {primvar.name[:50]!r}, which is replaced "
+            "by its fallback"
+        )
 
     def _note_srgb(self, name: str, use: UsdTextureUse) -> None:
         """Note that numbers are decoded from sRGB, unless they are an alpha."""
