@@ -843,7 +843,7 @@ class _PadUnits(NamedTuple):
         return self.image + self.before + self.after
 
 
-def _count_units(sizes: Sequence[int], bounds: tuple[float, float]) -> _PadUnits:
+def _count_units(sizes: list[int], bounds: tuple[float, float]) -> _PadUnits:
     """Return the units of images and of the pads that they need.
 
     An image covers the texture coordinates from 0 to 1. Pads reach as far as texture

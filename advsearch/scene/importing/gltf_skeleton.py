@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import compress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -172,15 +171,12 @@ def _read_joint_set(
         FileFormatError: there are not four joints and four weights for each vertex.
     """
     attributes = primitive.attributes
-    accessors = file.header.accessors
     joints_index = attributes[f"JOINTS_{index}"]
     weights_index = attributes.get(f"WEIGHTS_{index}")
-    n_vertices = accessors[attributes["POSITION"]].count
-    has_joints = _is_vec4(accessors[joints_index], n_vertices)
-    if (
-        weights_index is None
-        or not has_joints
-        or not _is_vec4(accessors[weights_index], n_vertices)
+    n_vertices = file.header.accessors[attributes["POSITION"]].count
+    if weights_index is None or not (
+        _is_vec4(file.header.accessors[joints_index], n_vertices)
+        and _is_vec4(file.header.accessors[weights_index], n_vertices)
     ):
         raise damaged(
             file.path, "four joints and four weights of each vertex", "others"
@@ -632,12 +628,23 @@ def _find_moving_channels(
     """
     joints = (joint for skin in skins for joint in header.skins[skin].joints)
     moving_nodes = with_ancestors(header.parent_of_node, {*target_counts, *joints})
-    moving_channels = []
-    for animation in header.animations:
-        channels = animation.channels
-        is_moving = [_is_moving(each, target_counts, moving_nodes) for each in channels]
-        moving_channels.append(list(compress(channels, is_moving)))
-    return moving_channels
+    return [
+        _select_moving_channels(animation.channels, target_counts, moving_nodes)
+        for animation in header.animations
+    ]
+
+
+def _select_moving_channels(
+    channels: Sequence[Channel],
+    target_counts: Mapping[int, int],
+    moving_nodes: Collection[int],
+) -> list[Channel]:
+    """Return the channels of one animation that move geometry; see `_is_moving`."""
+    return [
+        channel
+        for channel in channels
+        if _is_moving(channel, target_counts, moving_nodes)
+    ]
 
 
 def _is_moving(

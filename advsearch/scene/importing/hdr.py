@@ -628,7 +628,7 @@ def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     line that would take the result out of float32's range is invalid, too. EXPOSURE
     lines are ignored, since metering sets the exposure.
     """
-    factors = np.ones(3)
+    factors: Float64Array = np.ones(3)
     notes = list[str]()
     for text in re.findall(rb"^COLORCORR=(.*)$", header, re.MULTILINE)[:100]:
         corrected = _divide_by_correction(factors, text)

@@ -545,9 +545,7 @@ class MtlReader:
             "textures of roughness and metallic are replaced by their means"
         )
         uvs, areas = self.find_mapped_faces(name, square)
-        values = _select_channel(image, use)[:, :, None]
-        (mean,) = average_over_faces(values, uvs * use.scale + use.offset, areas)
-        return float(mean)
+        return _average_shown_values(image, use, uvs, areas)
 
     def _make_normal_map(
         self, material: MtlMaterial, uses: dict[str, MapStatement]
@@ -689,6 +687,22 @@ def _is_default_option(has_colors: bool, option: str, value: str) -> bool:
 def _is_clamped(use: MapStatement) -> bool:
     """Return whether an image must not repeat beyond its edges."""
     return use.options.get("clamp", "").lower() == "on"
+
+
+def _average_shown_values(
+    image: Float32Array, use: MapStatement, uvs: Float64Array, areas: Float64Array
+) -> float:
+    """Return the mean of a map of numbers over the faces that show it.
+
+    Args:
+        image: (H, W, C) values of the map's image.
+        use: the map.
+        uvs: (F, 3, 2) texture coordinates of the faces, as the file has them.
+        areas: (F,) areas of the faces.
+    """
+    values = _select_channel(image, use)[:, :, None]
+    mean = average_over_faces(values, uvs * use.scale + use.offset, areas)
+    return float(mean[0])
 
 
 def _list_read_options(key: str) -> list[str]:

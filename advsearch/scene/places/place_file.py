@@ -189,17 +189,22 @@ def make_place_parts(
         emission = _find_emission(place, part, are_lamps_on)
         if emission is not None:
             emission = emission / radiance_unit
-        mesh = replace(part.mesh, vertices=part.mesh.vertices / np.float32(metres))
-        scene_parts.append(
-            replace(
-                part,
-                place=place,
-                mesh=mesh,
-                solids=_scale_solids(part.solids, metres),
-                emission=emission,
-            )
-        )
+        scene_parts.append(_make_scene_part(place, part, metres, emission))
     return tuple(scene_parts)
+
+
+def _make_scene_part(
+    place: Place, part: MeshPart, metres: float, emission: Float32Array | None
+) -> MeshPart:
+    """Return a mesh of a place with an emission, and lengths in units of some metres."""
+    vertices = part.mesh.vertices / np.float32(metres)
+    return replace(
+        part,
+        place=place,
+        mesh=replace(part.mesh, vertices=vertices),
+        solids=_scale_solids(part.solids, metres),
+        emission=emission,
+    )
 
 
 def _find_emission(

@@ -275,15 +275,21 @@ class Arrangement:
         )
         self.fine_shape, self._upsampling = _make_fine_grid(texture_shape)
         object_center = self._lay_texels(seed)
-        # both sides of the object have the same gloss, and the ground has none
-        n_grounds = len(self.texels.grids) - self.n_sides
-        self.lobes = [self._measure_object_lobes()] * self.n_sides
-        self.lobes += [Lobes.make_diffuse()] * n_grounds
+        self.lobes = self._measure_lobes()
         self.world_to_map = torch.tensor(
             get_world_to_map(self._scene), dtype=torch.float32
         )
         self._ground_below = self._find_ground_below(object_center)
         self._views = self._make_view_tracer(object_center)
+
+    def _measure_lobes(self) -> list[Lobes]:
+        """Return the lobes of each surface.
+
+        Both sides of the object have the same gloss, and the ground has none.
+        """
+        n_grounds = len(self.texels.grids) - self.n_sides
+        object_lobes = [self._measure_object_lobes()] * self.n_sides
+        return object_lobes + [Lobes.make_diffuse()] * n_grounds
 
     def _lay_texels(self, seed: int) -> Float32Array:
         """Lay texels over all surfaces, and find what they see of sky and each other.

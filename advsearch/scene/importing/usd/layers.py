@@ -268,7 +268,7 @@ class _LayerCheck:
         if _is_layer_name(outer, inner):
             layer_file = Path(os.path.realpath(path.parent / outer))
         if layer_file is None or not reading.is_inside(layer_file, self._folder):
-            raise self._make_outside_error(name)
+            raise self._make_unread_layer_error(name)
         if not layer_file.is_file():
             raise errors.FileFormatError(
                 f"{self.file.name}: needs {name[:100]!r}, which is missing; put that "
@@ -278,7 +278,7 @@ class _LayerCheck:
             self._check_packaged_file(layer_file, inner, name)
         return layer_file
 
-    def _make_outside_error(self, name: str) -> errors.FileFormatError:
+    def _make_unread_layer_error(self, name: str) -> errors.FileFormatError:
         """Return the error for a named layer that is no USD file in the folder."""
         return errors.FileFormatError(
             f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "

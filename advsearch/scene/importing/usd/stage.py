@@ -911,10 +911,7 @@ class Conversion:
         skeleton_query = self._skins.GetSkelQuery(skeleton) if skeleton else None
         if not skeleton_query:
             return None, points
-        transforms = _compute_joint_transforms(skinning, skeleton_query)
-        if transforms is None:
-            return None, points
-        skinned = _skin_points(skinning, transforms, points)
+        skinned = _skin_points(skinning, skeleton_query, points)
         if skinned is None:
             return None, points
         xformable = UsdGeom.Xformable(skeleton.GetPrim())
@@ -979,11 +976,19 @@ def _read_perspective(camera: Any) -> dict[str, float] | None:
     }
 
 
-def _skin_points(skinning: Any, transforms: list[Any], points: Array) -> Array | None:
-    """Return points (P, 3) moved by the transforms of joints; None if USD cannot.
+def _skin_points(skinning: Any, skeleton_query: Any, points: Array) -> Array | None:
+    """Return points (P, 3) moved by the joints of a skin at rest.
 
-    `skinning` is the query of the skin.
+    The result is None if the skeleton lacks transforms, or if USD cannot move them.
+
+    Args:
+        skinning: query of the skin.
+        skeleton_query: query of the skeleton.
+        points: the points.
     """
+    transforms = _compute_joint_transforms(skinning, skeleton_query)
+    if transforms is None:
+        return None
     skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
     matrices = Vt.Matrix4dArray(transforms)
     if not skinning.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
