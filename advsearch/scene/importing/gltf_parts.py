@@ -54,6 +54,7 @@ from advsearch.scene.importing.parts import (
     clip_to_unit,
     compute_radiance,
     describe_substitute,
+    is_plain_white,
     make_normal_map,
     transform_part,
 )
@@ -429,7 +430,7 @@ class GltfSurfaces:
         texture = self._make_base_texture(material, color, factor[:3])
         base_color: Float32Array | None = color
         has_texture = material.metallic_roughness.baseColorTexture is not None
-        if has_texture and (color > 0.999).all():
+        if has_texture and is_plain_white(color):
             base_color = None  # plain white does not change a texture
         if material.alphaMode in TRANSPARENT_MODES:
             # "BLEND" keeps partial opacity, "MASK" cuts out what is below the cutoff.

@@ -20,6 +20,7 @@ from advsearch.scene.importing.parts import (
     compute_radiance,
     describe_substitute,
     has_normals,
+    is_plain_white,
     make_normal_map,
 )
 from advsearch.scene.importing.pictures import FileImages, ImageKind
@@ -348,7 +349,7 @@ class MtlReader:
         if use is not None and texture is not None:
             self._note_unused_alpha(material, use, texture)
             texture = np.ascontiguousarray(texture[:, :, :3])
-        if use is not None and color is not None and (color > 0.999).all():
+        if use is not None and color is not None and is_plain_white(color):
             color = None  # plain white does not change a texture
         return color, texture
 

@@ -175,9 +175,14 @@ def describe_substitute(color: Float32Array | None) -> str:
 
     Plain white is no color of a material: it only leaves a texture unchanged.
     """
-    if color is None or (color > 0.999).all():
+    if color is None or is_plain_white(color):
         return "neutral grey"
     return f"its base colour ({', '.join(f'{channel:.2f}' for channel in color)})"
+
+
+def is_plain_white(color: Float32Array) -> bool:
+    """Return whether a color (3 or 4,) is white, apart from rounding."""
+    return bool((color > 0.999).all())
 
 
 def apply_opacity(

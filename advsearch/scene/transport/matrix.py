@@ -841,15 +841,42 @@ def _trace_matrices(
     """
     with renderer.scene.limit_window(renderer.window):
         paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
-    radiance = _compute_noisy_radiance(renderer, paths, has_backdrop)
-    base, smooth = _denoise_base(renderer, radiance, paths, quick)
-    for transport in transports.values():
-        transport.finish(smooth)
+    base = _finish_transports(
+        renderer, transports.values(), paths, quick=quick, has_backdrop=has_backdrop
+    )
     if has_backdrop:
-        base = torch.cat([base, paths.coverage], dim=-1)
         base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
     if renderer.crop is not None:
         base = renderer.crop.window.paste(base, renderer.crop.surrounding_image)
+    return base
+
+
+def _finish_transports(
+    renderer: Renderer,
+    transports: Collection[TextureTransport],
+    paths: TracedPaths,
+    *,
+    quick: bool,
+    has_backdrop: bool,
+) -> Tensor:
+    """Denoise and finish filled matrices, and return the denoised image of their paths.
+
+    Args:
+        renderer: renderer of the scene.
+        transports: the matrices.
+        paths: mean of the images of all paths that filled them.
+        quick: denoise the matrices by a cheaper method.
+        has_backdrop: whether the image leaves out the environment.
+
+    Returns:
+        (H, W, 3) linear radiance; with a backdrop, coverage is a fourth channel.
+    """
+    radiance = _compute_noisy_radiance(renderer, paths, has_backdrop)
+    base, smooth = _denoise_base(renderer, radiance, paths, quick)
+    for transport in transports:
+        transport.finish(smooth)
+    if has_backdrop:
+        base = torch.cat([base, paths.coverage], dim=-1)
     return base
 
 
