@@ -643,8 +643,8 @@ def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
 def _divide_by_correction(factors: Float64Array, text: bytes) -> Float64Array | None:
     """Return factors (3,) divided by those of a COLORCORR line; None if it is invalid.
 
-    A valid `text` has three positive numbers. They must not take the result near the
-    limits of float32, which are about 1e-38 and 3e38.
+    A valid `text` has three positive numbers, and the result is from 1e-20 to 1e20, far
+    within the range of float32.
     """
     numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
     if len(numbers) != 3 or not (numbers > 0.0).all():

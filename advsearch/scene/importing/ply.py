@@ -294,13 +294,13 @@ class _RowReader:
         # rows would end beyond the file, or the lists at these positions differ in
         # length, that is wrong, and rows are walked one by one.
         starts, end = self._find_even_rows(position)
-        if end > len(self.cells) or self._have_lists_other_lengths(starts):
+        if end > len(self.cells) or self._has_uneven_lists(starts):
             starts, end = self._walk_rows(position, self.element.count)
         self._store_values(starts)
         return end
 
-    def _have_lists_other_lengths(self, starts: Mapping[str, IntArray]) -> bool:
-        """Return whether some property has lists of different lengths.
+    def _has_uneven_lists(self, starts: Mapping[str, IntArray]) -> bool:
+        """Return whether some property has lists of several lengths.
 
         `starts` are, by property, the bytes (rows,) at which it begins in each row.
         """

@@ -453,9 +453,9 @@ class LightBasis:
         if ENVIRONMENT_INPUT in changed_lights:
             maps = _make_basis_maps(renderer, lighting, values[ENVIRONMENT_INPUT])
             self._basis_maps = BasisMaps(maps)
-            self.inputs_of_light += [
-                {**dark_values, ENVIRONMENT_INPUT: basis_map} for basis_map in maps
-            ]
+            for basis_map in maps:
+                inputs_of_map = {**dark_values, ENVIRONMENT_INPUT: basis_map}
+                self.inputs_of_light.append(inputs_of_map)
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
         """Return the factor (lights, 3) of each light, differentiable in the inputs.

@@ -691,9 +691,8 @@ class Conversion:
         for attribute in attributes.values():
             index = constant_index
             if attribute is not None:
-                index = index_by_interpolation.get(
-                    attribute.interpolation, constant_index
-                )
+                kind = attribute.interpolation
+                index = index_by_interpolation.get(kind, constant_index)
                 self._check_value_count(path, attribute, index)
             columns.append(index)
         return np.stack(columns, axis=1)
@@ -793,6 +792,28 @@ class Conversion:
             self._note_default_material(primvars)
         colors = _read_primvar(primvars, bound.color)
         opacities = _read_primvar(primvars, bound.opacity)
+        yield from self._make_tints(bound, colors, opacities, faces, mesh_faces)
+
+    def _make_tints(
+        self,
+        bound: BoundMaterial,
+        colors: MeshValues | None,
+        opacities: MeshValues | None,
+        faces: Array,
+        mesh_faces: MeshFaces,
+    ) -> Iterator[tuple[int, MeshValues | None, Array]]:
+        """Make a copy of a material for each tint of faces; see `_split_by_tint`.
+
+        Args:
+            bound: the material.
+            colors: colors of the mesh that replace that of the material, or None.
+            opacities: opacities of the mesh that replace that of the material, or None.
+            faces: (F,) faces with the material.
+            mesh_faces: all faces of the mesh.
+
+        Yields:
+            Index of a glTF material, vertex colors or None, and faces.
+        """
         face_colors = _find_face_colors(colors, faces, mesh_faces)
         vertex_colors = colors if face_colors is None else None
         face_tints = self._compute_face_tints(face_colors, opacities, faces, mesh_faces)
