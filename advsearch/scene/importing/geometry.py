@@ -822,10 +822,10 @@ def _sum_by_group(vectors: Float64Array, group: IntArray) -> Float64Array:
 
     `group` (3 F,) is the group of each corner.
     """
-    coordinate_sums = [
-        np.bincount(group, weights=vectors[:, :, axis].ravel()) for axis in range(3)
-    ]
-    vector_sums: Float64Array = np.stack(coordinate_sums, axis=1)
+    vector_sums: Float64Array = np.stack(
+        [np.bincount(group, weights=vectors[:, :, axis].ravel()) for axis in range(3)],
+        axis=1,
+    )
     return vector_sums
 
 

@@ -33,7 +33,7 @@ IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
 highlights.
 """
 NORMAL_MAPS = ("norm", "map_kn", "map_bump", "bump")
-COLOR_MAPS = ("map_kd", "map_ke")
+COLOR_MAPS = ("map_kd", "map_ke")  # others have numbers
 UV_MAPS = ("map_kd", "map_d", *NORMAL_MAPS, "map_ke")
 """Maps that are sampled at texture coordinates. All have the layout (scale and offset of
 texture coordinates) of the first of them that a material has.
