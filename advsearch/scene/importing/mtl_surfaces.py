@@ -546,7 +546,7 @@ class MtlReader:
             "textures of roughness and metallic are replaced by their means"
         )
         uvs, areas = self.find_mapped_faces(name, square)
-        return _average_shown_values(image, use, uvs, areas)
+        return _average_mapped_values(image, use, uvs, areas)
 
     def _make_normal_map(
         self, material: MtlMaterial, uses: dict[str, MapStatement]
@@ -690,7 +690,7 @@ def _is_clamped(use: MapStatement) -> bool:
     return use.options.get("clamp", "").lower() == "on"
 
 
-def _average_shown_values(
+def _average_mapped_values(
     image: Float32Array, use: MapStatement, uvs: Float64Array, areas: Float64Array
 ) -> float:
     """Return the mean of a map of numbers over the faces that show it.

@@ -194,13 +194,13 @@ def make_place_parts(
 
 
 def _make_scene_part(
-    place: Place, part: MeshPart, metres: float, emission: Float32Array | None
+    owner: Place, part: MeshPart, metres: float, emission: Float32Array | None
 ) -> MeshPart:
     """Return a mesh of a place with an emission, and lengths in units of some metres."""
     vertices = part.mesh.vertices / np.float32(metres)
     return replace(
         part,
-        place=place,
+        place=owner,
         mesh=replace(part.mesh, vertices=vertices),
         solids=_scale_solids(part.solids, metres),
         emission=emission,
@@ -208,15 +208,15 @@ def _make_scene_part(
 
 
 def _find_emission(
-    place: Place, part: MeshPart, are_lamps_on: bool
+    owner: Place, part: MeshPart, are_lamps_on: bool
 ) -> Float32Array | None:
     """Return the luminance (H, W, 3) that a mesh of a place emits, in cd/m2, or None."""
-    if part.name not in place.file.lamps:
+    if part.name not in owner.file.lamps:
         return part.emission
     if not are_lamps_on:
         return None
     # one texel of the color that the file states
-    return np.array([[place.file.lamps[part.name]]], np.float32)
+    return np.array([[owner.file.lamps[part.name]]], np.float32)
 
 
 def _scale_solids(solids: tuple[Solid, ...], metres: float) -> tuple[Solid, ...]:
