@@ -725,7 +725,7 @@ def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     in a part with flat shading that of the face.
     """
     vectors = soup.compute_area_vectors()
-    is_known = np.isfinite(soup.normals).all(axis=2)
+    is_known = np.asarray(np.isfinite(soup.normals).all(axis=2))
     normals, is_front = _turn_normals(soup, vectors, is_known, notes)
     if not is_front.all():
         is_used = (is_known & is_front)[:, :, None]

@@ -782,7 +782,6 @@ def find_libraries(arguments: Sequence[str], references: ReferencedFiles) -> lis
         references: finds files beside the mesh file.
     """
     names: list[str] = []
-    names: list[str] = []
     for argument in arguments:
         names += _find_line_libraries(argument, references)
     return list(dict.fromkeys(filter(None, names)))

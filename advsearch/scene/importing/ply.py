@@ -564,8 +564,7 @@ def _find_mapped_triangles(uvs: IndexedValues | None, n_triangles: int) -> BoolA
     """Return which triangles (T,) have texture coordinates at all corners."""
     if uvs is None:
         return np.zeros(n_triangles, np.bool_)
-    is_mapped: BoolArray = (uvs.row_of_corner >= 0).all(axis=1)
-    return is_mapped
+    return np.asarray((uvs.row_of_corner >= 0).all(axis=1))
 
 
 def _parse_texture_names(comments: Sequence[str]) -> list[str]:

@@ -921,7 +921,7 @@ def _move_to_right_half(uvs: Float64Array, is_mirrored: BoolArray) -> Float64Arr
     In units of the old width, the right half is from 1 to 2, and its u runs backwards.
     Then both halves are scaled to [0, 1].
     """
-    new_uvs = uvs.copy()
+    new_uvs: Float64Array = uvs.copy()
     new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
     new_uvs[:, :, 0] /= 2.0
     return new_uvs

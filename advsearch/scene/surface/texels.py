@@ -771,8 +771,9 @@ def _blur_rows(radiance: Tensor, sigma: float) -> Tensor:
     row_filter = torch.exp(
         -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
     )
-    spectrum = torch.fft.rfft(radiance, dim=1)
-    return torch.fft.irfft(spectrum * row_filter[..., None], n=n_columns, dim=1)
+    spectrum = torch.fft.rfft(radiance, dim=1) * row_filter[..., None]
+    blurred: Tensor = torch.fft.irfft(spectrum, n=n_columns, dim=1)
+    return blurred
 
 
 def compute_directions(size: tuple[int, int]) -> Tensor:

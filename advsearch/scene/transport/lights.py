@@ -204,7 +204,7 @@ def _find_input_changes(
         inputs: scene inputs once a group is changed.
         n_coordinates: number of coordinates of the group.
     """
-    changes = {}
+    changes: dict[str, _Change] = {}
     for name in base_inputs.keys() | inputs.keys():
         change = _find_change(
             name,
