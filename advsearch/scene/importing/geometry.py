@@ -1295,7 +1295,7 @@ def _is_ear(
 def _is_left_of_side(
     points: Float64Array, start: Float64Array, end: Float64Array
 ) -> BoolArray:
-    """Return which points (E, n, 2) are left of a side or on it, but not at an end.
+    """Return which points (E, n, 2) are left of a side or on it, but not at its start.
 
     Args:
         points: the points.

@@ -256,8 +256,9 @@ def _count_part_values(file: Path, header: Mapping[str, Any]) -> int:
     _, (height, width) = _read_window(header, "displayWindow")
     # In a corrupt file the end of a window may be before its start.
     n_pixels = max(data_width, 0) * max(data_height, 0)
+    n_values = n_pixels * len(header["channels"])
     check_pixels(file, max(width, 0), max(height, 0))
-    return n_pixels * len(header["channels"])
+    return n_values
 
 
 def _read_window(
@@ -793,15 +794,16 @@ def _decode_repeats(body: bytes, position: int, line: Bytes) -> int:
     Returns:
         The position after the line.
     """
+    width = len(line)
     n_filled = 0
     count_shift = 0
-    while n_filled < len(line):
+    while n_filled < width:
         pixel = body[position : position + 4]
         position = position + 4
         if pixel[:3] == b"\x01\x01\x01":
             count = pixel[3] << count_shift
             # There has to be a pixel to repeat, and room for the repeats.
-            if n_filled == 0 or n_filled + count > len(line):
+            if n_filled == 0 or n_filled + count > width:
                 raise ValueError("a repeat that does not fit")
             line[n_filled : n_filled + count] = line[n_filled - 1]
             n_filled = n_filled + count

@@ -725,7 +725,7 @@ class _Properties:
             )
 
     def _make_no_polygons_error(self) -> FileFormatError:
-        """Return the error for a file without a polygon of 3 corners."""
+        """Return the error for a file without a polygon of 3 or more corners."""
         got = "points or lines only; export triangles"
         if self.has_splats:
             got = f"Gaussian splats: {SPLATS_ADVICE}"
@@ -783,7 +783,7 @@ class _Properties:
     def _find_mapped_polygons(self, wedges: ListValues, counts: IntArray) -> BoolArray:
         """Return which polygons (P,) have two wedge values for each corner.
 
-        Faces with another number of values are noted.
+        Faces with values, but another number of them, are noted.
         """
         n_faces = len(wedges.counts)
         wedge_counts = np.zeros(len(counts), np.int64)

@@ -489,7 +489,10 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
 
 
 def _make_binomial_weights(is_used: BoolArray) -> scipy.sparse.csr_array:
-    """Return the weights (n, n) of used texels (w, w) for each texel; rows sum to 1."""
+    """Return the weights (n, n) of used texels (w, w) for each texel.
+
+    Rows sum to 1, or to 0 if no texel nearby is used.
+    """
     width = len(is_used)
     # along one axis: each texel and two neighbours on each side
     axis_weights = scipy.sparse.diags_array(
