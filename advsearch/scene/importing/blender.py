@@ -58,14 +58,24 @@ def convert_blend(path: Path, data: bytes) -> bytes:
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         target = Path(folder) / "scene.glb"
         process = _run_blender(program, path, target)
-        if process.returncode or not target.is_file():
-            # It begins with a colon, or is "" if Blender printed nothing.
-            reason = reading.get_last_line(process.stdout + process.stderr)
-            raise errors.FileFormatError(
-                f"{path}: Blender could not read it{reason}; export glTF (.glb) from "
-                "Blender yourself"
-            )
+        _check_conversion(path, target, process)
         return reading.read_bytes(target, "object", (".glb",))
+
+
+def _check_conversion(
+    path: Path, target: Path, process: subprocess.CompletedProcess[str]
+) -> None:
+    """Raise FileFormatError if Blender failed, or did not write the target file.
+
+    `path` is the .blend file, for the message.
+    """
+    if process.returncode or not target.is_file():
+        # It begins with a colon, or is "" if Blender printed nothing.
+        reason = reading.get_last_line(process.stdout + process.stderr)
+        raise errors.FileFormatError(
+            f"{path}: Blender could not read it{reason}; export glTF (.glb) from "
+            "Blender yourself"
+        )
 
 
 def _run_blender(
@@ -82,7 +92,30 @@ def _run_blender(
     Raises:
         FileFormatError: Blender cannot be started, or takes too long.
     """
+    command = _make_conversion_command(program, path, target)
     folder = str(target.parent)
+    try:
+        return reading.run_converter(
+            path,
+            "Blender",
+            command,
+            folder=folder,
+            seconds=LONGEST,
+            env=reading.make_environment(folder),
+        )
+    except OSError as error:
+        raise errors.FileFormatError(
+            f"{path}: Blender can't be started ({error.strerror}); check {program[0]}"
+        ) from error
+
+
+def _make_conversion_command(
+    program: Sequence[str], path: Path, target: Path
+) -> list[str]:
+    """Return the command that converts a file, and write the script that it runs.
+
+    The script is written to the folder of `target`.
+    """
     script = target.with_name("export.py")
     script.write_text(EXPORT_SCRIPT, "utf-8")
     arguments = [
@@ -92,16 +125,4 @@ def _run_blender(
     ]
     # The bpy package runs in Python (-I), which needs no separator.
     separator = [] if "-I" in program else ["--"]
-    try:
-        return reading.run_converter(
-            path,
-            "Blender",
-            [*program, str(script), *separator, *arguments],
-            folder=folder,
-            seconds=LONGEST,
-            env=reading.make_environment(folder),
-        )
-    except OSError as error:
-        raise errors.FileFormatError(
-            f"{path}: Blender can't be started ({error.strerror}); check {program[0]}"
-        ) from error
+    return [*program, str(script), *separator, *arguments]

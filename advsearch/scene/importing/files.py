@@ -110,10 +110,16 @@ def find_advice(path: Path) -> str | None:
             return f"{kind}: {_make_blender_advice(path, operator)}"
     if suffix == ".bin":
         return _make_buffer_advice(path)
+    return _fill_format_advice(path)
+
+
+def _fill_format_advice(path: Path) -> str | None:
+    """Return the advice of `FORMAT_ADVICE` on a file, with its names; None if unknown."""
     # values for the braces in `FORMAT_ADVICE`: the file, and names of converted files
     names = {"file": shlex.quote(path.name)} | {
         name: shlex.quote(f"{path.stem}.{name}") for name in ("obj", "stl", "glb")
     }
+    suffix = path.suffix.lower()
     for kind, (instructions, suffixes) in FORMAT_ADVICE.items():
         if suffix in suffixes:
             return f"{kind}: {instructions.format(**names)}"
@@ -188,23 +194,28 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
         FileFormatError: the file has another suffix, or is missing, not an ordinary
             file, unreadable, empty or larger than `LARGEST_FILE`.
     """
+    data = _read_supported_file(path, what, suffixes)
+    if not data:
+        raise FileFormatError(
+            f"{path}: the {what} file is empty; export or download it again"
+        )
+    return data
+
+
+def _read_supported_file(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
+    """Return the content of a file, which may be empty; see `read_bytes`."""
     try:
         _check_suffix(path, what, suffixes)
         data = stored_files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
         hint = _make_missing_file_hint(path, suffixes)
-        raise FileFormatError(
-            f"{path}: no such {what} file.{hint} Check the path"
-        ) from error
+        message = f"{path}: no such {what} file.{hint} Check the path"
+        raise FileFormatError(message) from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise FileFormatError(
             f"{path}: the {what} file cannot be read ({reason}); check its permissions"
         ) from error
-    if not data:
-        raise FileFormatError(
-            f"{path}: the {what} file is empty; export or download it again"
-        )
     return data
 
 
@@ -227,24 +238,41 @@ def _check_suffix(path: Path, what: str, suffixes: Sequence[str]) -> None:
         )
     if path.suffix.lower() in suffixes:
         return
-    file, _, part_name = str(path).rpartition("#")
-    if not file:  # no part is named
-        file = str(path)
-        part_name = ""
-    # With a suffix that is not supported, the suffix is the problem, and not the part.
-    if part_name and Path(file).suffix.lower() in suffixes:
-        raise FileFormatError(
-            f"{file}: has no parts by name, got "
-            f"#{format_name(part_name, quoted=False)}; leave it out"
-        )
+    file, part_name = _split_part_name(path)
+    _check_part_name(file, part_name, suffixes)
     # The advice is about programs that export meshes.
     advice = None if what == "environment" else find_advice(Path(file))
     if advice is not None:
         raise FileFormatError(
             f"{path}: {advice} (supported are {join_alternatives(suffixes)})"
         )
+    raise _make_suffix_error(path, what, suffixes)
+
+
+def _check_part_name(file: str, part_name: str, suffixes: Sequence[str]) -> None:
+    """Raise FileFormatError if a part is named of a supported file, which has none."""
+    # With a suffix that is not supported, the suffix is the problem, and not the part.
+    if part_name and Path(file).suffix.lower() in suffixes:
+        raise FileFormatError(
+            f"{file}: has no parts by name, got "
+            f"#{format_name(part_name, quoted=False)}; leave it out"
+        )
+
+
+def _split_part_name(path: Path) -> tuple[str, str]:
+    """Split a path at its last # into the file and a part's name, which may be ""."""
+    file, _, part_name = str(path).rpartition("#")
+    if not file:  # no part is named
+        return str(path), ""
+    return file, part_name
+
+
+def _make_suffix_error(
+    path: Path, what: str, suffixes: Sequence[str]
+) -> FileFormatError:
+    """Return the error for a file whose suffix is none of those supported."""
     got = f"got {path.suffix!r}" if path.suffix else "got a name without a suffix"
-    raise FileFormatError(
+    return FileFormatError(
         f"{path}: expected an {what} file ending in {join_alternatives(suffixes)}, {got}; "
         "convert it to one of these"
     )
@@ -257,13 +285,7 @@ def _make_missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
     """
     if not path.parent.is_dir():
         return f" The folder {path.parent} does not exist either."
-    name_by_lower_case = {}
-    with suppress(OSError):  # the folder may not be read
-        name_by_lower_case = {
-            file.name.lower(): file.name
-            for file in path.parent.iterdir()
-            if file.suffix.lower() in suffixes
-        }
+    name_by_lower_case = _list_names_with_suffix(path.parent, suffixes)
     matches = difflib.get_close_matches(
         path.name.lower(), sorted(name_by_lower_case), n=3, cutoff=0.5
     )
@@ -271,6 +293,20 @@ def _make_missing_file_hint(path: Path, suffixes: Sequence[str]) -> str:
         return ""
     names = " or ".join(repr(name_by_lower_case[match]) for match in matches)
     return f" Did you mean {names}?"
+
+
+def _list_names_with_suffix(folder: Path, suffixes: Sequence[str]) -> dict[str, str]:
+    """Return the names of a folder's files with one of the suffixes, by lower case.
+
+    The result is empty if the folder may not be read.
+    """
+    with suppress(OSError):
+        return {
+            file.name.lower(): file.name
+            for file in folder.iterdir()
+            if file.suffix.lower() in suffixes
+        }
+    return {}
 
 
 def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:

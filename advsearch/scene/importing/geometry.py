@@ -17,6 +17,7 @@ import numpy.typing as npt
 from advsearch.errors import InputError
 from advsearch.scene.assets import (
     BoolArray,
+    Float32Array,
     Float64Array,
     IntArray,
     Mesh,
@@ -140,39 +141,78 @@ def join_parts(
     Raises:
         InputError: vertices are NaN or infinite, or the object has no extent.
     """
-    vertices = np.concatenate([part.vertices for part in parts])
-    _check_finite(vertices, source)
     faces = _concatenate_faces(parts)
-    lower_corner = vertices[find_used(faces, len(vertices))].min(axis=0)
-    extent = compute_extent(parts)
-    _check_extent(extent, source)
-    scaled_vertices = (vertices - lower_corner) / extent
-    # Adding 0 turns -0.0 into 0.0, so that both are one point.
-    points, point_of_vertex = _weld(scaled_vertices @ turn.T + 0.0)
+    points, point_of_vertex = _join_points(parts, faces, source, turn)
     n_faces = [len(part.faces) for part in parts]
-    normals = np.concatenate(
-        [_gather_at_corners(part.normals, part.faces, 3) for part in parts]
-    )
-    # White, which changes nothing, where a part has no colors.
-    colors = [
-        np.ones((len(part.faces), 3, 3)) if part.colors is None else part.colors
-        for part in parts
-    ]
-    # Joints and morph targets move vertices as the file stores them: `faces` has the
-    # stored vertex of each corner.
-    has_movable = any(part.movable is not None for part in parts)
     return TriangleSoup(
         points=points,
         faces=point_of_vertex[faces],
         part_of_face=np.arange(len(parts)).repeat(n_faces),
-        normals=normalize_vectors(normals) @ turn.T,
-        uvs=np.concatenate(
-            [_gather_at_corners(part.uvs, part.faces, 2) for part in parts]
-        ),
-        colors=np.concatenate(colors),
+        normals=_join_normals(parts) @ turn.T,
+        uvs=_join_uvs(parts),
+        colors=_join_colors(parts),
         is_flat=np.array([part.flat for part in parts]).repeat(n_faces),
-        stored_vertices=faces if has_movable else None,
+        stored_vertices=faces if _has_movable_part(parts) else None,
     )
+
+
+def _join_points(
+    parts: Sequence[ImportedPart], faces: IntArray, source: str, turn: Float64Array
+) -> tuple[Float64Array, IntArray]:
+    """Weld the vertices of all parts, scaled to extent 1 and turned; see `join_parts`.
+
+    Args:
+        parts: the parts.
+        faces: (F, 3) the faces of all parts, as indices of all their vertices.
+        source: name of the file, for messages.
+        turn: the rotation (3, 3).
+
+    Returns:
+        The points (P, 3), and the point of each vertex (V,) of the concatenated parts.
+    """
+    vertices = np.concatenate([part.vertices for part in parts])
+    _check_finite(vertices, source)
+    used = find_used(faces, len(vertices))
+    lower_corner = vertices[used].min(axis=0)
+    extent = compute_extent(parts)
+    _check_extent(extent, source)
+    scaled_vertices = (vertices - lower_corner) / extent
+    # Adding 0 turns -0.0 into 0.0, so that both are one point.
+    return _weld(scaled_vertices @ turn.T + 0.0)
+
+
+def _join_normals(parts: Sequence[ImportedPart]) -> Float64Array:
+    """Return the unit normals of the corners of all parts, (F, 3, 3); NaN if unknown."""
+    normals = [_gather_at_corners(part.normals, part.faces, 3) for part in parts]
+    return normalize_vectors(np.concatenate(normals))
+
+
+def _join_uvs(parts: Sequence[ImportedPart]) -> Float64Array:
+    """Return the UVs of the corners of all parts, (F, 3, 2); NaN if unknown."""
+    return np.concatenate(
+        [_gather_at_corners(part.uvs, part.faces, 2) for part in parts]
+    )
+
+
+def _join_colors(parts: Sequence[ImportedPart]) -> Float64Array:
+    """Return the factors of the colors of the corners of all parts, (F, 3, 3).
+
+    They are 1, which changes nothing, where a part has no colors.
+    """
+    colors = [
+        np.ones((len(part.faces), 3, 3)) if part.colors is None else part.colors
+        for part in parts
+    ]
+    return np.concatenate(colors)
+
+
+def _has_movable_part(parts: Sequence[ImportedPart]) -> bool:
+    """Return whether some part has joints or morph targets.
+
+    They move vertices as the file stores them, so that the stored vertex of each corner
+    has to be known.
+    """
+    return any(part.movable is not None for part in parts)
 
 
 def _concatenate_faces(parts: Sequence[ImportedPart]) -> IntArray:
@@ -305,17 +345,13 @@ def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     is None. Corners become one vertex of the mesh if they have the same point, normal
     and UV, and also the same stored vertex if that is known.
     """
-    # Adding 0 turns -0.0 into 0.0, which has other bits.
-    normals = (soup.normals.astype(np.float32) + np.float32(0.0)).reshape(-1, 3)
-    uvs = (soup.uvs.astype(np.float32) + np.float32(0.0)).reshape(-1, 2)
-    corners = soup.faces.reshape(-1)
-    # Floats are compared by their bits, as integers.
-    keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
-    if soup.stored_vertices is not None:
-        keys = np.column_stack([keys, soup.stored_vertices.reshape(-1)])
+    normals = _round_to_float32(soup.normals).reshape(-1, 3)
+    uvs = _round_to_float32(soup.uvs).reshape(-1, 2)
+    keys = _make_corner_keys(soup, normals, uvs)
     first_corner, vertex_of_corner = find_unique_rows(keys)
+    point_of_vertex = soup.faces.reshape(-1)[first_corner]
     mesh = Mesh(
-        vertices=soup.points[corners[first_corner]].astype(np.float32),
+        vertices=soup.points[point_of_vertex].astype(np.float32),
         faces=vertex_of_corner.reshape(-1, 3).astype(np.uint32),
         normals=normals[first_corner],
         uvs=uvs[first_corner],
@@ -323,6 +359,31 @@ def make_mesh_from_soup(soup: TriangleSoup) -> tuple[Mesh, IntArray | None]:
     if soup.stored_vertices is None:
         return mesh, None
     return mesh, soup.stored_vertices.reshape(-1)[first_corner]
+
+
+def _make_corner_keys(
+    soup: TriangleSoup, normals: Float32Array, uvs: Float32Array
+) -> npt.NDArray[Any]:
+    """Return a row of integers (3 F, k) for each corner, equal for the same vertex.
+
+    Floats are compared by their bits, as integers.
+
+    Args:
+        soup: the faces.
+        normals: (3 F, 3) normal at each corner.
+        uvs: (3 F, 2) UVs at each corner.
+    """
+    corners = soup.faces.reshape(-1)
+    keys = np.column_stack([corners, normals.view(np.int32), uvs.view(np.int32)])
+    if soup.stored_vertices is not None:
+        keys = np.column_stack([keys, soup.stored_vertices.reshape(-1)])
+    return keys
+
+
+def _round_to_float32(values: Float64Array) -> Float32Array:
+    """Return values as float32, without -0.0, whose bits are not those of 0.0."""
+    rounded: Float32Array = values.astype(np.float32) + np.float32(0.0)
+    return rounded
 
 
 # ---- Winding ----
@@ -335,6 +396,22 @@ def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     inside out are turned over. A shell is a set of faces that are connected by edges.
     """
     is_turned, shell, has_moebius_strip = _find_turned_faces(soup)
+    _note_turned_faces(is_turned, has_moebius_strip, notes)
+    soup = soup.flip_faces(is_turned)
+    is_shell_inside_out = _find_inside_out_shells(soup, shell)
+    is_inside_out = is_shell_inside_out[shell]
+    if is_inside_out.any():
+        notes.warn(
+            f"{int(is_inside_out.sum())} faces were inside out and have been turned "
+            "over"
+        )
+    return soup.flip_faces(is_inside_out)
+
+
+def _note_turned_faces(
+    is_turned: BoolArray, has_moebius_strip: bool, notes: Notes
+) -> None:
+    """Warn of faces (F,) that are turned over for their neighbors, and of one side."""
     if is_turned.any():
         notes.warn(
             f"{int(is_turned.sum())} faces wound against their neighbours were turned "
@@ -345,15 +422,6 @@ def _fix_winding(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
             "has a one-sided surface (a Moebius strip), so the backs of some faces are "
             "visible"
         )
-    soup = soup.flip_faces(is_turned)
-    is_shell_inside_out = _find_inside_out_shells(soup, shell)
-    is_inside_out = is_shell_inside_out[shell]
-    if is_inside_out.any():
-        notes.warn(
-            f"{int(is_inside_out.sum())} faces were inside out and have been turned "
-            "over"
-        )
-    return soup.flip_faces(is_inside_out)
 
 
 def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
@@ -370,6 +438,16 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     """
     start = faces.reshape(-1)
     end = np.roll(faces, -1, axis=1).reshape(-1)
+    left_corner, right_corner = _pair_sides(start, end)
+    return left_corner, right_corner, start[left_corner] == start[right_corner]
+
+
+def _pair_sides(start: IntArray, end: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the two sides of each edge (E,) that has exactly two.
+
+    Args:
+        start, end: (3 F,) the points at the ends of each side of a face.
+    """
     lower = np.minimum(start, end)
     upper = np.maximum(start, end)
     # Sorted by their ends, the sides of an edge follow one another.
@@ -380,9 +458,7 @@ def find_shared_edges(faces: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
     edge_begin = np.flatnonzero(np.concatenate([[True], ends_differ]))
     n_sides = np.diff(np.append(edge_begin, len(sorted_sides)))
     pair_begin = edge_begin[n_sides == 2]
-    left_corner = sorted_sides[pair_begin]
-    right_corner = sorted_sides[pair_begin + 1]
-    return left_corner, right_corner, start[left_corner] == start[right_corner]
+    return sorted_sides[pair_begin], sorted_sides[pair_begin + 1]
 
 
 def _link_windings(
@@ -468,12 +544,20 @@ def _find_turned_faces(soup: TriangleSoup) -> tuple[BoolArray, IntArray, bool]:
     component_as_is = component[0::2]
     component_turned = component[1::2]
     is_turned = _select_windings(component_as_is, component_turned, area)
-    # A shell has two components, or one if it is one-sided. The lower one identifies
-    # the shell.
+    has_moebius_strip = bool((component_as_is == component_turned).any())
+    shell = _number_shells(component_as_is, component_turned)
+    return is_turned, shell, has_moebius_strip
+
+
+def _number_shells(component_as_is: IntArray, component_turned: IntArray) -> IntArray:
+    """Return the shell of each face (F,), from the components of its two windings (F,).
+
+    A shell has two components, or one if it is one-sided. The lower one identifies the
+    shell.
+    """
     shell_component = np.minimum(component_as_is, component_turned)
     _, shell = np.unique(shell_component, return_inverse=True)
-    has_moebius_strip = bool((component_as_is == component_turned).any())
-    return is_turned, shell.astype(np.int64), has_moebius_strip
+    return shell.astype(np.int64)
 
 
 def _compute_shell_bounds(
@@ -528,6 +612,29 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
     volume = _compute_signed_volumes(soup, shell, vectors, face_counts)
     agreement = _compute_normal_agreement(soup, shell, vectors, n_shells)
     bounds = _compute_shell_bounds(soup, shell, n_shells)
+    is_closed_turned = _find_inside_out_closed_shells(
+        is_closed, volume, agreement, bounds
+    )
+    is_open_turned = agreement < 0.0
+    return np.where(is_closed, is_closed_turned, is_open_turned)
+
+
+def _find_inside_out_closed_shells(
+    is_closed: BoolArray,
+    volume: Float64Array,
+    agreement: Float64Array,
+    bounds: tuple[Float64Array, Float64Array],
+) -> BoolArray:
+    """Return which closed shells (S,) to turn over, by the two steps of the caller.
+
+    The values of open shells mean nothing.
+
+    Args:
+        is_closed: (S,) which shells are closed.
+        volume: (S,) signed volumes.
+        agreement: (S,) how far the file's normals agree with the faces.
+        bounds: lower and upper corners (S, 3) of the boxes of all shells.
+    """
     # First step. Turning reverses the signs of volumes and agreements.
     are_all_turned = volume[is_closed].sum() < 0.0
     is_negative = (volume < 0.0) != are_all_turned
@@ -538,9 +645,8 @@ def _find_inside_out_shells(soup: TriangleSoup, shell: IntArray) -> BoolArray:
         if _is_enclosed(int(index), is_closed, bounds):
             is_turned_again[index] = agreement_after_step[index] < 0.0
     # A closed shell that is turned over in both steps is as before.
-    is_closed_turned = is_turned_again != are_all_turned
-    is_open_turned = agreement < 0.0
-    return np.where(is_closed, is_closed_turned, is_open_turned)
+    is_turned: BoolArray = is_turned_again != are_all_turned
+    return is_turned
 
 
 def _is_enclosed(
@@ -614,35 +720,72 @@ def _compute_signed_volumes(
 def _fix_normals(soup: TriangleSoup, notes: Notes) -> TriangleSoup:
     """Return the soup with a normal on the front of its face at every corner.
 
-    If the file's normals are on the front of their faces on almost all of the surface
-    (`MIN_NORMAL_AGREEMENT`), they are used. If they are on the back on almost all of
-    it, they are all reversed. Otherwise all are computed.
-
-    A single normal that is missing, or on the back of its face, is computed too. A
-    computed normal is smooth, or in a part with flat shading that of the face.
+    A normal of the file is used if `_turn_normals` finds it on the front. A normal that
+    is missing, or on the back of its face, is computed. A computed normal is smooth, or
+    in a part with flat shading that of the face.
     """
     vectors = soup.compute_area_vectors()
-    area = np.linalg.norm(vectors, axis=1)
-    is_known = np.isfinite(soup.normals).all(axis=2)
-    is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
-    normals = soup.normals
-    if is_known.any():
-        known_area = np.where(is_known, area[:, None], 0.0)
-        front_fraction = float((known_area * is_front).sum() / known_area.sum())
-        if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:  # most are on the back
-            notes.warn("its normals pointed inwards and were turned around")
-            normals = -normals
-            is_front = is_known & ~is_front
-        elif front_fraction < MIN_NORMAL_AGREEMENT:
-            notes.warn("its normals contradict its faces and were computed anew")
-            is_front = np.zeros_like(is_front)  # no normal of the file is used
+    is_known = np.asarray(np.isfinite(soup.normals).all(axis=2))
+    normals, is_front = _turn_normals(soup, vectors, is_known, notes)
     if not is_front.all():
-        computed = compute_smooth_normals(soup)
-        if soup.is_flat is not None:
-            face_normals = normalize_vectors(vectors)[:, None]
-            computed = np.where(soup.is_flat[:, None, None], face_normals, computed)
-        normals = np.where((is_known & is_front)[:, :, None], normals, computed)
+        is_used = (is_known & is_front)[:, :, None]
+        normals = np.where(is_used, normals, _compute_normals(soup, vectors))
     return replace(soup, normals=normals)
+
+
+def _turn_normals(
+    soup: TriangleSoup, vectors: Float64Array, is_known: BoolArray, notes: Notes
+) -> tuple[Float64Array, BoolArray]:
+    """Return the file's normals (F, 3, 3), and which (F, 3) are on the front of a face.
+
+    If they are on the front of their faces on almost all of the surface
+    (`MIN_NORMAL_AGREEMENT`), they stay as they are. If they are on the back on almost
+    all of it, they are all reversed. Otherwise none counts as being on the front.
+
+    Args:
+        soup: the faces.
+        vectors: (F, 3) normals of the faces, as long as twice the areas.
+        is_known: (F, 3) which corners have a normal.
+        notes: notes about the file, to which changes are added.
+    """
+    is_front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
+    if not is_known.any():
+        return soup.normals, is_front
+    front_fraction = _compute_front_fraction(is_known, is_front, vectors)
+    if front_fraction < 1.0 - MIN_NORMAL_AGREEMENT:  # most are on the back
+        notes.warn("its normals pointed inwards and were turned around")
+        return -soup.normals, is_known & ~is_front
+    if front_fraction < MIN_NORMAL_AGREEMENT:
+        notes.warn("its normals contradict its faces and were computed anew")
+        return soup.normals, np.zeros_like(is_front)
+    return soup.normals, is_front
+
+
+def _compute_front_fraction(
+    is_known: BoolArray, is_front: BoolArray, vectors: Float64Array
+) -> float:
+    """Return the fraction of the area with known normals where they are on the front.
+
+    Args:
+        is_known: (F, 3) which corners have a normal.
+        is_front: (F, 3) which corners have a normal on the front of their face.
+        vectors: (F, 3) normals of the faces, as long as twice the areas.
+    """
+    area = np.linalg.norm(vectors, axis=1)
+    known_area = np.where(is_known, area[:, None], 0.0)
+    return float((known_area * is_front).sum() / known_area.sum())
+
+
+def _compute_normals(soup: TriangleSoup, vectors: Float64Array) -> Float64Array:
+    """Compute normals of corners (F, 3, 3): of the face where flat, and smooth elsewhere.
+
+    `vectors` are normals of the faces, of any length.
+    """
+    computed = compute_smooth_normals(soup)
+    if soup.is_flat is not None:
+        face_normals = normalize_vectors(vectors)[:, None]
+        computed = np.where(soup.is_flat[:, None, None], face_normals, computed)
+    return computed
 
 
 def _compute_cosines(
@@ -666,18 +809,24 @@ def compute_smooth_normals(soup: TriangleSoup) -> Float64Array:
     face_normals = normalize_vectors(soup.compute_area_vectors())
     smoothing_group = _find_smoothing_groups(soup, face_normals)
     weighted = face_normals[:, None] * _compute_corner_angles(soup)[:, :, None]
-    normal_sums: Float64Array = np.stack(
-        [
-            np.bincount(smoothing_group, weights=weighted[:, :, axis].ravel())
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    smooth_normals = normalize_vectors(normal_sums)[smoothing_group].reshape(-1, 3, 3)
+    unit_sums = normalize_vectors(_sum_by_group(weighted, smoothing_group))
+    smooth_normals = unit_sums[smoothing_group].reshape(-1, 3, 3)
     # A mean that is not on the front of a face is replaced by the face's normal. So is
     # a mean of NaN, where normals cancel.
     cosine = (smooth_normals * face_normals[:, None]).sum(axis=2, keepdims=True)
     return np.where(cosine > 0.0, smooth_normals, face_normals[:, None])
+
+
+def _sum_by_group(vectors: Float64Array, group: IntArray) -> Float64Array:
+    """Return the sum (G, 3) of the vectors of corners (F, 3, 3) in each group.
+
+    `group` (3 F,) is the group of each corner.
+    """
+    vector_sums: Float64Array = np.stack(
+        [np.bincount(group, weights=vectors[:, :, axis].ravel()) for axis in range(3)],
+        axis=1,
+    )
+    return vector_sums
 
 
 def _find_smoothing_groups(soup: TriangleSoup, face_normals: Float64Array) -> IntArray:
@@ -784,10 +933,7 @@ def triangulate_and_note(
         The corners of the triangles (T, 3), as indices into `points`; and the polygon
         of each triangle (T,).
     """
-    n_degenerate = int((counts < 3).sum())
-    if n_degenerate:
-        plural = "" if n_degenerate == 1 else "s"
-        notes.warn(f"{n_degenerate:,} face{plural} of fewer than 3 corners left out")
+    _note_degenerate_polygons(counts, notes)
     triangles, polygon, n_wrong = triangulate(points, counts)
     if n_wrong:
         notes.warn(
@@ -795,6 +941,14 @@ def triangulate_and_note(
             "divided wrongly"
         )
     return triangles, polygon
+
+
+def _note_degenerate_polygons(counts: IntArray, notes: Notes) -> None:
+    """Note how many polygons, with these numbers of corners (P,), have no triangle."""
+    n_degenerate = int((counts < 3).sum())
+    if n_degenerate:
+        plural = "" if n_degenerate == 1 else "s"
+        notes.warn(f"{n_degenerate:,} face{plural} of fewer than 3 corners left out")
 
 
 def triangulate(
@@ -821,9 +975,7 @@ def triangulate(
     owners = []
     n_wrong = 0
     budget = MOST_WORK  # comparisons of points with ears, for all polygons
-    for count in np.unique(counts):  # polygons with equally many corners, in parallel
-        if count < 3:
-            continue
+    for count in np.unique(counts[counts >= 3]):  # equally many corners, in parallel
         polygons = np.flatnonzero(counts == count)
         corners = starts[polygons, None] + np.arange(count)
         equal_triangles, n_failed, n_compared = _triangulate_equal(
@@ -833,12 +985,27 @@ def triangulate(
         n_wrong = n_wrong + n_failed
         triangles.append(equal_triangles.reshape(-1, 3))
         owners.append(np.repeat(polygons, count - 2))
+    restored_triangles, owner = _restore_order(triangles, owners)
+    return restored_triangles, owner, n_wrong
+
+
+def _restore_order(
+    triangles: list[IntArray], owners: list[IntArray]
+) -> tuple[IntArray, IntArray]:
+    """Concatenate groups of triangles, sorted by their polygon.
+
+    Args:
+        triangles: the corners (T, 3) of the triangles of each group.
+        owners: the polygon (T,) of each triangle of each group.
+
+    Returns:
+        The corners of all triangles (T, 3), and the polygon of each (T,).
+    """
     if not owners:
-        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64), n_wrong
+        return np.zeros((0, 3), np.int64), np.zeros(0, np.int64)
     owner = np.concatenate(owners)
-    # Polygons were grouped by their number of corners; this restores their order.
     order = np.argsort(owner, kind="stable")
-    return np.concatenate(triangles)[order], owner[order], n_wrong
+    return np.concatenate(triangles)[order], owner[order]
 
 
 def _triangulate_equal(
@@ -859,17 +1026,11 @@ def _triangulate_equal(
         The triangles (P, n - 2, 3), the number of polygons that may be wrong, and the
         number of comparisons made.
     """
-    count = corners.shape[1]
-    fan_tips = corners[:, :1].repeat(count - 2, axis=1)
-    fans = np.stack([fan_tips, corners[:, 1:-1], corners[:, 2:]], axis=2)
-    if count == 3:  # a triangle is its own fan
+    fans = _make_fans(corners)
+    if corners.shape[1] == 3:  # a triangle is its own fan
         return fans, 0, 0
     projected = _project_to_planes(points[corners])
-    areas = _compute_doubled_areas(
-        projected[:, :1], projected[:, 1:-1], projected[:, 2:]
-    )
-    min_area = _MIN_AREA_FRACTION * np.abs(areas.sum(axis=1))[:, None]
-    concave = np.flatnonzero((areas <= min_area).any(axis=1))
+    concave = _find_concave_polygons(projected)
     if not len(concave):
         return fans, 0, 0
     ears, n_failed, n_compared = _cut_ears(projected[concave], budget)
@@ -878,6 +1039,21 @@ def _triangulate_equal(
     polygon_rows = np.arange(len(concave))[:, None, None]
     fans[concave] = corners[concave][polygon_rows, ears]
     return fans, n_failed, n_compared
+
+
+def _make_fans(corners: IntArray) -> IntArray:
+    """Divide polygons (P, n) into fans of triangles (P, n - 2, 3) from the first corner."""
+    fan_tips = corners[:, :1].repeat(corners.shape[1] - 2, axis=1)
+    return np.stack([fan_tips, corners[:, 1:-1], corners[:, 2:]], axis=2)
+
+
+def _find_concave_polygons(projected: Float64Array) -> IntArray:
+    """Return the indices of polygons (P, n, 2) with a fan triangle of no positive area."""
+    areas = _compute_doubled_areas(
+        projected[:, :1], projected[:, 1:-1], projected[:, 2:]
+    )
+    min_area = _MIN_AREA_FRACTION * np.abs(areas.sum(axis=1))[:, None]
+    return np.flatnonzero((areas <= min_area).any(axis=1))
 
 
 def _project_to_planes(corners: Float64Array) -> Float64Array:
@@ -908,6 +1084,17 @@ def _compute_doubled_areas(
     to_b = b - a
     to_c = c - a
     return np.asarray(to_b[..., 0] * to_c[..., 1] - to_b[..., 1] * to_c[..., 0])
+
+
+def _compute_doubled_polygon_areas(flat: Float64Array) -> Float64Array:
+    """Return twice the area of polygons with corners (P, n, 2), (P,).
+
+    The signed areas of the triangles between the origin and each side add up to it.
+    """
+    successors = np.roll(flat, -1, axis=1)
+    side_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
+    doubled_areas: Float64Array = np.abs(side_areas.sum(axis=1))
+    return doubled_areas
 
 
 class _EarCutter:
@@ -943,11 +1130,7 @@ class _EarCutter:
         self.tip = np.zeros(count, dtype=np.int64)
         self.n_tries = np.zeros(count, dtype=np.int64)
         self.is_failed = np.zeros(count, dtype=np.bool_)
-        # The signed areas of the triangles between the origin and each side add up to
-        # the area of the polygon.
-        successors = np.roll(flat, -1, axis=1)
-        doubled_areas = _compute_doubled_areas(flat, successors, np.zeros(2))
-        self.area = np.abs(doubled_areas.sum(axis=1))
+        self.area = _compute_doubled_polygon_areas(flat)
         self.dent, self.is_present = _find_dents(flat, self.area)
         self.dent_points = np.take_along_axis(flat, self.dent[:, :, None], axis=1)
         self.active = np.arange(count)
@@ -992,17 +1175,26 @@ class _EarCutter:
         is_cut = n_left == 3  # the last triangle
         is_hopeless = self.n_tries[active] >= n_left  # all corners were tried
         if self.n_compared < budget:
-            dent_points = self.dent_points[active]
-            # Each dent is compared with one triangle.
-            n_dents = dent_points.size // 2  # points have two coordinates
-            self.n_compared += n_dents
-            corners = [self.flat[active, corner] for corner in (a, b, c)]
-            min_area = _MIN_AREA_FRACTION * self.area[active]
-            is_cut |= _is_ear(corners, dent_points, self.is_present[active], min_area)
+            is_cut |= self._find_ears(a, b, c)
         else:  # the budget is spent: all others are cut off untested
             is_hopeless[:] = True
         self.is_failed[active] |= is_hopeless & ~is_cut
         return np.asarray(is_cut | is_hopeless)
+
+    def _find_ears(self, a: IntArray, b: IntArray, c: IntArray) -> BoolArray:
+        """Return which active polygons have an ear at b, and count the comparisons.
+
+        Args:
+            a, b, c: (active,) three successive corners of each active polygon.
+        """
+        active = self.active
+        dent_points = self.dent_points[active]
+        # Each dent is compared with one triangle.
+        n_dents = dent_points.size // 2  # points have two coordinates
+        self.n_compared += n_dents
+        corners = [self.flat[active, corner] for corner in (a, b, c)]
+        min_area = _MIN_AREA_FRACTION * self.area[active]
+        return _is_ear(corners, dent_points, self.is_present[active], min_area)
 
     def _cut(self, rows: IntArray, a: IntArray, b: IntArray, c: IntArray) -> None:
         """Cut an ear off each of some polygons.
@@ -1092,17 +1284,30 @@ def _is_ear(
         min_area: (P,) doubled area up to which a triangle is treated as having none.
     """
     is_ear: BoolArray = _compute_doubled_areas(*corners) > min_area
-    x = points[is_ear, :, 0]
-    y = points[is_ear, :, 1]
+    candidates = points[is_ear]
     is_inside = is_present[is_ear]
     for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-        # (E, 1) the ends of the side
-        x0 = start[is_ear, :1]
-        y0 = start[is_ear, 1:]
-        x1 = end[is_ear, :1]
-        y1 = end[is_ear, 1:]
-        is_inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
-        # A point at a corner of the triangle is not in it.
-        is_inside &= (x != x0) | (y != y0)
+        is_inside &= _is_left_of_side(candidates, start[is_ear], end[is_ear])
     is_ear[is_ear] = ~is_inside.any(axis=1)
     return is_ear
+
+
+def _is_left_of_side(
+    points: Float64Array, start: Float64Array, end: Float64Array
+) -> BoolArray:
+    """Return which points (E, n, 2) are left of a side or on it, but not at its start.
+
+    Args:
+        points: the points.
+        start, end: (E, 2) the ends of the side.
+    """
+    x = points[:, :, 0]
+    y = points[:, :, 1]
+    x0 = start[:, :1]
+    y0 = start[:, 1:]
+    x1 = end[:, :1]
+    y1 = end[:, 1:]
+    is_left: BoolArray = (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
+    # A point at a corner of the triangle is not in it.
+    is_left &= (x != x0) | (y != y0)
+    return is_left

@@ -46,6 +46,7 @@ file, but hundreds of bytes of memory.
 # sizes in a .glb file, bytes
 _FILE_HEADER_SIZE = 12
 _CHUNK_HEADER_SIZE = 8
+_JSON_START = _FILE_HEADER_SIZE + _CHUNK_HEADER_SIZE
 
 
 def read_header(path: Path, data: bytes) -> Header:
@@ -58,14 +59,7 @@ def read_header(path: Path, data: bytes) -> Header:
     """
     json_chunk, _ = _split_chunks(path, data)
     content = _parse_content(path, json_chunk)
-    try:
-        # `_parse_content` has checked that there is an asset.
-        version = Asset.model_validate(content["asset"]).version
-        if version.split(".")[0] != "2":
-            raise damaged(path, "glTF of version 2", f"version {format_name(version)}")
-        header = Header.model_validate(content)
-    except ValidationError as error:
-        raise _make_entry_error(path, error) from None
+    header = _validate_header(path, content)
     present_extensions = _find_extensions(path, content)
     _check_node_lights(path, header, content)
     # Some files use extensions without listing them. The notes about extensions need
@@ -74,6 +68,22 @@ def read_header(path: Path, data: bytes) -> Header:
     header = header.model_copy(update={"extensionsUsed": all_used})
     check_header(path, header)
     return header
+
+
+def _validate_header(path: Path, content: dict[str, Any]) -> Header:
+    """Return the header that JSON describes, whose version and types are checked.
+
+    Raises:
+        FileFormatError: it is of another version, or an entry is invalid.
+    """
+    try:
+        # `_parse_content` has checked that there is an asset.
+        version = Asset.model_validate(content["asset"]).version
+        if version.split(".")[0] != "2":
+            raise damaged(path, "glTF of version 2", f"version {format_name(version)}")
+        return Header.model_validate(content)
+    except ValidationError as error:
+        raise _make_entry_error(path, error) from None
 
 
 def _check_node_lights(path: Path, header: Header, content: dict[str, Any]) -> None:
@@ -100,13 +110,25 @@ def _check_node_lights(path: Path, header: Header, content: dict[str, Any]) -> N
 def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
     """Parse the JSON of a header, which must have an asset.
 
-    Before it is parsed, its size is limited: commas and opening brackets are counted,
-    which is an upper bound for the number of values.
-
     Raises:
         FileFormatError: it is too large, no JSON, or no glTF.
     """
     text = decode_text(chunk)
+    _check_header_size(path, text)
+    try:
+        content = parse_json(text)
+    except ValueError as error:
+        raise _make_json_error(path, chunk, error) from None
+    if not isinstance(content, dict) or "asset" not in content:
+        raise damaged(path, "glTF with an 'asset' entry", "other JSON")
+    return content
+
+
+def _check_header_size(path: Path, text: str) -> None:
+    """Check an upper bound for the number of values of a header, before it is parsed.
+
+    Commas and opening brackets are counted.
+    """
     # Each value follows a comma, or the bracket that begins its list or object.
     max_values = sum(text.count(character) for character in ",[{")
     check_most(
@@ -116,17 +138,21 @@ def _parse_content(path: Path, chunk: bytes) -> dict[str, Any]:
         "a glTF header of at most {} values",
         "more",
     )
-    try:
-        content = parse_json(text)
-    except ValueError as error:
-        got = detect_file_kind(chunk)  # such as a web page; None if unknown
-        if not got:
-            is_over_limit = isinstance(error, JsonBoundsError)
-            got = str(error) if is_over_limit else "something else"
-        raise damaged(path, "glTF with a JSON header", got) from None
-    if not isinstance(content, dict) or "asset" not in content:
-        raise damaged(path, "glTF with an 'asset' entry", "other JSON")
-    return content
+
+
+def _make_json_error(path: Path, chunk: bytes, error: ValueError) -> FileFormatError:
+    """Return the error for a header that cannot be parsed.
+
+    Args:
+        path: path of the file.
+        chunk: the header.
+        error: error of the parser.
+    """
+    got = detect_file_kind(chunk)  # such as a web page; None if unknown
+    if not got:
+        is_over_limit = isinstance(error, JsonBoundsError)
+        got = str(error) if is_over_limit else "something else"
+    return damaged(path, "glTF with a JSON header", got)
 
 
 def _make_entry_error(path: Path, error: ValidationError) -> FileFormatError:
@@ -173,17 +199,22 @@ def _find_extensions(path: Path, content: JsonValue) -> set[str]:
         if isinstance(entry, list):
             pending.extend(entry)
         elif isinstance(entry, dict):
-            entry_extensions = entry.get("extensions")
-            if entry_extensions is None:
-                entry_extensions = {}
-            if not _are_extensions(entry_extensions):
-                raise damaged(
-                    path,
-                    "glTF whose extensions are objects",
-                    format_name(json.dumps(entry_extensions)),
-                )
-            extensions.update(entry_extensions)
+            extensions.update(_get_extensions(path, entry))
             pending.extend(value for key, value in entry.items() if key != "extras")
+    return extensions
+
+
+def _get_extensions(path: Path, entry: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    """Return the extensions of an entry; raise FileFormatError if one is no object."""
+    extensions = entry.get("extensions")
+    if extensions is None:
+        return {}
+    if not _are_extensions(extensions):
+        raise damaged(
+            path,
+            "glTF whose extensions are objects",
+            format_name(json.dumps(extensions)),
+        )
     return extensions
 
 
@@ -197,30 +228,49 @@ def _split_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """
     if path.suffix.lower() == ".gltf":
         return data, None
-    has_magic = data.startswith(b"glTF")
-    json_start = _FILE_HEADER_SIZE + _CHUNK_HEADER_SIZE
-    if not has_magic or len(data) < json_start:
-        got = "the first few bytes of one" if has_magic else describe_content(data)
-        raise damaged(path, "a binary glTF file", got)
+    json_end, file_end = _find_json_end(path, data)
+    binary = _read_binary_chunk(data, json_end, file_end)
+    # Some writers pad the JSON with zeros.
+    return data[_JSON_START:json_end].rstrip(b"\0"), binary
+
+
+def _find_json_end(path: Path, data: bytes) -> tuple[int, int]:
+    """Return the end of the JSON of a .glb file, and the end of the file as it states.
+
+    Raises:
+        FileFormatError: it is no .glb of version 2, or shorter than it states.
+    """
+    _check_file_start(path, data)
     version, length, json_size, kind = struct.unpack_from("<4xIII4s", data)
     if version != 2:
         raise damaged(path, "binary glTF of version 2", f"version {version}")
-    if length > len(data):
-        raise damaged(
-            path,
-            f"{length} bytes, as its header states",
-            f"{len(data)}; the file is cut short",
-        )
-    json_end = json_start + json_size
+    _check_stated_length(path, length, data)
+    json_end = _JSON_START + json_size
     if kind != b"JSON" or json_end > length:
         raise damaged(
             path,
             "a chunk of JSON first",
             f"{json_size} bytes of {format_name(kind.decode('latin-1'))}",
         )
-    binary = _read_binary_chunk(data, json_end, length)
-    # Some writers pad the JSON with zeros.
-    return data[json_start:json_end].rstrip(b"\0"), binary
+    return json_end, length
+
+
+def _check_file_start(path: Path, data: bytes) -> None:
+    """Raise FileFormatError unless data begin as a .glb file does, up to its JSON."""
+    has_magic = data.startswith(b"glTF")
+    if not has_magic or len(data) < _JSON_START:
+        got = "the first few bytes of one" if has_magic else describe_content(data)
+        raise damaged(path, "a binary glTF file", got)
+
+
+def _check_stated_length(path: Path, length: int, data: bytes) -> None:
+    """Raise FileFormatError if a .glb file has fewer bytes than its header states."""
+    if length > len(data):
+        raise damaged(
+            path,
+            f"{length} bytes, as its header states",
+            f"{len(data)}; the file is cut short",
+        )
 
 
 def _read_binary_chunk(data: bytes, chunk_start: int, file_end: int) -> bytes | None:
@@ -281,6 +331,11 @@ def _check_references(path: Path, header: Header) -> None:
                 raise damaged(
                     path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}"
                 )
+    _check_channels(path, header)
+
+
+def _check_channels(path: Path, header: Header) -> None:
+    """Raise FileFormatError if a channel refers to a sampler that its clip lacks."""
     for animation in header.animations:
         sampler_indices = [channel.sampler_index for channel in animation.channels]
         max_index = max(sampler_indices, default=-1)
@@ -300,7 +355,20 @@ def check_header(path: Path, header: Header) -> None:
         FileFormatError: the header needs an extension that is not supported, refers to
             a missing entry, or is over a limit.
     """
-    # A file that requires an extension of its appearance is read without it.
+    _check_required_extensions(path, header)
+    _check_references(path, header)
+    _check_data_size(path, header)
+    for mesh in header.meshes:
+        for primitive in mesh.primitives:
+            _check_primitive(path, header, primitive)
+    _check_tree(path, header)
+
+
+def _check_required_extensions(path: Path, header: Header) -> None:
+    """Raise FileFormatError if a file cannot be read without an unsupported extension.
+
+    A file that requires an extension of its appearance is read without it.
+    """
     unsupported = sorted(
         name
         for name in header.extensionsRequired
@@ -309,26 +377,28 @@ def check_header(path: Path, header: Header) -> None:
     )
     if unsupported:
         raise _make_unsupported_error(path, unsupported)
-    _check_references(path, header)
-    accessor_sizes = (
-        entry.count
-        * entry.width
-        * np.dtype(_COMPONENT_TYPES[entry.componentType]).itemsize
-        for entry in header.accessors
-    )
+
+
+def _check_data_size(path: Path, header: Header) -> None:
+    """Raise FileFormatError if the views, or the accessors, of a file have too many bytes.
+
+    Both sums are limited. Accessors may share a view, or have none and be zeros, and
+    views may also hold images, so neither sum bounds the other.
+    """
     view_size = sum(view.byteLength for view in header.bufferViews)
-    # Both sums are limited. Accessors may share a view, or have none and be zeros, and
-    # views may also hold images, so neither sum bounds the other.
+    accessor_size = sum(map(_compute_accessor_size, header.accessors))
     check_most(
         path,
-        max(view_size, sum(accessor_sizes)),
+        max(view_size, accessor_size),
         MAX_DATA_SIZE,
         "geometry and pictures of at most {} bytes",
     )
-    for mesh in header.meshes:
-        for primitive in mesh.primitives:
-            _check_primitive(path, header, primitive)
-    _check_tree(path, header)
+
+
+def _compute_accessor_size(accessor: Accessor) -> int:
+    """Return the number of bytes of all values of an accessor."""
+    kind = np.dtype(_COMPONENT_TYPES[accessor.componentType])
+    return accessor.count * accessor.width * kind.itemsize
 
 
 def _make_unsupported_error(path: Path, names: Iterable[str]) -> FileFormatError:
@@ -368,18 +438,26 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     unsupported = find_unread_extensions(primitive)
     # Gaussian splats are left out with a note instead.
     may_be_compressed = unsupported and not any(map(is_splat_name, unsupported))
-    for accessor in (*attributes.values(), indices):
-        has_no_data = (
-            accessor is not None
-            and accessor.bufferView is None
-            and accessor.sparse is None
-        )
-        if has_no_data and may_be_compressed:  # with Draco, for example
-            raise _make_unsupported_error(path, unsupported)
-    if indices is not None and indices.type != "SCALAR":
+    accessors = (*attributes.values(), indices)
+    if may_be_compressed and any(map(_has_no_data, accessors)):  # Draco, for example
+        raise _make_unsupported_error(path, unsupported)
+    if indices is not None:
+        _check_indices(path, indices)
+
+
+def _has_no_data(accessor: Accessor | None) -> bool:
+    """Return whether an accessor exists but has neither a buffer view nor sparse values."""
+    return (
+        accessor is not None and accessor.bufferView is None and accessor.sparse is None
+    )
+
+
+def _check_indices(path: Path, indices: Accessor) -> None:
+    """Raise FileFormatError unless the accessor of indices has unsigned integers."""
+    if indices.type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", indices.type)
     # unsigned integers of 1, 2 and 4 bytes
-    if indices is not None and indices.componentType not in (5121, 5123, 5125):
+    if indices.componentType not in (5121, 5123, 5125):
         raise damaged(path, "indices that are unsigned integers", "other numbers")
 
 
@@ -401,25 +479,44 @@ def _check_attributes(
         FileFormatError: an attribute has a type that the format excludes, or its number
             of values is not that of the positions.
     """
+    for name, types in _find_valid_types(header, primitive).items():
+        if name in attributes:
+            _check_attribute(path, attributes, name, types)
+
+
+def _check_attribute(
+    path: Path, attributes: dict[str, Accessor], name: str, types: tuple[str, ...]
+) -> None:
+    """Check one attribute of a primitive, with the errors of `_check_attributes`.
+
+    Args:
+        path: path of the file, for messages.
+        attributes: accessors of all attributes, by name.
+        name: the attribute that is checked.
+        types: the types that the format allows for it.
+    """
+    accessor = attributes[name]
+    if accessor.type not in types:
+        raise damaged(path, f"{name} of type {' or '.join(types)}", accessor.type)
+    positions = attributes.get("POSITION")
+    if positions is not None and accessor.count != positions.count:
+        expected = f"as many values of {name} as of POSITION, {positions.count:,}"
+        raise damaged(path, expected, f"{accessor.count:,}")
+
+
+def _find_valid_types(
+    header: Header, primitive: Primitive
+) -> dict[str, tuple[str, ...]]:
+    """Return the types that the format allows for each attribute that is read."""
     uv_name = "TEXCOORD_0"
     if primitive.material is not None:
         uv_name = header.materials[primitive.material].uv_attribute
-    valid_types = {
+    return {
         "POSITION": ("VEC3",),
         "NORMAL": ("VEC3",),
         "COLOR_0": ("VEC3", "VEC4"),
         uv_name: ("VEC2",),
     }
-    positions = attributes.get("POSITION")
-    for name, types in valid_types.items():
-        if name not in attributes:
-            continue
-        accessor = attributes[name]
-        if accessor.type not in types:
-            raise damaged(path, f"{name} of type {' or '.join(types)}", accessor.type)
-        if positions is not None and accessor.count != positions.count:
-            expected = f"as many values of {name} as of POSITION, {positions.count:,}"
-            raise damaged(path, expected, f"{accessor.count:,}")
 
 
 def _check_tree(path: Path, header: Header) -> None:
@@ -469,16 +566,22 @@ def _check_tree_sizes(path: Path, header: Header) -> None:
         sum(_count_max_triangles(header, primitive) for primitive in mesh.primitives)
         for mesh in header.meshes
     ]
-    primitives_of_mesh = [len(mesh.primitives) for mesh in header.meshes]
-    instanced_meshes = [node.mesh for node in header.nodes if node.mesh is not None]
-    n_instanced_triangles = sum(triangles_of_mesh[mesh] for mesh in instanced_meshes)
+    n_instanced_triangles = _sum_over_nodes(header, triangles_of_mesh)
     check_faces(path, max(n_instanced_triangles, sum(triangles_of_mesh)))
-    n_instanced = sum(primitives_of_mesh[mesh] for mesh in instanced_meshes)
+    primitives_of_mesh = [len(mesh.primitives) for mesh in header.meshes]
+    n_instanced = _sum_over_nodes(header, primitives_of_mesh)
     check_most(
         path,
         max(n_instanced, sum(primitives_of_mesh), len(header.nodes)),
         LARGEST_TREE,
         "glTF of at most {} nodes and primitives",
+    )
+
+
+def _sum_over_nodes(header: Header, count_of_mesh: list[int]) -> int:
+    """Return the sum, over all nodes with a mesh, of a count that each mesh has."""
+    return sum(
+        count_of_mesh[node.mesh] for node in header.nodes if node.mesh is not None
     )
 
 
@@ -570,30 +673,34 @@ class GltfFile:
         Raises:
             FileFormatError: the buffer has no data, or its file is missing.
         """
-        if index in self._buffers:
-            return self._buffers[index]
+        if index not in self._buffers:
+            self._buffers[index] = self._read_buffer(index)
+        return self._buffers[index]
+
+    def _read_buffer(self, index: int) -> bytes:
+        """Read the bytes of a buffer, with the errors of `_load_buffer`."""
         uri = self.header.buffers[index].uri
         try:
             if uri is not None:
-                data = self.load_uri(uri)
-            elif index == 0 and self._chunk is not None:  # of a .glb file
-                data = self._chunk
-            else:
-                raise self._make_empty_buffer_error(index)
+                return self.load_uri(uri)
+            if index == 0 and self._chunk is not None:  # of a .glb file
+                return self._chunk
+            raise self._make_empty_buffer_error(index)
         except FileNotFoundError:
-            name = normalize_name(uri or "")
-            reason = self.references.refusal_by_name.get(name, "is missing")
-            message = (
-                f"{self.path}: needs {format_name(name)}, which {reason}; put that "
-                "file beside it"
-            )
-            raise FileFormatError(message) from None
+            raise self._make_missing_buffer_error(uri or "") from None
         except ValueError:
             raise damaged(
                 self.path, f"a buffer {index} in base64", "other text"
             ) from None
-        self._buffers[index] = data
-        return data
+
+    def _make_missing_buffer_error(self, uri: str) -> FileFormatError:
+        """Return the error for a buffer whose file is missing, or must not be read."""
+        name = normalize_name(uri)
+        reason = self.references.refusal_by_name.get(name, "is missing")
+        return FileFormatError(
+            f"{self.path}: needs {format_name(name)}, which {reason}; put that "
+            "file beside it"
+        )
 
     def _make_empty_buffer_error(self, index: int) -> FileFormatError:
         """Return the error for a buffer without data."""
@@ -620,24 +727,23 @@ class GltfFile:
         if index in self._sparse_filled:
             return self._sparse_filled[index]
         accessor = self.header.accessors[index]
-        values = np.zeros(
-            (accessor.count, accessor.width), _COMPONENT_TYPES[accessor.componentType]
-        )
-        if accessor.bufferView is not None and accessor.count:
-            stride = self.header.bufferViews[accessor.bufferView].byteStride
-            values = self._make_array(
-                accessor.bufferView,
-                accessor.byteOffset,
-                values.shape,
-                values.dtype,
-                stride,
-            )
+        values = self._read_dense_values(accessor)
         if accessor.sparse is None or not accessor.sparse.count:
             return values
         values = self._replace_rows(values, accessor, accessor.sparse)
         # Other values are views of the file's bytes, and need no cache.
         self._sparse_filled[index] = values
         return values
+
+    def _read_dense_values(self, accessor: Accessor) -> npt.NDArray[Any]:
+        """Return the values (count, width) of an accessor without its sparse values."""
+        shape = (accessor.count, accessor.width)
+        kind = np.dtype(_COMPONENT_TYPES[accessor.componentType])
+        view = accessor.bufferView
+        if view is None or not accessor.count:
+            return np.zeros(shape, kind)
+        stride = self.header.bufferViews[view].byteStride
+        return self._make_array(view, accessor.byteOffset, shape, kind, stride)
 
     def _replace_rows(
         self, dense_values: npt.NDArray[Any], accessor: Accessor, sparse: Sparse
@@ -653,34 +759,38 @@ class GltfFile:
             FileFormatError: there are too many sparse values, or they are for rows that
                 do not exist.
         """
-        sparse_indices = sparse.indices
         sparse_values = sparse.values
-        count = sparse.count
-        if count > accessor.count:
-            raise damaged(
-                self.path, f"at most {accessor.count:,} sparse values", f"{count:,}"
-            )
-        sparse_rows = self._make_array(
-            sparse_indices.bufferView,
-            sparse_indices.byteOffset,
-            (count, 1),
-            np.dtype(_COMPONENT_TYPES[sparse_indices.componentType]),
-        )[:, 0]
-        if sparse_rows.max() >= accessor.count:
-            raise damaged(
-                self.path,
-                f"sparse values at rows under {accessor.count:,}",
-                f"{int(sparse_rows.max()):,}",
-            )
+        sparse_rows = self._read_sparse_rows(sparse, accessor.count)
         # a copy, because `dense_values` may be a view of the file's bytes
         values = np.array(dense_values)
         values[sparse_rows] = self._make_array(
             sparse_values.bufferView,
             sparse_values.byteOffset,
-            (count, accessor.width),
+            (sparse.count, accessor.width),
             values.dtype,
         )
         return values
+
+    def _read_sparse_rows(self, sparse: Sparse, n_rows: int) -> npt.NDArray[Any]:
+        """Return the rows (S,) that sparse values replace, of an array of `n_rows`.
+
+        Raises:
+            FileFormatError: there are too many, or they do not exist.
+        """
+        indices = sparse.indices
+        count = sparse.count
+        if count > n_rows:
+            raise damaged(self.path, f"at most {n_rows:,} sparse values", f"{count:,}")
+        kind = np.dtype(_COMPONENT_TYPES[indices.componentType])
+        column = self._make_array(
+            indices.bufferView, indices.byteOffset, (count, 1), kind
+        )
+        sparse_rows = column[:, 0]
+        max_row = int(sparse_rows.max())
+        if max_row >= n_rows:
+            expected = f"sparse values at rows under {n_rows:,}"
+            raise damaged(self.path, expected, f"{max_row:,}")
+        return sparse_rows
 
     def _make_array(
         self,

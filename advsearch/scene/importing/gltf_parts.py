@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,6 +54,7 @@ from advsearch.scene.importing.parts import (
     clip_to_unit,
     compute_radiance,
     describe_substitute,
+    is_plain_white,
     make_normal_map,
     transform_part,
 )
@@ -140,11 +142,6 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
         For each kind a phrase, in which `{s}` is the ending of the plural, such as
         "occlusion map{s}: left out"; and for each entry whether it is left out.
     """
-    roots: Iterable[int] = range(len(header.nodes))
-    if header.scenes:
-        default_scene = header.scene or 0
-        roots = header.scenes[default_scene].nodes
-    scene_nodes = header.find_descendants(roots)  # with the roots themselves
     materials = header.materials
     # `shares_layout` returns whether a texture has the texture coordinates of the base
     # color. It is also True for a material without that texture.
@@ -156,22 +153,36 @@ def _find_left_out_entries(header: Header) -> dict[str, Iterable[bool]]:
             not material.shares_layout(material.normalTexture) for material in materials
         ),
         "emission texture{s} with other coordinates than the base colour: left out, "
-        "with the emission": (
-            any(material.emission)
-            and not material.shares_layout(material.emissiveTexture)
-            for material in materials
-        ),
+        "with the emission": map(_has_unreadable_emission, materials),
         "material{s} with an alphaMode that glTF does not have: opaque": (
             material.alphaMode not in ("OPAQUE", *TRANSPARENT_MODES)
             for material in materials
         ),
         "further scene{s}: left out": (True for _ in header.scenes[1:]),
-        "node{s} with a mesh outside of its scene: left out": (
-            node.mesh is not None
-            for index, node in enumerate(header.nodes)
-            if index not in scene_nodes
+        "node{s} with a mesh outside of its scene: left out": _list_has_mesh_outside(
+            header
         ),
     }
+
+
+def _has_unreadable_emission(material: MaterialEntry) -> bool:
+    """Return whether an emission has other texture coordinates than the base color."""
+    has_emission = any(material.emission)
+    return has_emission and not material.shares_layout(material.emissiveTexture)
+
+
+def _list_has_mesh_outside(header: Header) -> list[bool]:
+    """Return for each node outside of the default scene whether it has a mesh."""
+    roots: Iterable[int] = range(len(header.nodes))
+    if header.scenes:
+        default_scene = header.scene or 0
+        roots = header.scenes[default_scene].nodes
+    scene_nodes = header.find_descendants(roots)  # with the roots themselves
+    return [
+        node.mesh is not None
+        for index, node in enumerate(header.nodes)
+        if index not in scene_nodes
+    ]
 
 
 ENTRY_KINDS = {
@@ -208,7 +219,14 @@ def _note_unread(header: Header, notes: Notes) -> None:
         if kind is not None:
             for key in _find_unread_keys(entry):
                 notes.record(kind, key)
-    # Recorded keys that are also marked as read are not noted.
+    _mark_ignored_keys(notes)
+    for mesh in header.meshes:
+        for primitive in mesh.primitives:
+            _note_unread_attributes(header, primitive, notes)
+
+
+def _mark_ignored_keys(notes: Notes) -> None:
+    """Mark the keys that need no note as read, so that they are not noted."""
     for kind in set(ENTRY_KINDS.values()):
         ignored_keys = set(IGNORED_KEYS)
         # Extras of a material or a texture may change how it looks. Elsewhere they are
@@ -217,9 +235,6 @@ def _note_unread(header: Header, notes: Notes) -> None:
             ignored_keys.add("extras")
         for key in ignored_keys:
             notes.mark_read(kind, key)
-    for mesh in header.meshes:
-        for primitive in mesh.primitives:
-            _note_unread_attributes(header, primitive, notes)
 
 
 def _find_unread_keys(entry: Entry) -> list[str]:
@@ -330,6 +345,9 @@ BLURRED_NOTE = (
     "side are filtered"
 )
 
+NOT_REPEATED = (gltf_entries.CLAMPED, gltf_entries.BORDER, gltf_entries.MIRRORED)
+"""Wrap modes whose images end at their edges, or are mirrored there."""
+
 
 @dataclass
 class GltfSurfaces:
@@ -361,14 +379,24 @@ class GltfSurfaces:
             The surface; and the scale (2,) and shift (2,) by which a texture coordinate
             t of the file becomes scale * t + shift.
         """
-        material = MaterialEntry()
-        name = ""
-        if material_index is not None:
-            material = self.file.header.materials[material_index]
-            name = material.name or f"material {material_index}"
+        material, name = self._get_named_material(material_index)
+        surface = self._make_unfitted_surface(material, name, pieces)
+        uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
+        return self._fit_images(surface, material, uvs)
+
+    def _make_unfitted_surface(
+        self, material: MaterialEntry, name: str, pieces: Sequence[PrimitiveData]
+    ) -> ImportedSurface:
+        """Return the surface of a material, with its images as the file has them.
+
+        Args:
+            material: the material.
+            name: its name.
+            pieces: all primitives with the material.
+        """
         color, texture = self._make_base_color(material)
         roughness, metallic = self._compute_roughness_and_metallic(material, pieces)
-        surface = ImportedSurface(
+        return ImportedSurface(
             color=color,
             texture=texture,
             roughness=clip_to_unit(roughness),
@@ -377,9 +405,15 @@ class GltfSurfaces:
             emission=self._make_emission(material),
             name=name,
         )
-        uvs = [piece.part.uvs for piece in pieces if piece.part.uvs is not None]
-        fitted_surface, scale, shift = self._fit_images(surface, material, uvs)
-        return fitted_surface, scale, shift
+
+    def _get_named_material(
+        self, material_index: int | None
+    ) -> tuple[MaterialEntry, str]:
+        """Return a material and its name; None is the format's default, without name."""
+        if material_index is None:
+            return MaterialEntry(), ""
+        material = self.file.header.materials[material_index]
+        return material, material.name or f"material {material_index}"
 
     def _make_base_color(
         self, material: MaterialEntry
@@ -390,36 +424,50 @@ class GltfSurfaces:
         opacity, only for the alpha modes "MASK" and "BLEND". The color is None if it is
         plain white and the material names a texture, even if its file is missing.
         """
-        entry = material.metallic_roughness
-        stated_factor = entry.baseColorFactor
-        if stated_factor is None:
-            stated_factor = [1.0] * 4
-        factor = np.array(stated_factor, np.float32).clip(0, 1)
-        color_factor = factor[:3]
-        has_alpha = material.alphaMode in TRANSPARENT_MODES
-        # Factors are linear in glTF.
-        color = linear_to_srgb(color_factor)
+        factor = _get_base_color_factor(material)
+        opacity_factor = factor[3:]
+        color = linear_to_srgb(factor[:3])  # factors are linear in glTF
+        texture = self._make_base_texture(material, color, factor[:3])
+        base_color: Float32Array | None = color
+        has_texture = material.metallic_roughness.baseColorTexture is not None
+        if has_texture and is_plain_white(color):
+            base_color = None  # plain white does not change a texture
+        if material.alphaMode in TRANSPARENT_MODES:
+            # "BLEND" keeps partial opacity, "MASK" cuts out what is below the cutoff.
+            cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
+            base_color = apply_opacity(base_color, opacity_factor, cutoff)
+            texture = apply_opacity(texture, opacity_factor, cutoff)
+        return base_color, texture
+
+    def _make_base_texture(
+        self, material: MaterialEntry, color: Float32Array, factor: Float32Array
+    ) -> Float32Array | None:
+        """Return the texture of the base color, sRGB, times a linear factor (3,); or None.
+
+        `color` (3,) is the factor in sRGB.
+        """
+        texture = self._load_base_texture(material, color)
+        if texture is None or not (factor != 1.0).any():
+            return texture
+        return _multiply_colors(texture, factor)
+
+    def _load_base_texture(
+        self, material: MaterialEntry, color: Float32Array
+    ) -> Float32Array | None:
+        """Return the texture (H, W, 3 or 4) of the base color as the file has it, or None.
+
+        `color` is what is used instead, for the note if it cannot be read.
+        """
         image_kind: ImageKind = "colours"
-        if has_alpha:
+        if material.alphaMode in TRANSPARENT_MODES:
             image_kind = "colours and alpha"
-        texture = self._load_image(
-            entry.baseColorTexture,
+        return self._load_image(
+            material.metallic_roughness.baseColorTexture,
             image_kind,
             # The blank makes the file the subject: "chair.glb names the texture ...".
             f" names the texture {{name}}, which {{why}}; {describe_substitute(color)} "
             "is used instead",
         )
-        if texture is not None and (color_factor != 1.0).any():
-            texture = _multiply_colors(texture, color_factor)
-        base_color: Float32Array | None = color
-        if entry.baseColorTexture is not None and (color > 0.999).all():
-            base_color = None  # plain white does not change a texture
-        if has_alpha:
-            # "BLEND" keeps partial opacity, "MASK" cuts out what is below the cutoff.
-            cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
-            base_color = apply_opacity(base_color, factor[3:], cutoff)
-            texture = apply_opacity(texture, factor[3:], cutoff)
-        return base_color, texture
 
     def _make_normal_map(self, material: MaterialEntry) -> Float32Array | None:
         """Return the normal map (H, W, 3) of a material, or None."""
@@ -466,11 +514,8 @@ class GltfSurfaces:
         """
         entry = material.metallic_roughness
         use = entry.metallicRoughnessTexture
-        image = self._load_image(
-            use,
-            "numbers",
-            "the texture {name} of roughness and metallic {why}; it is left out",
-        )
+        note = "the texture {name} of roughness and metallic {why}; it is left out"
+        image = self._load_image(use, "numbers", note)
         if image is None or use is None:
             return entry.roughnessFactor, entry.metallicFactor
         self.notes.warn(
@@ -502,8 +547,13 @@ class GltfSurfaces:
         is_single_texel = texels is not None and texels.shape[:2] == (1, 1)
         if texels is None or not is_unfiltered or is_single_texel:
             return texels
-        # Texels are repeated until the longer side has up to this size. Then the texels
-        # of the result are so small that filtering is not visible.
+        return self._sharpen(texels)
+
+    def _sharpen(self, texels: Float32Array) -> Float32Array:
+        """Repeat texels (H, W, C), so that filtering is not visible, or note that it is.
+
+        Texels are repeated until the longer side has up to half the limit of a texture.
+        """
         max_sharp_size = min(self._images.max_side, TEXTURE_LIMIT) // 2
         repeats = max_sharp_size // max(texels.shape[:2])
         min_repeats = 2
@@ -533,21 +583,20 @@ class GltfSurfaces:
             )
             return None
         entry = self.file.header.images[image_index]
-        is_embedded = entry.uri is None or entry.uri.startswith("data:")
-        name = "(embedded)" if is_embedded else str(entry.uri)
-
-        def load_content() -> bytes:
-            """Return the bytes of the image's file; empty if it has none."""
-            if entry.uri is not None:
-                return self.file.load_uri(entry.uri)
-            if entry.bufferView is None:
-                return b""
-            return bytes(self.file.get_view_bytes(entry.bufferView))
-
         # Several textures may show the same image, a file or a buffer view. It is
         # decoded once.
         key = (entry.uri, entry.bufferView)
+        name = _name_image(entry)
+        load_content = partial(self._load_image_content, entry)
         return self._images.load_image(key, load_content, kind, name, note_template)
+
+    def _load_image_content(self, entry: gltf_entries.Image) -> bytes:
+        """Return the bytes of an image's file or buffer view; empty if it has none."""
+        if entry.uri is not None:
+            return self.file.load_uri(entry.uri)
+        if entry.bufferView is None:
+            return b""
+        return bytes(self.file.get_view_bytes(entry.bufferView))
 
     def _get_sampler(self, use: TextureInfo) -> Sampler:
         """Return the sampler of a texture, which has defaults if the file states none."""
@@ -575,34 +624,33 @@ class GltfSurfaces:
         Returns:
             The surface, and the scale (2,) and shift (2,) of texture coordinates.
         """
-        # An empty array is added, since none at all cannot be concatenated.
-        all_uvs = np.concatenate([*uvs, np.zeros((0, 2))])
         scale = np.ones(2)
         shift = np.zeros(2)
         images = list(surface.images)
-        if not images or not len(all_uvs) or not np.isfinite(all_uvs).all():
+        uv_bounds = _compute_uv_bounds(uvs)
+        if not images or uv_bounds is None:
             return surface, scale, shift
-        # `images` has the texture first, if there is one, then the normal map, then the
-        # emission.
-        normals_index = None
-        if surface.normal_map is not None:
-            normals_index = 0 if surface.texture is None else 1
-        samplers = self._list_samplers(material)
-        wraps_by_axis = (
-            [sampler.wrapS for sampler in samplers],
-            [sampler.wrapT for sampler in samplers],
-        )
+        wraps_by_axis = self._list_wraps_by_axis(material)
         for axis, wraps in enumerate(wraps_by_axis):
-            axis_uvs = all_uvs[:, axis]
             # u, the first coordinate, runs along the second axis of an image.
             images, scale[axis], shift[axis] = self._fit_axis(
                 images,
                 axis=1 - axis,
                 wraps=wraps,
-                bounds=(float(axis_uvs.min()), float(axis_uvs.max())),
-                normals_index=normals_index,
+                bounds=uv_bounds[axis],
+                normals_index=_find_normals_index(surface),
             )
         return surface.with_images(images), scale, shift
+
+    def _list_wraps_by_axis(
+        self, material: MaterialEntry
+    ) -> tuple[list[int], list[int]]:
+        """Return the wrap modes along u, and along v, of a material's textures."""
+        samplers = self._list_samplers(material)
+        return (
+            [sampler.wrapS for sampler in samplers],
+            [sampler.wrapT for sampler in samplers],
+        )
 
     def _list_samplers(self, material: MaterialEntry) -> list[Sampler]:
         """Return the samplers of a material's textures that are read.
@@ -659,18 +707,8 @@ class GltfSurfaces:
             # texels are small enough, that is not visible.
             images = [_enlarge(image, axis) for image in images]
         if first_wrap == gltf_entries.MIRRORED and reaches_out:
-            # The image and its mirror image: old coordinates cover the first half.
-            mirrored = [
-                np.concatenate([image, np.flip(image, axis)], axis=axis)
-                for image in images
-            ]
-            return mirrored, 0.5, 0.0
-        is_not_repeated = first_wrap in (
-            gltf_entries.CLAMPED,
-            gltf_entries.BORDER,
-            gltf_entries.MIRRORED,
-        )
-        if is_not_repeated and (reaches_out or edges_differ):
+            return [_append_mirror_image(image, axis) for image in images], 0.5, 0.0
+        if first_wrap in NOT_REPEATED and (reaches_out or edges_differ):
             return self._pad_images(images, axis, bounds, normals_index, has_border)
         return images, 1.0, 0.0
 
@@ -701,37 +739,79 @@ class GltfSurfaces:
             becomes that of the padded one, scale * t + shift.
         """
         sizes = [image.shape[axis] for image in images]
-        # All images have the same texture coordinates, so that their pads must be the
-        # same fraction of an image. A pad must also be an integer number of texels. So
-        # pads are measured in units: each image is divided into the same number of
-        # units, the greatest common divisor of the sizes.
-        n_units = int(np.gcd.reduce(sizes))
-        units_before, units_after = _count_pad_units(n_units, bounds)
-        padded_units = n_units + units_before + units_after
-        max_unit_texels = max(sizes) // n_units
-        if padded_units * max_unit_texels > 2 * self._images.max_side:
+        units = _count_units(sizes, bounds)
+        if units.padded * (max(sizes) // units.image) > 2 * self._images.max_side:
             self.notes.warn_that_file(EDGES_NOTE)
             return images, 1.0, 0.0
+        borders = _list_borders(len(images), normals_index, has_border)
         padded = []
-        for index, image in enumerate(images):
-            border = None
-            if has_border:
-                is_normal_map = index == normals_index
-                border = FLAT_TEXEL if is_normal_map else np.zeros(1, np.float32)
-            unit_texels = sizes[index] // n_units
-            padded.append(
-                _pad(
-                    image,
-                    axis,
-                    before=units_before * unit_texels,
-                    after=units_after * unit_texels,
-                    border=border,
-                )
-            )
-        # The old image covers `n_units` of the padded one, after `units_before`.
-        scale = n_units / padded_units
-        shift = units_before / padded_units
+        for image, border in zip(images, borders, strict=True):
+            unit = image.shape[axis] // units.image  # in texels of this image
+            pads = (units.before * unit, units.after * unit)
+            padded.append(_pad(image, axis, *pads, border))
+        scale = units.image / units.padded
+        shift = units.before / units.padded
         return padded, scale, shift
+
+
+def _name_image(entry: gltf_entries.Image) -> str:
+    """Return the URI of an image's file, or "(embedded)" if the image is in the file."""
+    is_embedded = entry.uri is None or entry.uri.startswith("data:")
+    return "(embedded)" if is_embedded else str(entry.uri)
+
+
+def _compute_uv_bounds(
+    uvs: Sequence[Float64Array],
+) -> list[tuple[float, float]] | None:
+    """Return the smallest and the largest u, and the smallest and the largest v.
+
+    `uvs` are texture coordinates (V, 2) of several primitives. The result is None if
+    there are none, or if one is NaN or infinite.
+    """
+    # An empty array is added, since none at all cannot be concatenated.
+    all_uvs = np.concatenate([*uvs, np.zeros((0, 2))])
+    if not len(all_uvs) or not np.isfinite(all_uvs).all():
+        return None
+    return [(float(column.min()), float(column.max())) for column in all_uvs.T]
+
+
+def _list_borders(
+    n_images: int, normals_index: int | None, has_border: bool
+) -> list[Float32Array | None]:
+    """Return the texel (1,) or (C,) beyond the edges of each image; see `_pad_images`.
+
+    All are None if images have no border.
+    """
+    if not has_border:
+        return [None] * n_images
+    borders: list[Float32Array | None] = [np.zeros(1, np.float32)] * n_images
+    if normals_index is not None:
+        borders[normals_index] = FLAT_TEXEL
+    return borders
+
+
+def _get_base_color_factor(material: MaterialEntry) -> Float32Array:
+    """Return the linear factor (4,) of a base color and its opacity, in [0, 1]."""
+    stated_factor = material.metallic_roughness.baseColorFactor
+    if stated_factor is None:
+        stated_factor = [1.0] * 4
+    factor: Float32Array = np.array(stated_factor, np.float32)
+    return factor.clip(0, 1)
+
+
+def _find_normals_index(surface: ImportedSurface) -> int | None:
+    """Return the index of the normal map in a surface's images; None if it has none.
+
+    The images are the texture, if there is one, then the normal map, then the emission.
+    """
+    if surface.normal_map is None:
+        return None
+    return 0 if surface.texture is None else 1
+
+
+def _append_mirror_image(image: Float32Array, axis: int) -> Float32Array:
+    """Return an image and its mirror image along an axis: old UVs cover the first half."""
+    return np.concatenate([image, np.flip(image, axis)], axis=axis)
 
 
 def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Array:
@@ -740,21 +820,45 @@ def _multiply_colors(texture: Float32Array, factor: Float32Array) -> Float32Arra
     return np.concatenate([linear_to_srgb(linear), texture[:, :, 3:]], axis=2)
 
 
-def _count_pad_units(n_units: int, bounds: tuple[float, float]) -> tuple[int, int]:
-    """Return how many units the pads before and after an image need.
+class _PadUnits(NamedTuple):
+    """Lengths along an axis of images and their pads, in units.
 
-    An image covers the texture coordinates from 0 to 1, and is divided into units of
-    equal length. Pads reach as far as texture coordinates, and one unit farther, so
-    that filtering does not reach beyond them.
+    All images of a surface have the same texture coordinates, so that their pads must
+    be the same fraction of an image. A pad must also be an integer number of texels. So
+    each image is divided into the same number of units, the greatest common divisor of
+    the sizes.
+
+    Attributes:
+        image: number of units of each image.
+        before: number of units of the pad before it.
+        after: number of units of the pad after it.
+    """
+
+    image: int
+    before: int
+    after: int
+
+    @property
+    def padded(self) -> int:
+        """Number of units of an image with its pads."""
+        return self.image + self.before + self.after
+
+
+def _count_units(sizes: list[int], bounds: tuple[float, float]) -> _PadUnits:
+    """Return the units of images and of the pads that they need.
+
+    An image covers the texture coordinates from 0 to 1. Pads reach as far as texture
+    coordinates, and one unit farther, so that filtering does not reach beyond them.
 
     Args:
-        n_units: number of units of the image.
+        sizes: number of texels of each image along an axis.
         bounds: smallest and largest texture coordinate.
     """
+    n_units = int(np.gcd.reduce(sizes))
     min_uv, max_uv = bounds
     units_before = max(0, int(np.ceil(-min_uv * n_units))) + 1
     units_after = max(0, int(np.ceil((max_uv - 1.0) * n_units))) + 1
-    return units_before, units_after
+    return _PadUnits(n_units, units_before, units_after)
 
 
 def _average_where_visible(
@@ -775,14 +879,13 @@ def _average_where_visible(
     ]
     if not mapped_parts:
         return np.asarray(image.mean(axis=(0, 1), dtype=np.float64), np.float32)
-    corner_uvs = np.concatenate(
-        # v points down in the file, and up in `average_over_faces`: it becomes 1 - v.
-        [uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped_parts]
-    )
-    area_vectors = compute_area_vectors(
-        np.concatenate([part.vertices[part.faces] for part, _ in mapped_parts])
-    )
-    return average_over_faces(image, corner_uvs, np.linalg.norm(area_vectors, axis=1))
+    # v points down in the file, and up in `average_over_faces`: it becomes 1 - v.
+    corner_uvs = [
+        uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped_parts
+    ]
+    corners = [part.vertices[part.faces] for part, _ in mapped_parts]
+    areas = np.linalg.norm(compute_area_vectors(np.concatenate(corners)), axis=1)
+    return average_over_faces(image, np.concatenate(corner_uvs), areas)
 
 
 def _edges_differ(image: Float32Array, axis: int) -> bool:
@@ -829,6 +932,12 @@ def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
     factor = -(-SMALL_IMAGE_SIZE // size)
     if factor == 1:
         return picture
+    return _interpolate_texels(picture, axis, factor)
+
+
+def _interpolate_texels(picture: Float32Array, axis: int, factor: int) -> Float32Array:
+    """Interpolate an image linearly to `factor` times as many texels along an axis."""
+    size = picture.shape[axis]
     # Positions of the new texels' centers, in units of old texels. The centers of old
     # texels are at integers.
     position = ((np.arange(size * factor) + 0.5) / factor - 0.5).clip(0.0, size - 1.0)
@@ -837,10 +946,9 @@ def _enlarge(picture: Float32Array, axis: int) -> Float32Array:
     shape[axis] = -1
     fraction = (position - lower).reshape(shape).astype(np.float32)
     upper = np.minimum(lower + 1, size - 1)
-    return np.asarray(
-        np.take(picture, lower, axis) * (1.0 - fraction)
-        + np.take(picture, upper, axis) * fraction
-    )
+    enlarged: Float32Array = np.take(picture, lower, axis) * (1.0 - fraction)
+    enlarged = enlarged + np.take(picture, upper, axis) * fraction
+    return enlarged
 
 
 # ---- Primitives ----
@@ -905,16 +1013,10 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         FileFormatError: the file is corrupt, or no primitive has faces.
     """
     file = GltfFile(path, data)
-    header = file.header
-    instances = _list_instances(header)
+    instances = _list_instances(file.header)
     mesh_nodes = [instance.node for instance in instances]
     target_counts = gltf_skeleton.count_targets(file, mesh_nodes)
-    pieces = _read_pieces(file, mesh_nodes)
-    with_faces = _select_with_faces(pieces)
-    if not with_faces:
-        raise _make_no_faces_error(path, header, has_primitives=bool(pieces))
-    note_skipped_contents(header, notes)
-    _note_pieces(header, keys=list(pieces), with_faces=with_faces, notes=notes)
+    with_faces = _read_pieces_with_faces(file, mesh_nodes, notes)
     parts_by_key = _make_parts(GltfSurfaces(file, notes), with_faces)
     skins = _read_skins(file, mesh_nodes)
     skeleton = gltf_skeleton.read_skeleton(file, target_counts)
@@ -925,6 +1027,24 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     # The faces of a mesh count once for each node that draws it.
     check_faces(path, sum(len(part.faces) for part in parts))
     return parts
+
+
+def _read_pieces_with_faces(
+    file: GltfFile, mesh_nodes: Sequence[int], notes: Notes
+) -> dict[PrimitiveKey, PrimitiveData]:
+    """Read the primitives with faces that nodes draw, and note what else the file has.
+
+    Raises:
+        FileFormatError: no primitive has faces.
+    """
+    header = file.header
+    pieces = _read_pieces(file, mesh_nodes)
+    with_faces = _select_with_faces(pieces)
+    if not with_faces:
+        raise _make_no_faces_error(file.path, header, has_primitives=bool(pieces))
+    note_skipped_contents(header, notes)
+    _note_pieces(header, keys=list(pieces), with_faces=with_faces, notes=notes)
+    return with_faces
 
 
 class SkinPose(NamedTuple):
@@ -950,23 +1070,25 @@ def _read_pieces(
     """
     header = file.header
     meshes = dict.fromkeys(header.nodes[node].mesh for node in mesh_nodes)
-    skinned_meshes = {
-        header.nodes[node].mesh
-        for node in mesh_nodes
-        if header.nodes[node].skin is not None
-    }
+    skinned_meshes = _find_skinned_meshes(header, mesh_nodes)
     pieces = dict[PrimitiveKey, PrimitiveData | None]()
     for mesh in meshes:
         assert mesh is not None  # for mypy: these nodes have meshes
         entry = header.meshes[mesh]
+        is_skinned = mesh in skinned_meshes
         for index, primitive in enumerate(entry.primitives):
-            pieces[mesh, index] = read_primitive(
-                file,
-                primitive,
-                mesh_extras=entry.extras,
-                is_skinned=mesh in skinned_meshes,
-            )
+            piece = read_primitive(file, primitive, entry.extras, is_skinned)
+            pieces[mesh, index] = piece
     return pieces
+
+
+def _find_skinned_meshes(header: Header, mesh_nodes: Sequence[int]) -> set[int | None]:
+    """Return the meshes that some node with a skin draws."""
+    return {
+        header.nodes[node].mesh
+        for node in mesh_nodes
+        if header.nodes[node].skin is not None
+    }
 
 
 def _make_no_faces_error(
@@ -998,26 +1120,39 @@ def _note_pieces(
         notes: notes about the file, to which sentences are added.
     """
     primitives = [header.meshes[mesh].primitives[index] for mesh, index in keys]
-    # Gaussian splats have no faces either, but are noted in `_note_extensions`.
+    _note_without_faces(primitives, len(with_faces), notes)
+    transparent_meshes = {
+        mesh for (mesh, _), piece in with_faces.items() if piece.has_transparent_colors
+    }
+    _note_meshes(transparent_meshes, TRANSPARENT_COLORS_NOTE, notes)
+    meshes_without_material = {
+        mesh for (mesh, _), piece in with_faces.items() if piece.material_index is None
+    }
+    _note_meshes(meshes_without_material, DEFAULT_MATERIAL_NOTE, notes)
+
+
+def _note_meshes(meshes: set[int], phrase: str, notes: Notes) -> None:
+    """Note the number of meshes, if any, with a phrase as `_format_count` takes it."""
+    if meshes:
+        notes.warn(_format_count(len(meshes), phrase))
+
+
+def _note_without_faces(
+    primitives: Sequence[Primitive], n_with_faces: int, notes: Notes
+) -> None:
+    """Note how many primitives have no faces, without those of Gaussian splats.
+
+    Splats have no faces either, but are noted in `_note_extensions`.
+    """
     n_splats = sum(
         any(map(is_splat_name, find_unread_extensions(primitive)))
         for primitive in primitives
     )
-    n_without_faces = len(keys) - len(with_faces) - n_splats
+    n_without_faces = len(primitives) - n_with_faces - n_splats
     if n_without_faces:
         notes.warn(
             f"{n_without_faces} parts without faces (points, lines) are left out"
         )
-    transparent_meshes = {
-        mesh for (mesh, _), piece in with_faces.items() if piece.has_transparent_colors
-    }
-    meshes_without_material = {
-        mesh for (mesh, _), piece in with_faces.items() if piece.material_index is None
-    }
-    if transparent_meshes:
-        notes.warn(_format_count(len(transparent_meshes), TRANSPARENT_COLORS_NOTE))
-    if meshes_without_material:
-        notes.warn(_format_count(len(meshes_without_material), DEFAULT_MATERIAL_NOTE))
 
 
 def _make_parts(
@@ -1039,12 +1174,22 @@ def _make_parts(
     for material, group in groups.items():
         surface, scale, shift = surfaces.make_surface(material, list(group.values()))
         for key, piece in group.items():
-            uvs = piece.part.uvs
-            if uvs is not None:
-                # v points down in the file, and up in a part: it becomes 1 - v.
-                uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
+            uvs = _convert_uvs(piece.part.uvs, scale, shift)
             parts[key] = replace(piece.part, surface=surface, uvs=uvs)
     return parts
+
+
+def _convert_uvs(
+    uvs: Float64Array | None, scale: Float64Array, shift: Float64Array
+) -> Float64Array | None:
+    """Return UVs (V, 2) of a part: scaled and shifted, with v that points up; or None.
+
+    v points down in the file: it becomes 1 - v.
+    """
+    if uvs is None:
+        return None
+    converted_uvs: Float64Array = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
+    return converted_uvs
 
 
 def _read_skins(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, SkinPose]:
@@ -1108,22 +1253,35 @@ def _pose_parts(
     for node, mesh, pose in instances:
         skin_index = file.header.nodes[node].skin
         skin = None if skin_index is None else skins[skin_index]
-        for primitive_index in range(len(file.header.meshes[mesh].primitives)):
-            key = (mesh, primitive_index)
-            if key not in parts_by_key:
-                continue  # it has no faces
-            vertex_joints = with_faces[key].vertex_joints
+        for key in _list_keys_with_faces(file.header, mesh, parts_by_key):
+            piece = with_faces[key]
             part = parts_by_key[key]
             if skeleton is not None:
-                part = _make_movable(file, part, with_faces[key], node, skin, skeleton)
-            if skin is None or vertex_joints is None:
-                part = transform_part(part, pose)
-            else:
-                part = gltf_skeleton.pose_part(
-                    file.path, part, vertex_joints, skin.matrices
-                )
-            parts.append(replace(part, node=node))
+                part = _make_movable(file, part, piece, node, skin, skeleton)
+            posed = _pose_part(file.path, part, piece.vertex_joints, skin, pose)
+            parts.append(replace(posed, node=node))
     return parts
+
+
+def _list_keys_with_faces(
+    header: Header, mesh: int, parts_by_key: Mapping[PrimitiveKey, ImportedPart]
+) -> list[PrimitiveKey]:
+    """Return the keys of the primitives of a mesh that are parts, in the file's order."""
+    indices = range(len(header.meshes[mesh].primitives))
+    return [(mesh, index) for index in indices if (mesh, index) in parts_by_key]
+
+
+def _pose_part(
+    path: Path,
+    part: ImportedPart,
+    vertex_joints: gltf_skeleton.VertexJoints | None,
+    skin: SkinPose | None,
+    node_pose: Float64Array,
+) -> ImportedPart:
+    """Return a part as its joints pose it, or its node if it has no skin or no joints."""
+    if skin is None or vertex_joints is None:
+        return transform_part(part, node_pose)
+    return gltf_skeleton.pose_part(path, part, vertex_joints, skin.matrices)
 
 
 def _make_movable(
@@ -1144,31 +1302,58 @@ def _make_movable(
         skin: skin of the node; None if it has none.
         skeleton: skeleton of the file.
     """
-    # Without a skin, all vertices are bound to the node itself.
-    joints = np.zeros((len(part.vertices), 1), np.int64)
-    vertex_joints = gltf_skeleton.VertexJoints(joints, np.ones(joints.shape))
-    joint_nodes = np.array([node])
-    inverse_binds = np.eye(4)[None]
+    targets = piece.morph_targets
+    rest_weights = gltf_skeleton.read_rest_weights(file, node, len(targets))
+    movable = _bind_to_node(part.vertices, targets, rest_weights, node, skeleton)
     if skin is not None and piece.vertex_joints is not None:
-        vertex_joints = piece.vertex_joints
-        joint_nodes = skin.joint_nodes
-        inverse_binds = skin.inverse_binds
-    rest_weights = gltf_skeleton.read_rest_weights(file, node, len(piece.morph_targets))
-    movable = Movable(
-        skeleton=skeleton,
-        node=node,
-        vertices=part.vertices,
-        joint_nodes=joint_nodes,
-        inverse_binds=inverse_binds,
-        joints=vertex_joints.joints,
-        weights=vertex_joints.weights,
-        targets=piece.morph_targets,
-        rest_weights=rest_weights,
-    )
+        movable = _bind_to_skin(movable, skin, piece.vertex_joints)
     morphed = gltf_skeleton.apply_morph_targets(
-        part, piece.morph_targets, piece.normal_offsets, rest_weights
+        part, targets, piece.normal_offsets, rest_weights
     )
     return replace(morphed, movable=movable)
+
+
+def _bind_to_node(
+    vertices: Float64Array,
+    targets: tuple[MorphTarget, ...],
+    rest_weights: Float64Array,
+    node: int,
+    skeleton: Skeleton,
+) -> Movable:
+    """Return the data that moves a part without a skin: its node is its only joint.
+
+    Args:
+        vertices: (V, 3) in the node's coordinates.
+        targets: T morph targets.
+        rest_weights: (T,) weights of the targets at rest.
+        node: index of the node.
+        skeleton: skeleton of the file.
+    """
+    n_vertices = len(vertices)
+    return Movable(
+        skeleton=skeleton,
+        node=node,
+        vertices=vertices,
+        joint_nodes=np.array([node]),
+        inverse_binds=np.eye(4)[None],
+        joints=np.zeros((n_vertices, 1), np.int64),
+        weights=np.ones((n_vertices, 1)),
+        targets=targets,
+        rest_weights=rest_weights,
+    )
+
+
+def _bind_to_skin(
+    movable: Movable, skin: SkinPose, vertex_joints: gltf_skeleton.VertexJoints
+) -> Movable:
+    """Return the data that moves a part, with its vertices bound to a skin's joints."""
+    return replace(
+        movable,
+        joint_nodes=skin.joint_nodes,
+        inverse_binds=skin.inverse_binds,
+        joints=vertex_joints.joints,
+        weights=vertex_joints.weights,
+    )
 
 
 class PrimitiveData(NamedTuple):
@@ -1251,31 +1436,18 @@ def read_primitive(
         return None
     used, faces = _find_used_vertices(file, primitive)
     positions = file.read_float_rows(attributes["POSITION"], used)
-    material = MaterialEntry()
-    if primitive.material is not None:
-        material = file.header.materials[primitive.material]
+    material = _get_primitive_material(file.header, primitive)
     uvs = _read_texture_coordinates(file, attributes, material.layout_texture, used)
     roughness_uvs = _read_roughness_coordinates(file, attributes, material, used)
     colors, has_alpha = _read_vertex_colors(file, attributes, used, faces)
-    normals = None
-    if "NORMAL" in attributes:
-        normals = file.read_float_rows(attributes["NORMAL"], used)
+    normals = _read_stated_normals(file, attributes, used)
     vertex_joints = None
     if is_skinned:
         vertex_joints = gltf_skeleton.read_vertex_joints(file, primitive, used)
     targets, normal_offsets = gltf_skeleton.read_morph_targets(
         file, primitive, used, mesh_extras
     )
-    # Primitives with the same material share a surface, which `_make_parts` adds.
-    part = ImportedPart(
-        vertices=positions,
-        faces=faces,
-        normals=normals,
-        uvs=uvs,
-        colors=colors,
-        surface=ImportedSurface(),
-        flat=True,  # as glTF shades faces without normals
-    )
+    part = _make_part_without_surface(positions, faces, normals, uvs, colors)
     return PrimitiveData(
         part=part,
         material_index=primitive.material,
@@ -1284,6 +1456,47 @@ def read_primitive(
         morph_targets=targets,
         normal_offsets=normal_offsets,
         roughness_uvs=roughness_uvs,
+    )
+
+
+def _get_primitive_material(header: Header, primitive: Primitive) -> MaterialEntry:
+    """Return the material of a primitive; the format's default if it names none."""
+    if primitive.material is None:
+        return MaterialEntry()
+    return header.materials[primitive.material]
+
+
+def _read_stated_normals(
+    file: GltfFile, attributes: Mapping[str, int], used: IntArray
+) -> Float64Array | None:
+    """Return the normals (V, 3) of used vertices (V,); None if the primitive has none.
+
+    `attributes` are the indices of its accessors, by name.
+    """
+    if "NORMAL" not in attributes:
+        return None
+    return file.read_float_rows(attributes["NORMAL"], used)
+
+
+def _make_part_without_surface(
+    positions: Float64Array,
+    faces: IntArray,
+    normals: Float64Array | None,
+    uvs: Float64Array | None,
+    colors: Float64Array | None,
+) -> ImportedPart:
+    """Return the geometry of a primitive, to which `_make_parts` adds the surface.
+
+    Primitives with the same material share a surface.
+    """
+    return ImportedPart(
+        vertices=positions,
+        faces=faces,
+        normals=normals,
+        uvs=uvs,
+        colors=colors,
+        surface=ImportedSurface(),
+        flat=True,  # as glTF shades faces without normals
     )
 
 
@@ -1302,6 +1515,18 @@ def _find_used_vertices(
     Raises:
         FileFormatError: a face refers to a vertex that does not exist.
     """
+    order = _read_vertex_order(file, primitive)
+    triangles = _make_triangles(order, primitive.mode)
+    used_vertices, corners = np.unique(triangles, return_inverse=True)
+    return used_vertices, corners.reshape(-1, 3).astype(np.int64)
+
+
+def _read_vertex_order(file: GltfFile, primitive: Primitive) -> IntArray:
+    """Return the vertices in the order in which a primitive lists them.
+
+    Raises:
+        FileFormatError: one does not exist.
+    """
     count = file.header.accessors[primitive.attributes["POSITION"]].count
     order = np.arange(count)
     if primitive.indices is not None:
@@ -1312,10 +1537,7 @@ def _find_used_vertices(
             "faces of its own vertices",
             "a face that refers to a vertex that does not exist",
         )
-    used_vertices, corners = np.unique(
-        _make_triangles(order, primitive.mode), return_inverse=True
-    )
-    return used_vertices, corners.reshape(-1, 3).astype(np.int64)
+    return order
 
 
 def _read_texture_coordinates(
@@ -1345,9 +1567,13 @@ def _read_texture_coordinates(
         # header, and other textures can be left out.
         return None
     uvs = file.read_float_rows(attributes[name], used)
-    if use is None:
-        return uvs
-    transform = use.transform
+    return uvs if use is None else _apply_texture_transform(uvs, use.transform)
+
+
+def _apply_texture_transform(
+    uvs: Float64Array, transform: gltf_entries.TextureTransform
+) -> Float64Array:
+    """Return UVs (N, 2) scaled, rotated, then shifted by a texture's transform."""
     sine = np.sin(transform.rotation)
     cosine = np.cos(transform.rotation)
     u, v = (uvs * transform.scale).T

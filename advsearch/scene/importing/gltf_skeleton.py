@@ -115,7 +115,22 @@ def read_vertex_joints(
         FileFormatError: the number of joints is not that of the vertices, or joints
             have no weights.
     """
-    # A file has sets of four joints and weights a vertex: JOINTS_0, JOINTS_1, ...
+    sets = _read_joint_sets(file, primitive, used)
+    if not sets:
+        return None
+    joints = np.concatenate([joint_set.joints for joint_set in sets], axis=1)
+    weights = np.concatenate([joint_set.weights for joint_set in sets], axis=1)
+    return VertexJoints(joints, _normalize_weights(weights))
+
+
+def _read_joint_sets(
+    file: GltfFile, primitive: Primitive, used: IntArray
+) -> list[VertexJoints]:
+    """Return the sets of four joints and weights of used vertices: JOINTS_0, JOINTS_1, ...
+
+    Raises:
+        FileFormatError: there are too many sets, or a set is wrong.
+    """
     sets = list[VertexJoints]()
     while f"JOINTS_{len(sets)}" in primitive.attributes:
         if len(sets) == MAX_JOINT_SETS:
@@ -123,19 +138,20 @@ def read_vertex_joints(
                 file.path, f"at most {4 * MAX_JOINT_SETS} joints of each vertex", "more"
             )
         sets.append(_read_joint_set(file, primitive, used, len(sets)))
-    if not sets:
-        return None
-    joints = np.concatenate([joint_set.joints for joint_set in sets], axis=1)
-    weights = np.concatenate([joint_set.weights for joint_set in sets], axis=1)
+    return sets
+
+
+def _normalize_weights(weights: Float64Array) -> Float64Array:
+    """Return weights (V, W) scaled so that those of a vertex add up to 1.
+
+    A vertex without weights moves with its first joint: (1, 0, 0, ...).
+    """
     total = weights.sum(axis=1, keepdims=True)
     has_weights = total > 0.0
-    # A vertex without weights moves with its first joint: (1, 0, 0, ...).
     only_first = np.zeros(weights.shape[1])
     only_first[0] = 1.0
-    normalized = np.where(
-        has_weights, weights / np.where(has_weights, total, 1.0), only_first
-    )
-    return VertexJoints(joints, normalized)
+    fractions = weights / np.where(has_weights, total, 1.0)
+    return np.where(has_weights, fractions, only_first)
 
 
 def _read_joint_set(
@@ -155,14 +171,12 @@ def _read_joint_set(
         FileFormatError: there are not four joints and four weights for each vertex.
     """
     attributes = primitive.attributes
-    accessors = file.header.accessors
     joints_index = attributes[f"JOINTS_{index}"]
     weights_index = attributes.get(f"WEIGHTS_{index}")
-    n_vertices = accessors[attributes["POSITION"]].count
-    if (
-        weights_index is None
-        or not _is_vec4(accessors[joints_index], n_vertices)
-        or not _is_vec4(accessors[weights_index], n_vertices)
+    n_vertices = file.header.accessors[attributes["POSITION"]].count
+    if weights_index is None or not (
+        _is_vec4(file.header.accessors[joints_index], n_vertices)
+        and _is_vec4(file.header.accessors[weights_index], n_vertices)
     ):
         raise damaged(
             file.path, "four joints and four weights of each vertex", "others"
@@ -213,34 +227,53 @@ def pose_part(
     Raises:
         FileFormatError: it is bound to joints that its skin does not have.
     """
-    min_joint = int(vertex_joints.joints.min(initial=0))
-    max_joint = int(vertex_joints.joints.max(initial=0))
-    if max_joint >= len(matrices) or min_joint < 0:
-        wrong_joint = min_joint if min_joint < 0 else max_joint
-        raise damaged(
-            path,
-            f"joints under {len(matrices)}, as its skin has",
-            f"number {wrong_joint}",
-        )
-    # (V, 3, 4): the weighted mean of the matrices of a vertex's joints
-    transforms = np.zeros((len(part.vertices), 3, 4))
-    for joint, weight in zip(
-        vertex_joints.joints.T, vertex_joints.weights.T, strict=True
-    ):
-        transforms += weight[:, None, None] * matrices[joint, :3]
+    _check_joints(path, vertex_joints.joints, len(matrices))
+    transforms = _blend_matrices(vertex_joints, matrices)
     linear = transforms[:, :, :3]
     normals = part.normals
     vertices = np.einsum("vij,vj->vi", linear, part.vertices) + transforms[:, :, 3]
     if normals is not None:
-        # The matrix of cofactors is the inverse transpose times the determinant, and
-        # exists also for matrices without an inverse. Its row i is the cross product of
-        # the rows i + 1 and i + 2.
-        cofactors = np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
-        normals = np.einsum("vij,vj->vi", cofactors, normals)
+        normals = _transform_normals(normals, linear)
     # Then all faces are turned over. If only some vertices are mirrored, there is no
     # winding that fits all faces, and it stays as it is.
     are_all_mirrored = bool((np.linalg.det(linear) < 0.0).all())
     return replace_geometry(part, vertices, normals, is_mirrored=are_all_mirrored)
+
+
+def _check_joints(path: Path, joints: IntArray, n_joints: int) -> None:
+    """Raise FileFormatError if vertices are bound to joints beyond `n_joints`."""
+    min_joint = int(joints.min(initial=0))
+    max_joint = int(joints.max(initial=0))
+    if max_joint >= n_joints or min_joint < 0:
+        wrong_joint = min_joint if min_joint < 0 else max_joint
+        raise damaged(
+            path,
+            f"joints under {n_joints}, as its skin has",
+            f"number {wrong_joint}",
+        )
+
+
+def _blend_matrices(
+    vertex_joints: VertexJoints, matrices: Float64Array
+) -> Float64Array:
+    """Return the weighted mean (V, 3, 4) of the matrices (J, 4, 4) of a vertex's joints."""
+    joints = vertex_joints.joints
+    transforms = np.zeros((len(joints), 3, 4))
+    for joint, weight in zip(joints.T, vertex_joints.weights.T, strict=True):
+        transforms += weight[:, None, None] * matrices[joint, :3]
+    return transforms
+
+
+def _transform_normals(normals: Float64Array, linear: Float64Array) -> Float64Array:
+    """Return normals (V, 3), of any length, under the linear maps (V, 3, 3) of vertices.
+
+    The matrix of cofactors is the inverse transpose times the determinant, and exists
+    also for matrices without an inverse. Its row i is the cross product of the rows
+    i + 1 and i + 2.
+    """
+    cofactors = np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
+    transformed: Float64Array = np.einsum("vij,vj->vi", cofactors, normals)
+    return transformed
 
 
 def read_morph_targets(
@@ -261,26 +294,42 @@ def read_morph_targets(
         FileFormatError: a target has another number of vertices, or numbers that are
             NaN or infinite.
     """
-    names = extras.get("targetNames") if isinstance(extras, dict) else None
-    if not isinstance(names, list):
-        names = []
+    names = _name_targets(len(primitive.targets), extras)
     targets = list[MorphTarget]()
     normal_offsets = list[Float64Array | None]()
-    for index, attributes in enumerate(primitive.targets):
+    for name, attributes in zip(names, primitive.targets, strict=True):
         offsets = _read_offsets(file, primitive, attributes, "POSITION", used)
-        if offsets is None:  # the target moves normals alone
-            offsets = np.zeros((len(used), 3))
-        moved_vertices = np.flatnonzero(offsets.any(axis=1))
-        name = f"target-{index}"
-        if index < len(names) and isinstance(names[index], str):
-            name = names[index]
-        targets.append(
-            MorphTarget(sanitize_name(name), moved_vertices, offsets[moved_vertices])
-        )
+        targets.append(_make_morph_target(name, offsets, len(used)))
         normal_offsets.append(
             _read_offsets(file, primitive, attributes, "NORMAL", used)
         )
     return tuple(targets), tuple(normal_offsets)
+
+
+def _make_morph_target(
+    name: str, offsets: Float64Array | None, n_vertices: int
+) -> MorphTarget:
+    """Return a morph target with only the vertices that it moves.
+
+    `offsets` (V, 3) are those of all vertices; None for a target that moves only
+    normals.
+    """
+    if offsets is None:
+        offsets = np.zeros((n_vertices, 3))
+    moved_vertices = np.flatnonzero(offsets.any(axis=1))
+    return MorphTarget(name, moved_vertices, offsets[moved_vertices])
+
+
+def _name_targets(count: int, extras: object) -> list[str]:
+    """Return names of morph targets: those in a mesh's extras, or else "target-0", ..."""
+    stated_names = extras.get("targetNames") if isinstance(extras, dict) else None
+    if not isinstance(stated_names, list):
+        stated_names = []
+    names = [f"target-{index}" for index in range(count)]
+    for index, stated_name in enumerate(stated_names[:count]):
+        if isinstance(stated_name, str):
+            names[index] = stated_name
+    return [sanitize_name(name) for name in names]
 
 
 def _read_offsets(
@@ -307,8 +356,22 @@ def _read_offsets(
     """
     if name not in attributes:
         return None
+    _check_offsets(file, primitive, name, attributes[name])
+    offsets = file.read_float_rows(attributes[name], used)
+    return _require_finite(file.path, "morph targets", offsets)
+
+
+def _check_offsets(file: GltfFile, primitive: Primitive, name: str, index: int) -> None:
+    """Raise FileFormatError unless a morph target has an offset for each vertex.
+
+    Args:
+        file: the glTF file.
+        primitive: entry of the primitive.
+        name: the attribute that the target changes.
+        index: accessor of the offsets.
+    """
     accessors = file.header.accessors
-    accessor = accessors[attributes[name]]
+    accessor = accessors[index]
     count = accessors[primitive.attributes["POSITION"]].count
     if accessor.type != "VEC3" or accessor.count != count:
         raise damaged(
@@ -316,8 +379,6 @@ def _read_offsets(
             f"a {name} of type VEC3 for each vertex in a morph target",
             "others",
         )
-    offsets = file.read_float_rows(attributes[name], used)
-    return _require_finite(file.path, "morph targets", offsets)
 
 
 def apply_morph_targets(
@@ -391,27 +452,11 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
         FileFormatError: the primitives of a mesh have different numbers of targets, or
             the limit `MAX_MOVES` is exceeded.
     """
-    header = file.header
     n_targets = dict[int, int]()
     n_moves = 0
     for node in mesh_nodes:
-        entry = header.nodes[node]
-        primitives: Sequence[Primitive] = ()
-        if entry.mesh is not None:
-            primitives = header.meshes[entry.mesh].primitives
-        counts = {len(primitive.targets) for primitive in primitives}
-        if len(counts) > 1:
-            raise damaged(
-                file.path,
-                "as many morph targets in all primitives of a mesh",
-                "different numbers",
-            )
-        n_targets[node] = max(counts, default=0)
-        # The limit is for memory: each primitive stores a matrix for each joint of its
-        # skin, and an offset of each vertex for each target.
-        if entry.skin is not None:
-            n_moves += len(primitives) * len(header.skins[entry.skin].joints)
-        n_moves += n_targets[node] * _count_vertices(header, primitives)
+        n_targets[node] = _count_node_targets(file, node)
+        n_moves += _count_moves(file.header, node, n_targets[node])
     check_most(
         file.path,
         n_moves,
@@ -419,6 +464,42 @@ def count_targets(file: GltfFile, mesh_nodes: Sequence[int]) -> dict[int, int]:
         "at most {} vertices of morph targets and joints of primitives",
     )
     return n_targets
+
+
+def _list_primitives(header: Header, node: int) -> Sequence[Primitive]:
+    """Return the primitives of a node's mesh; none if it has no mesh."""
+    mesh = header.nodes[node].mesh
+    return () if mesh is None else header.meshes[mesh].primitives
+
+
+def _count_node_targets(file: GltfFile, node: int) -> int:
+    """Return the number of morph targets of a node, which all its primitives have.
+
+    Raises:
+        FileFormatError: primitives have different numbers of targets.
+    """
+    primitives = _list_primitives(file.header, node)
+    counts = {len(primitive.targets) for primitive in primitives}
+    if len(counts) > 1:
+        raise damaged(
+            file.path,
+            "as many morph targets in all primitives of a mesh",
+            "different numbers",
+        )
+    return max(counts, default=0)
+
+
+def _count_moves(header: Header, node: int, n_targets: int) -> int:
+    """Return how many joints and offsets a node's primitives store, for `MAX_MOVES`.
+
+    Each primitive stores a matrix for each joint of its skin, and an offset of each
+    vertex for each of its `n_targets` morph targets.
+    """
+    primitives = _list_primitives(header, node)
+    skin = header.nodes[node].skin
+    n_joints = 0 if skin is None else len(header.skins[skin].joints)
+    n_vertices = _count_vertices(header, primitives)
+    return len(primitives) * n_joints + n_targets * n_vertices
 
 
 def _name_nodes(header: Header) -> tuple[str, ...]:
@@ -448,28 +529,37 @@ def read_skeleton(file: GltfFile, target_counts: Mapping[int, int]) -> Skeleton 
     Raises:
         FileFormatError: a clip violates the format, or clips are too large.
     """
-    header = file.header
-    node_skins = {header.nodes[node].skin for node in target_counts}
+    node_skins = {file.header.nodes[node].skin for node in target_counts}
     skins = {skin for skin in node_skins if skin is not None}
     clips = _read_clips(file, target_counts, skins)
     if not (skins or clips or any(target_counts.values())):
         return None
-    # quaternions (x, y, z, w); the identity for nodes without a rotation
-    rotations = np.array(
-        [node.rotation or [0.0, 0.0, 0.0, 1.0] for node in header.nodes]
-    )
-    lengths = np.linalg.norm(rotations, axis=1, keepdims=True)
+    return _make_skeleton(file, clips)
+
+
+def _make_skeleton(file: GltfFile, clips: tuple[Clip, ...]) -> Skeleton:
+    """Return all nodes of a file as a skeleton with these clips."""
+    header = file.header
+    nodes = header.nodes
     return Skeleton(
         source=file.path.name,
         names=_name_nodes(header),
         parents=np.array(header.parent_of_node),
-        local_matrices=np.stack([compute_matrix(node) for node in header.nodes]),
-        translations=np.array([node.translation or [0.0] * 3 for node in header.nodes]),
-        rotations=np.asarray(rotations / np.maximum(lengths, 1e-12)),
-        scales=np.array([node.scale or [1.0] * 3 for node in header.nodes]),
-        has_matrix=np.array([node.matrix is not None for node in header.nodes]),
+        local_matrices=np.stack([compute_matrix(node) for node in nodes]),
+        translations=np.array([node.translation or [0.0] * 3 for node in nodes]),
+        rotations=_compute_quaternions(nodes),
+        scales=np.array([node.scale or [1.0] * 3 for node in nodes]),
+        has_matrix=np.array([node.matrix is not None for node in nodes]),
         clips=clips,
     )
+
+
+def _compute_quaternions(nodes: Sequence[Node]) -> Float64Array:
+    """Return the unit quaternions (N, 4), x y z w, of nodes; the identity by default."""
+    quaternions = np.array([node.rotation or [0.0, 0.0, 0.0, 1.0] for node in nodes])
+    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    unit_quaternions: Float64Array = quaternions / np.maximum(lengths, 1e-12)
+    return unit_quaternions
 
 
 def _count_key_numbers(
@@ -501,25 +591,29 @@ def _read_clips(
     """
     header = file.header
     used_channels = _find_moving_channels(header, target_counts, skins)
-    check_most(
-        file.path,
-        _count_key_numbers(header, used_channels),
-        MAX_KEY_NUMBERS,
-        "clips of at most {} numbers",
-    )
+    n_numbers = _count_key_numbers(header, used_channels)
+    check_most(file.path, n_numbers, MAX_KEY_NUMBERS, "clips of at most {} numbers")
     unique_names = UniqueNames()
     clips = list[Clip]()
-    for index, (animation, channels) in enumerate(
-        zip(header.animations, used_channels, strict=True)
-    ):
+    for index, channels in enumerate(used_channels):
         if channels:
-            tracks = [
-                _read_track(file, animation, channel, target_counts)
-                for channel in channels
-            ]
+            animation = header.animations[index]
+            tracks = _read_tracks(file, animation, channels, target_counts)
             name = unique_names.make_unique(animation.name or f"clip-{index}")
-            clips.append(Clip(name, tuple(tracks)))
+            clips.append(Clip(name, tracks))
     return tuple(clips)
+
+
+def _read_tracks(
+    file: GltfFile,
+    animation: Animation,
+    channels: Sequence[Channel],
+    target_counts: Mapping[int, int],
+) -> tuple[Track, ...]:
+    """Read some channels of a clip; see `_read_track`."""
+    return tuple(
+        _read_track(file, animation, channel, target_counts) for channel in channels
+    )
 
 
 def _find_moving_channels(
@@ -534,21 +628,42 @@ def _find_moving_channels(
     """
     joints = (joint for skin in skins for joint in header.skins[skin].joints)
     moving_nodes = with_ancestors(header.parent_of_node, {*target_counts, *joints})
-
-    def moves_geometry(channel: Channel) -> bool:
-        """Return whether a channel sets something that moves geometry."""
-        node = channel.target.node
-        property_name = channel.target.path
-        if node is None or property_name not in VALUE_WIDTHS:
-            return False  # the channel sets a property of an extension
-        if property_name == "weights":
-            return target_counts.get(node, 0) > 0
-        return node in moving_nodes
-
     return [
-        list(filter(moves_geometry, animation.channels))
+        _select_moving_channels(animation.channels, target_counts, moving_nodes)
         for animation in header.animations
     ]
+
+
+def _select_moving_channels(
+    channels: Sequence[Channel],
+    target_counts: Mapping[int, int],
+    moving_nodes: Collection[int],
+) -> list[Channel]:
+    """Return the channels of one animation that move geometry; see `_is_moving`."""
+    return [
+        channel
+        for channel in channels
+        if _is_moving(channel, target_counts, moving_nodes)
+    ]
+
+
+def _is_moving(
+    channel: Channel, target_counts: Mapping[int, int], moving_nodes: Collection[int]
+) -> bool:
+    """Return whether a channel sets weights of morph targets, or moves such a node.
+
+    Args:
+        channel: a channel of a clip.
+        target_counts: number of morph targets, by node.
+        moving_nodes: nodes whose transform moves geometry.
+    """
+    node = channel.target.node
+    property_name = channel.target.path
+    if node is None or property_name not in VALUE_WIDTHS:
+        return False  # the channel sets a property of an extension
+    if property_name == "weights":
+        return target_counts.get(node, 0) > 0
+    return node in moving_nodes
 
 
 def _read_track(
@@ -577,27 +692,42 @@ def _read_track(
     assert node is not None  # for mypy: `_read_clips` leaves others out
     property_name = channel.target.path
     times = _read_times(file, sampler.input)
-    # Weights move vertices, and not the node itself.
-    if file.header.nodes[node].matrix is not None and property_name != "weights":
-        raise damaged(
-            file.path, f"a node {node} without matrix, because a clip moves it", "one"
-        )
+    _check_movable_node(file, node, property_name)
     values_per_key = 3 if sampler.interpolation == "CUBICSPLINE" else 1
     n_targets = target_counts[node] if property_name == "weights" else 1
     shape = (len(times), values_per_key, n_targets)
     keys = _read_keys(file, sampler.output, property_name, shape)
     if property_name == "rotation":
-        # The three values of a cubic spline are tangent, value and tangent.
-        value_index = 1 if values_per_key == 3 else 0
-        quaternions = keys[:, value_index]  # (K, 4)
-        lengths = np.linalg.norm(quaternions, axis=1)
-        if not (lengths > MIN_QUATERNION_LENGTH).all():  # also for NaN
-            raise damaged(
-                file.path,
-                "rotations of a clip that are unit quaternions",
-                "one of length 0",
-            )
+        _check_clip_rotations(file.path, keys)
     return Track(node, property_name, sampler.interpolation, times, keys)
+
+
+def _check_movable_node(file: GltfFile, node: int, property_name: str) -> None:
+    """Raise FileFormatError if a clip sets the transform of a node that has a matrix."""
+    # Weights move vertices, and not the node itself.
+    if file.header.nodes[node].matrix is not None and property_name != "weights":
+        raise damaged(
+            file.path, f"a node {node} without matrix, because a clip moves it", "one"
+        )
+
+
+def _check_clip_rotations(path: Path, keys: Float64Array) -> None:
+    """Raise FileFormatError if a rotation of a clip has a length of about 0.
+
+    Args:
+        path: path of the file.
+        keys: (K, 1 or 3, 4) a quaternion for each key, or for a cubic spline tangent,
+            quaternion and tangent.
+    """
+    value_index = 1 if keys.shape[1] == 3 else 0
+    quaternions = keys[:, value_index]  # (K, 4)
+    lengths = np.linalg.norm(quaternions, axis=1)
+    if not (lengths > MIN_QUATERNION_LENGTH).all():  # also for NaN
+        raise damaged(
+            path,
+            "rotations of a clip that are unit quaternions",
+            "one of length 0",
+        )
 
 
 def _read_keys(
@@ -618,18 +748,15 @@ def _read_keys(
     """
     n_keys, values_per_key, n_targets = shape
     width = VALUE_WIDTHS[property_name]
-    output = file.header.accessors[index]
     count = n_keys * values_per_key * n_targets
+    output = file.header.accessors[index]
     if output.count != count or output.width != width:
-        expected = (
-            f"{count:,} values of {_count_numbers(width)} for "
-            f"{n_keys:,} keys of a {property_name}"
-        )
+        values_text = f"{count:,} values of {_count_numbers(width)}"
+        expected = f"{values_text} for {n_keys:,} keys of a {property_name}"
         raise damaged(file.path, expected, f"{output.count:,} of {output.width}")
     values = file.read_float_rows(index, np.arange(count))
-    return _require_finite(file.path, "the keys of a clip", values).reshape(
-        n_keys, values_per_key, n_targets * width
-    )
+    finite_values = _require_finite(file.path, "the keys of a clip", values)
+    return finite_values.reshape(n_keys, values_per_key, n_targets * width)
 
 
 def _count_numbers(count: int) -> str:
@@ -650,13 +777,7 @@ def _read_times(file: GltfFile, index: int) -> Float64Array:
     """
     path = file.path
     accessor = file.header.accessors[index]
-    is_float32 = accessor.componentType == FLOAT32
-    if accessor.type != "SCALAR" or not is_float32 or not accessor.count:
-        raise damaged(
-            path,
-            "keys of a clip at times in seconds, of type SCALAR and 32-bit floats",
-            "others",
-        )
+    _check_times_accessor(path, accessor)
     values = file.read_float_rows(index, np.arange(accessor.count))
     times = _require_finite(path, "the times of a clip", values)[:, 0]
     if times[0] < 0.0 or (np.diff(times) <= 0.0).any():
@@ -664,6 +785,17 @@ def _read_times(file: GltfFile, index: int) -> Float64Array:
             path, "times of a clip from 0 that rise from key to key", "others"
         )
     return times
+
+
+def _check_times_accessor(path: Path, accessor: Accessor) -> None:
+    """Raise FileFormatError unless an accessor has 32-bit floats, one for each key."""
+    is_float32 = accessor.componentType == FLOAT32
+    if accessor.type != "SCALAR" or not is_float32 or not accessor.count:
+        raise damaged(
+            path,
+            "keys of a clip at times in seconds, of type SCALAR and 32-bit floats",
+            "others",
+        )
 
 
 def _require_finite(path: Path, what: str, values: Float64Array) -> Float64Array:

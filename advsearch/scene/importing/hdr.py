@@ -23,7 +23,7 @@ import OpenEXR
 
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.pictures import MAX_PIXELS, check_pixels
-from advsearch.scene.assets import Float32Array
+from advsearch.scene.assets import Float32Array, Float64Array
 from advsearch.scene.importing.files import damaged, describe_content, format_name
 from advsearch.trust.stored_files import check_most
 
@@ -103,24 +103,8 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
     """
     if not data.startswith(b"\x76\x2f\x31\x01"):  # as every OpenEXR file begins
         raise damaged(file, "an OpenEXR picture", describe_content(data))
-    try:
-        with _suppress_output():
-            header, planes, notes = _read_layer(file, data)
-    except (AdvsearchError, MemoryError):
-        raise  # our own errors name the problem already
-    except Exception as error:  # the library raises many kinds
-        message = (
-            f"{file}: cannot be read as OpenEXR; it is damaged or cut short: export it "
-            "again"
-        )
-        raise FileFormatError(message) from error
-    # The library returns a number, or an enum with one as its value.
-    environment_map = header.get("envmap")
-    if getattr(environment_map, "value", environment_map) == CUBE_MAP:
-        raise FileFormatError(
-            f"{file}: expected a map of latitude and longitude, got "
-            "a cube map; convert it"
-        )
+    header, planes, notes = _read_layer_quietly(file, data)
+    _check_no_cube_map(file, header)
     _, size = _read_window(header, "dataWindow")
     _check_planes(file, planes, size)
     colors = planes if "R" in planes else _convert_luminance(planes, size)
@@ -130,6 +114,38 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
         )
     rgb = (colors["R"], colors["G"], colors["B"])
     return _crop_to_display_window(header, rgb, notes), notes
+
+
+def _read_layer_quietly(
+    file: Path, data: bytes
+) -> tuple[dict[str, Any], dict[str, Plane], list[str]]:
+    """Return what `_read_layer` returns, without output and with one kind of error.
+
+    Raises:
+        FileFormatError: the library cannot read the file, or `_read_layer` raises it.
+    """
+    try:
+        with _suppress_output():
+            return _read_layer(file, data)
+    except (AdvsearchError, MemoryError):
+        raise  # our own errors name the problem already
+    except Exception as error:  # the library raises many kinds
+        message = (
+            f"{file}: cannot be read as OpenEXR; it is damaged or cut short: export it "
+            "again"
+        )
+        raise FileFormatError(message) from error
+
+
+def _check_no_cube_map(file: Path, header: Mapping[str, Any]) -> None:
+    """Raise FileFormatError if a header states that the picture is a cube map."""
+    # The library returns a number, or an enum with one as its value.
+    environment_map = header.get("envmap")
+    if getattr(environment_map, "value", environment_map) == CUBE_MAP:
+        raise FileFormatError(
+            f"{file}: expected a map of latitude and longitude, got "
+            "a cube map; convert it"
+        )
 
 
 def _read_layer(
@@ -150,14 +166,19 @@ def _read_layer(
         _check_size(file, exr_file)
     with OpenEXR.File(io.BytesIO(data), separate_channels=True) as exr_file:
         parts = [(dict(part.header), dict(part.channels)) for part in exr_file.parts]
-        is_incomplete = any(
-            len(channels) != len(header["channels"]) for header, channels in parts
-        )
-        if not parts or is_incomplete:
-            raise ValueError("pixels that end early")
+        _check_complete(parts)
         header, channels, notes = _select_layer(file, parts)
         planes = {name: channel.pixels for name, channel in channels.items()}
         return header, planes, notes
+
+
+def _check_complete(parts: list[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+    """Raise ValueError unless each part, a header and channels, has all its channels."""
+    is_incomplete = any(
+        len(channels) != len(header["channels"]) for header, channels in parts
+    )
+    if not parts or is_incomplete:
+        raise ValueError("pixels that end early")
 
 
 def _check_planes(
@@ -172,6 +193,18 @@ def _check_planes(
         planes: channels by name, such as "R".
         size: rows and columns of the data window.
     """
+    if not _are_floats_of_size(planes, size):
+        got = ", ".join(
+            f"{name} {plane.dtype} {plane.shape}" for name, plane in planes.items()
+        )
+        raise FileFormatError(
+            f"{file}: expected channels of equal size in half or "
+            f"float, got {got}; save it again"
+        )
+
+
+def _are_floats_of_size(planes: Mapping[str, Plane], size: tuple[int, int]) -> bool:
+    """Return whether all planes are floats (H, W), and all but chroma have a size."""
     has_size = all(
         plane.shape == size
         for name, plane in planes.items()
@@ -180,14 +213,7 @@ def _check_planes(
     are_floats = all(
         plane.dtype.kind == "f" and plane.ndim == 2 for plane in planes.values()
     )
-    if not has_size or not are_floats:
-        got = ", ".join(
-            f"{name} {plane.dtype} {plane.shape}" for name, plane in planes.items()
-        )
-        raise FileFormatError(
-            f"{file}: expected channels of equal size in half or "
-            f"float, got {got}; save it again"
-        )
+    return has_size and are_floats
 
 
 def _has_srgb_primaries(header: Mapping[str, Any]) -> bool:
@@ -206,26 +232,33 @@ def _check_size(file: Path, picture: Any) -> None:
     There are two limits: one for the number of values of all parts, and one for the
     display window of each part, which may be larger than its data.
     """
-    n_values = 0
-    for part in picture.parts:
-        header = part.header
-        if "deep" in str(header.get("type", "")):
-            raise FileFormatError(
-                f"{file}: expected one value a pixel, got a deep "
-                "OpenEXR picture; flatten it"
-            )
-        _, (data_height, data_width) = _read_window(header, "dataWindow")
-        _, (height, width) = _read_window(header, "displayWindow")
-        # In a corrupt file the end of a window may be before its start.
-        n_pixels = max(data_width, 0) * max(data_height, 0)
-        n_values += n_pixels * len(header["channels"])
-        check_pixels(file, max(width, 0), max(height, 0))
+    n_values = sum(_count_part_values(file, part.header) for part in picture.parts)
     check_most(
         file,
         n_values,
         MAX_VALUES,
         "OpenEXR pictures of at most {} pixels times channels",
     )
+
+
+def _count_part_values(file: Path, header: Mapping[str, Any]) -> int:
+    """Return the number of values of a part: its pixels times its channels.
+
+    Raises:
+        FileFormatError: the part is deep, or its display window is too large.
+    """
+    if "deep" in str(header.get("type", "")):
+        raise FileFormatError(
+            f"{file}: expected one value a pixel, got a deep "
+            "OpenEXR picture; flatten it"
+        )
+    _, (data_height, data_width) = _read_window(header, "dataWindow")
+    _, (height, width) = _read_window(header, "displayWindow")
+    # In a corrupt file the end of a window may be before its start.
+    n_pixels = max(data_width, 0) * max(data_height, 0)
+    n_values = n_pixels * len(header["channels"])
+    check_pixels(file, max(width, 0), max(height, 0))
+    return n_values
 
 
 def _read_window(
@@ -264,6 +297,12 @@ class _Layer(NamedTuple):
         lacks_colors = "R" not in self.channels
         return name_rank, lacks_colors
 
+    @property
+    def color_channels(self) -> dict[str, Any]:
+        """Colors, or luminance with its chroma if there is one, by name."""
+        names = ("R", "G", "B") if "R" in self.channels else ("Y", "RY", "BY")
+        return {name: self.channels[name] for name in names if name in self.channels}
+
 
 def _select_layer(
     file: Path, parts: list[tuple[dict[str, Any], dict[str, Any]]]
@@ -283,22 +322,22 @@ def _select_layer(
     """
     layers = _find_color_layers(parts)
     if not layers:
-        names = sorted({name for _, channels in parts for name in channels})
-        got = ", ".join(format_name(name, quoted=False) for name in names)
-        expected = "expected the channels R, G and B (or Y alone)"
-        raise FileFormatError(
-            f"{file}: {expected}, got {got}; save the picture as plain RGB"
-        )
-
+        raise _make_no_colors_error(file, parts)
     selected = min(layers, key=lambda layer: layer.rank)  # the first of equal ones
-    # colors, or luminance with its chroma if there is one
-    channel_names = ("R", "G", "B") if "R" in selected.channels else ("Y", "RY", "BY")
-    channels = {
-        name: selected.channels[name]
-        for name in channel_names
-        if name in selected.channels
-    }
-    return selected.header, channels, _describe_other_layers(selected, layers)
+    notes = _describe_other_layers(selected, layers)
+    return selected.header, selected.color_channels, notes
+
+
+def _make_no_colors_error(
+    file: Path, parts: list[tuple[dict[str, Any], dict[str, Any]]]
+) -> FileFormatError:
+    """Return the error for a file of these parts, none of which has colors."""
+    names = sorted({name for _, channels in parts for name in channels})
+    got = ", ".join(format_name(name, quoted=False) for name in names)
+    expected = "expected the channels R, G and B (or Y alone)"
+    return FileFormatError(
+        f"{file}: {expected}, got {got}; save the picture as plain RGB"
+    )
 
 
 def _describe_other_layers(selected: _Layer, layers: list[_Layer]) -> list[str]:
@@ -337,17 +376,25 @@ def _find_color_layers(
     """
     layers = list[_Layer]()
     for header, channels in parts:
-        channels_by_layer: dict[str, dict[str, Any]] = {}
-        for name, channel in channels.items():
-            layer, _, channel_name = name.rpartition(".")
-            key = CHANNEL_NAMES.get(channel_name.lower(), channel_name)
-            channels_by_layer.setdefault(layer, {}).setdefault(key, channel)
         part_name = str(header.get("name", "")) if len(parts) > 1 else ""
-        for layer, layer_channels in channels_by_layer.items():
+        for layer, layer_channels in _group_channels(channels).items():
             names = set(layer_channels)
             if _is_luminance(names) or {"R", "G", "B"} <= names:
                 layers.append(_Layer(layer or part_name, header, layer_channels))
     return layers
+
+
+def _group_channels(channels: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the channels of each layer, by the layer's name and by what they hold.
+
+    The first of several channels that hold the same is returned.
+    """
+    channels_by_layer: dict[str, dict[str, Any]] = {}
+    for name, channel in channels.items():
+        layer, _, channel_name = name.rpartition(".")
+        key = CHANNEL_NAMES.get(channel_name.lower(), channel_name)
+        channels_by_layer.setdefault(layer, {}).setdefault(key, channel)
+    return channels_by_layer
 
 
 def _is_luminance(names: set[str]) -> bool:
@@ -410,9 +457,15 @@ def _resample(plane: Plane, size: tuple[int, ...]) -> Plane:
     return plane
 
 
-def _shift_range(pixels: range, origin: int) -> slice:
+def _shift_ranges(
+    rows: range, columns: range, origin: tuple[int, int]
+) -> tuple[slice, slice]:
     """Return pixels of a grid as those of an array whose first one is `origin`."""
-    return slice(pixels.start - origin, pixels.stop - origin)
+    first_row, first_column = origin
+    return (
+        slice(rows.start - first_row, rows.stop - first_row),
+        slice(columns.start - first_column, columns.stop - first_column),
+    )
 
 
 def _intersect_ranges(
@@ -443,23 +496,16 @@ def _crop_to_display_window(
         return planes
     rows = _intersect_ranges(data_corner[0], data_size[0], corner[0], size[0])
     columns = _intersect_ranges(data_corner[1], data_size[1], corner[1], size[1])
-    is_cropped = (len(rows), len(columns)) != data_size
-    if is_cropped:
+    if (len(rows), len(columns)) != data_size:
         notes.append("its data beyond the display window is left out")
-
-    # the pixels that both windows have, counted from the corner of either one
-    source = (_shift_range(rows, data_corner[0]), _shift_range(columns, data_corner[1]))
-    target = (_shift_range(rows, corner[0]), _shift_range(columns, corner[1]))
-
-    def crop(plane: Plane) -> Plane:
-        """Copy what both windows have into a black plane of the display window."""
-        result = np.zeros(size, plane.dtype)
-        if rows and columns:
-            result[target] = plane[source]
-        return result
-
-    red, green, blue = planes
-    return crop(red), crop(green), crop(blue)
+    red, green, blue = (np.zeros(size, plane.dtype) for plane in planes)
+    if rows and columns:
+        # the pixels that both windows have, counted from the corner of either one
+        source = _shift_ranges(rows, columns, data_corner)
+        target = _shift_ranges(rows, columns, corner)
+        for plane, cropped in zip(planes, (red, green, blue), strict=True):
+            cropped[target] = plane[source]
+    return red, green, blue
 
 
 Bytes = npt.NDArray[np.uint8]
@@ -487,6 +533,20 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
         FileFormatError: there is no valid size, it is too large, or scanlines are
             missing.
     """
+    size_match = _match_size(path, body)
+    n_lines = int(size_match["n_lines"])
+    line_length = int(size_match["line_length"])
+    check_pixels(path, line_length, n_lines)
+    pixels = _decode_scanlines(path, body[size_match.end() :], n_lines, line_length)
+    return _turn_upright(pixels, size_match)
+
+
+def _match_size(path: Path, body: bytes) -> re.Match[bytes]:
+    """Return the match of `_RESOLUTION` at the beginning of a picture's body.
+
+    Raises:
+        FileFormatError: there is no valid size.
+    """
     size_match = _RESOLUTION.match(body)
     if (
         not size_match
@@ -499,10 +559,14 @@ def _read_upright_pixels(path: Path, body: bytes) -> Bytes:
             f"{path}: expected a size like '-Y 512 +X 1024', got "
             f"{line!r}; save the picture again"
         )
-    n_lines = int(size_match["n_lines"])
-    line_length = int(size_match["line_length"])
-    check_pixels(path, line_length, n_lines)
-    pixels = _decode_scanlines(path, body[size_match.end() :], n_lines, line_length)
+    return size_match
+
+
+def _turn_upright(pixels: Bytes, size_match: re.Match[bytes]) -> Bytes:
+    """Return the pixels (H, W, 4) of scanlines (N, L, 4) with row 0 on top.
+
+    `size_match` has the directions of the lines, and of the pixels in them.
+    """
     are_lines_flipped = size_match["line_direction"] not in _UPRIGHT_DIRECTIONS
     if are_lines_flipped:
         pixels = pixels[::-1]
@@ -531,13 +595,7 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
         FileFormatError: the file is no Radiance picture, has XYZ colors, is too large,
             or is cut short.
     """
-    if not data.startswith(b"#?"):
-        raise damaged(path, "a Radiance .hdr picture", describe_content(data))
-    header_end = re.search(rb"\r?\n\r?\n", data)  # an empty line
-    if not header_end:
-        raise damaged(path, "a Radiance .hdr picture", "half a header")
-    header = data[: header_end.start()]
-    body = data[header_end.end() :]
+    header, body = _split_header(path, data)
     format_match = re.search(rb"^FORMAT=\s*(\S+)", header, re.MULTILINE)
     if format_match and format_match[1] != b"32-bit_rle_rgbe":
         got = format_name(format_match[1].decode("latin-1"), quoted=False)
@@ -549,6 +607,20 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Float32Array, list[st
     return pixels, factors, notes
 
 
+def _split_header(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """Split a Radiance picture into its header, and the size and scanlines after it.
+
+    Raises:
+        FileFormatError: it is no Radiance picture, or has no complete header.
+    """
+    if not data.startswith(b"#?"):
+        raise damaged(path, "a Radiance .hdr picture", describe_content(data))
+    header_end = re.search(rb"\r?\n\r?\n", data)  # an empty line
+    if not header_end:
+        raise damaged(path, "a Radiance .hdr picture", "half a header")
+    return data[: header_end.start()], data[header_end.end() :]
+
+
 def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     """Return the inverse (3,) of all COLORCORR lines, and notes on invalid ones.
 
@@ -557,20 +629,30 @@ def _read_color_corrections(header: bytes) -> tuple[Float32Array, list[str]]:
     line that would take the result out of float32's range is invalid, too. EXPOSURE
     lines are ignored, since metering sets the exposure.
     """
-    factors = np.ones(3)
+    factors: Float64Array = np.ones(3)
     notes = list[str]()
     for text in re.findall(rb"^COLORCORR=(.*)$", header, re.MULTILINE)[:100]:
-        numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
-        corrected = np.full(3, np.nan)  # not in range
-        if len(numbers) == 3 and (numbers > 0.0).all():
-            corrected = factors / numbers
-        is_in_range = ((corrected > 1e-20) & (corrected < 1e20)).all()
-        if is_in_range:
+        corrected = _divide_by_correction(factors, text)
+        if corrected is not None:
             factors = corrected
         else:
             line = "COLORCORR=" + text.decode("latin-1")
             notes.append(f"its line {format_name(line)} is left out")
     return factors.astype(np.float32), notes
+
+
+def _divide_by_correction(factors: Float64Array, text: bytes) -> Float64Array | None:
+    """Return factors (3,) divided by those of a COLORCORR line; None if it is invalid.
+
+    A valid `text` has three positive numbers, and the result is from 1e-20 to 1e20, far
+    within the range of float32.
+    """
+    numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
+    if len(numbers) != 3 or not (numbers > 0.0).all():
+        return None
+    corrected: Float64Array = factors / numbers
+    is_in_range = ((corrected > 1e-20) & (corrected < 1e20)).all()
+    return corrected if is_in_range else None
 
 
 def decode_rgbe(pixels: Bytes) -> Float32Array:
@@ -599,15 +681,9 @@ def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes
     """
     result = np.empty((height, width, 4), np.uint8)
     position = 0
-    # two bytes of 2, then the width in two bytes
-    run_length_mark = bytes([2, 2, width >> 8 & 0xFF, width & 0xFF])
     for row in range(height):
-        has_mark = body[position : position + 4] == run_length_mark
         try:
-            if 8 <= width < 32768 and has_mark:
-                position = _decode_runs(body, position + 4, result[row])
-            else:
-                position = _decode_plain_line(body, position, result[row])
+            position = _decode_line(body, position, result[row])
         except (IndexError, ValueError):
             got = (
                 f"{row} complete ones and the start of another; the file is cut short "
@@ -615,6 +691,24 @@ def _decode_scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes
             )
             raise damaged(path, f"{height} scanlines of {width} pixels", got) from None
     return result
+
+
+def _decode_line(body: bytes, position: int, line: Bytes) -> int:
+    """Fill a line (W, 4) from a scanline, run-length encoded or plain.
+
+    Returns:
+        The position after the scanline, which begins at `position`.
+
+    Raises:
+        IndexError, ValueError: the scanline ends early, or is corrupt.
+    """
+    width = len(line)
+    # two bytes of 2, then the width in two bytes
+    run_length_mark = bytes([2, 2, width >> 8 & 0xFF, width & 0xFF])
+    has_mark = body[position : position + 4] == run_length_mark
+    if 8 <= width < 32768 and has_mark:
+        return _decode_runs(body, position + 4, line)
+    return _decode_plain_line(body, position, line)
 
 
 def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
@@ -635,23 +729,32 @@ def _decode_runs(body: bytes, position: int, line: Bytes) -> int:
         IndexError, ValueError: the runs end early, or do not fit.
     """
     for channel in range(4):
-        runs = []
-        n_filled = 0
-        while n_filled < len(line):
-            count = body[position]
-            if count == 0:
-                raise ValueError("a run of length zero")
-            if count > 128:  # one value, repeated
-                n_bytes = 1
-                repeats = count - 128
-            else:
-                n_bytes = count
-                repeats = 1
-            runs.append(body[position + 1 : position + 1 + n_bytes] * repeats)
-            position = position + 1 + n_bytes
-            n_filled = n_filled + n_bytes * repeats
-        line[:, channel] = np.frombuffer(b"".join(runs), np.uint8)
+        values, position = _decode_channel(body, position, len(line))
+        line[:, channel] = np.frombuffer(values, np.uint8)
     return position
+
+
+def _decode_channel(body: bytes, position: int, length: int) -> tuple[bytes, int]:
+    """Return at least `length` values of the runs of a channel, and the position after.
+
+    Raises IndexError or ValueError if the runs end early, or one has no values.
+    """
+    runs = []
+    n_filled = 0
+    while n_filled < length:
+        count = body[position]
+        if count == 0:
+            raise ValueError("a run of length zero")
+        if count > 128:  # one value, repeated
+            n_bytes = 1
+            repeats = count - 128
+        else:
+            n_bytes = count
+            repeats = 1
+        runs.append(body[position + 1 : position + 1 + n_bytes] * repeats)
+        position = position + 1 + n_bytes
+        n_filled = n_filled + n_bytes * repeats
+    return b"".join(runs), position
 
 
 def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
@@ -682,6 +785,16 @@ def _decode_plain_line(body: bytes, position: int, line: Bytes) -> int:
         if not has_repeats:
             line[:] = pixels
             return position + 4 * width
+    return _decode_repeats(body, position, line)
+
+
+def _decode_repeats(body: bytes, position: int, line: Bytes) -> int:
+    """Fill a line (W, 4) pixel by pixel, with repeats; see `_decode_plain_line`.
+
+    Returns:
+        The position after the line.
+    """
+    width = len(line)
     n_filled = 0
     count_shift = 0
     while n_filled < width:

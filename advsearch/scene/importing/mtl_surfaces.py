@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from PIL import Image
@@ -20,6 +20,7 @@ from advsearch.scene.importing.parts import (
     compute_radiance,
     describe_substitute,
     has_normals,
+    is_plain_white,
     make_normal_map,
 )
 from advsearch.scene.importing.pictures import FileImages, ImageKind
@@ -32,6 +33,7 @@ IGNORED_KEYWORDS = frozenset("ka ks ns ni sharpness map_aat".split())
 highlights.
 """
 NORMAL_MAPS = ("norm", "map_kn", "map_bump", "bump")
+COLOR_MAPS = ("map_kd", "map_ke")  # others have numbers
 UV_MAPS = ("map_kd", "map_d", *NORMAL_MAPS, "map_ke")
 """Maps that are sampled at texture coordinates. All have the layout (scale and offset of
 texture coordinates) of the first of them that a material has.
@@ -102,12 +104,16 @@ class MtlReader:
         file = normalize_name(name).rpartition("/")[2]  # without its folder
         materials, stray_keywords = parse_mtl(text, file)
         for keyword in stray_keywords:
-            self.notes.record(
-                f"before the first material of {format_name(file, quoted=False)}, "
-                "statement",
-                keyword,
-            )
+            self._record_stray_statement(file, keyword)
         self._add_materials(materials)
+
+    def _record_stray_statement(self, file: str, keyword: str) -> None:
+        """Record a statement before the first material of a file, which is left out."""
+        self.notes.record(
+            f"before the first material of {format_name(file, quoted=False)}, "
+            "statement",
+            keyword,
+        )
 
     def _note_missing_library(self, name: str) -> None:
         """Note a material file that is missing, or that must not be read."""
@@ -175,9 +181,7 @@ class MtlReader:
                 all squares, is left out of the result.
         """
         material = self._find_material(name)
-        if material is None:
-            return []
-        numbered_name = self._find_numbered_name(material)
+        numbered_name = self._find_numbered_name(material) if material else None
         if numbered_name is None:
             return []
         squares = [square for square in candidates if square]
@@ -185,21 +189,25 @@ class MtlReader:
         other_squares = [square for square in squares if square != named_square]
         if not other_squares:
             return []  # all faces are in the square of the image that is named
-        other_names = (
-            replace_square(numbered_name, square) for square in other_squares
-        )
         has_placeholder = named_square == PLACEHOLDER_SQUARE
-        if has_placeholder or any(
-            _exists(self.references, other_name) for other_name in other_names
-        ):
+        if has_placeholder or self._has_square_image(numbered_name, other_squares):
             return squares
+        self._note_missing_squares(numbered_name, other_squares)
+        return []
+
+    def _has_square_image(self, numbered_name: str, squares: Sequence[int]) -> bool:
+        """Return whether there is an image for some square, named like `numbered_name`."""
+        names = (replace_square(numbered_name, square) for square in squares)
+        return any(_exists(self.references, name) for name in names)
+
+    def _note_missing_squares(self, numbered_name: str, squares: Sequence[int]) -> None:
+        """Note that an image repeats in other UDIM squares, which have no image."""
         self.notes.warn(
             f"{format_name(numbered_name)} is named like one of several pictures (UDIM), "
             "and there is none for the "
-            f"faces in {', '.join(map(str, other_squares[:8]))}: it repeats there; put "
+            f"faces in {', '.join(map(str, squares[:8]))}: it repeats there; put "
             "those pictures beside it"
         )
-        return []
 
     def _find_numbered_name(self, material: MtlMaterial) -> str | None:
         """Return the first name of a material's images that has a UDIM square in it."""
@@ -232,27 +240,33 @@ class MtlReader:
         no_use = MapStatement(name="", options={})
         first_use = next((uses[key] for key in UV_MAPS if key in uses), no_use)
         self._drop_other_layouts(material, uses, first_use)
+        surface = self._convert_maps(material, uses, name, square)
+        if not are_noted:
+            self._note_unread(material)
+        is_clamped = first_use is not no_use and any(map(_is_clamped, uses.values()))
+        return MtlSurface(surface, first_use.scale, first_use.offset, is_clamped)
+
+    def _convert_maps(
+        self,
+        material: MtlMaterial,
+        uses: dict[str, MapStatement],
+        name: str,
+        square: int,
+    ) -> ImportedSurface:
+        """Convert the statements of a material, and its maps by keyword, to a surface.
+
+        Maps of roughness and metallic are averaged over the faces with this name of the
+        material and this UDIM square.
+        """
         color, texture = self._make_base_color(material, uses.get("map_kd"))
         opaque_surface = ImportedSurface(color, texture, name=material.name)
-        surface = replace(
+        return replace(
             self._apply_opacity(material, uses.get("map_d"), opaque_surface),
-            # Maps of these two are averaged over the faces with this name and square.
-            roughness=self._read_fraction(
-                material, "pr", uses.get("map_pr"), name, square
-            ),
-            metallic=self._read_fraction(
-                material, "pm", uses.get("map_pm"), name, square
-            ),
+            roughness=self._read_fraction(material, "pr", uses, name, square),
+            metallic=self._read_fraction(material, "pm", uses, name, square),
             normal_map=self._make_normal_map(material, uses),
             emission=self._make_emission(material, uses.get("map_ke")),
         )
-        if not are_noted:
-            self._note_unread(material)
-        has_uv_map = first_use is not no_use
-        is_clamped = has_uv_map and any(
-            use.options.get("clamp", "").lower() == "on" for use in uses.values()
-        )
-        return MtlSurface(surface, first_use.scale, first_use.offset, is_clamped)
 
     def _parse_uses(
         self, material: MtlMaterial, square: int
@@ -267,17 +281,15 @@ class MtlReader:
             use = self._parse_use(material, key)
             if use is not None:
                 uses[key] = use
-        material.tracked_statements.mark_read(
-            *(key for key in uses if key not in NORMAL_MAPS)
-        )
+        read_keys = [key for key in uses if key not in NORMAL_MAPS]
         # `_note_unread` notes some values of illum, but not the statement itself.
-        material.tracked_statements.mark_read("illum")
-        if square:
-            uses = {
-                key: replace(use, name=replace_square(use.name, square))
-                for key, use in uses.items()
-            }
-        return uses
+        material.tracked_statements.mark_read(*read_keys, "illum")
+        if not square:
+            return uses
+        return {
+            key: replace(use, name=replace_square(use.name, square))
+            for key, use in uses.items()
+        }
 
     def _drop_other_layouts(
         self,
@@ -299,17 +311,20 @@ class MtlReader:
         for key in [key for key in UV_MAPS if key in uses]:
             layout = (uses[key].scale, uses[key].offset)
             if layout != first_layout:
-                statement = (
-                    f"{material.spelling[key]} of the material "
-                    f"{format_name(material.name)}"
-                )
-                self.notes.warn(
-                    f"{statement} has other texture coordinates (-s, -o) than its first "
-                    "map; it is left out"
-                )
+                self._note_other_layout(material, key)
                 # It is noted here, and needs no note as an unread statement.
                 material.tracked_statements.mark_read(key)
                 del uses[key]
+
+    def _note_other_layout(self, material: MtlMaterial, key: str) -> None:
+        """Note that the map of a keyword is left out, since its UVs differ."""
+        statement = (
+            f"{material.spelling[key]} of the material {format_name(material.name)}"
+        )
+        self.notes.warn(
+            f"{statement} has other texture coordinates (-s, -o) than its first "
+            "map; it is left out"
+        )
 
     def _make_base_color(
         self, material: MtlMaterial, use: MapStatement | None
@@ -332,16 +347,22 @@ class MtlReader:
         )
         texture = self._load_image(use, "colours and alpha", note_template)
         if use is not None and texture is not None:
-            has_transparency = texture[:, :, 3].min() < 1.0
-            if has_transparency and "map_d" not in material.argument_by_keyword:
-                self.notes.warn(
-                    f"the alpha of {format_name(use.name)} is left out: no map_d "
-                    "makes it an opacity"
-                )
+            self._note_unused_alpha(material, use, texture)
             texture = np.ascontiguousarray(texture[:, :, :3])
-        if use is not None and color is not None and (color > 0.999).all():
+        if use is not None and color is not None and is_plain_white(color):
             color = None  # plain white does not change a texture
         return color, texture
+
+    def _note_unused_alpha(
+        self, material: MtlMaterial, use: MapStatement, texture: Float32Array
+    ) -> None:
+        """Note the alpha of a texture (H, W, 4), unless the material has a ``map_d``."""
+        has_transparency = texture[:, :, 3].min() < 1.0
+        if has_transparency and "map_d" not in material.argument_by_keyword:
+            self.notes.warn(
+                f"the alpha of {format_name(use.name)} is left out: no map_d "
+                "makes it an opacity"
+            )
 
     def _read_color(self, material: MtlMaterial) -> Float32Array | None:
         """Return the color (3,) of ``Kd``; None, and a note, if it is no color.
@@ -367,30 +388,6 @@ class MtlReader:
         Also noted are statements that were overridden, a fourth number of Kd, and
         illumination models above 2, such as ray-traced glass.
         """
-        zero_keys = {
-            key
-            for key in material.argument_by_keyword
-            if _is_zero(material.peek_argument(key))
-        }
-        base_map = parse_map(
-            without_comment(material.argument_by_keyword.get("map_kd", ""))
-        )
-
-        def is_without_effect(key: str, statement: str) -> bool:
-            """Return whether a statement changes nothing."""
-            argument = without_comment(statement)
-            if not argument or key in IGNORED_KEYWORDS or key in zero_keys:
-                return True
-            if key == "pcr":  # the roughness of a clear coat, which may be absent
-                return "pc" in zero_keys
-            if key == "tf":  # a transmission filter, which is grey if numbers are equal
-                return len(set(argument.split())) == 1
-            if key == "map_ka" and base_map is not None:
-                # exporters repeat the image of the color as that of ambient light
-                ambient_map = parse_map(argument)
-                return ambient_map is not None and ambient_map.name == base_map.name
-            return False
-
         for key in material.overridden:
             self.notes.record("earlier material statement", key)
         if len(material.peek_argument("kd").split()) == 4:
@@ -400,6 +397,7 @@ class MtlReader:
                 "illumination model",
                 without_comment(material.argument_by_keyword["illum"]),
             )
+        is_without_effect = _EffectTest(material).is_without_effect
         for name in material.tracked_statements.find_unread(is_without_effect):
             self.notes.record("material statement", name)
 
@@ -435,21 +433,9 @@ class MtlReader:
             key: keyword of the statement with the image, such as "map_kd".
             use: the image and its options.
         """
-        has_colors = key in ("map_kd", "map_ke")
-        read_options = ["s", "o", "mm", "clamp"]  # scale, offset, value range, clamping
-        if key in NORMAL_MAPS:
-            read_options.append("bm")  # bump multiplier
-        elif not has_colors:
-            read_options.append("imfchan")  # channel of the image
         options = TrackedKeys(use.options)
-        options.mark_read(*read_options)
-
-        def is_without_effect(option: str, value: str) -> bool:
-            """Return whether an option has a value that changes nothing."""
-            if option == "colorspace":
-                return value.lower() == ("srgb" if has_colors else "linear")
-            return value.lower() == DEFAULT_OPTIONS.get(option) or _is_zero(value)
-
+        options.mark_read(*_list_read_options(key))
+        is_without_effect = partial(_is_default_option, key in COLOR_MAPS)
         for option in options.find_unread(is_without_effect):
             self.notes.record(
                 "texture option", f"-{option} of {material.spelling[key]}"
@@ -475,26 +461,15 @@ class MtlReader:
         )
         if image is None and factor == 1.0:
             return surface
-        color = surface.color
-        texture = surface.texture
-        # A surface without a color would have no opacity either: it becomes grey.
-        color_or_grey = np.full(3, NEUTRAL_GREY, np.float32) if color is None else color
+        opacity = None
         if use is not None and image is not None:
             opacity = _select_channel(image, use)
-            if texture is None:
-                texture = np.broadcast_to(color_or_grey, (*opacity.shape, 3))
-            size = (texture.shape[1], texture.shape[0])
-            resized = np.asarray(
-                Image.fromarray(opacity).resize(size, Image.Resampling.BILINEAR)
-            )
-            texture = np.concatenate([texture, resized[:, :, None]], axis=2)
-        elif texture is None:
-            color = color_or_grey
+        surface = _prepare_opacity(surface, opacity)
         factor_array = np.array([factor], np.float32)
         return replace(
             surface,
-            color=apply_opacity(color, factor_array, cutoff=None),
-            texture=apply_opacity(texture, factor_array, cutoff=None),
+            color=apply_opacity(surface.color, factor_array, cutoff=None),
+            texture=apply_opacity(surface.texture, factor_array, cutoff=None),
         )
 
     def _read_opacity(self, material: MtlMaterial) -> float:
@@ -510,30 +485,40 @@ class MtlReader:
         tr = parse_fraction(material.read_argument("tr"))
         if tr is None:
             return 1.0 if opacity is None else opacity
-        material_phrase = f"the material {format_name(material.name)} has Tr {tr:g}"
         if opacity is None:
-            if tr > 0.0:
-                self.notes.warn(
-                    f"{material_phrase} and no d: it is read as transparency, which "
-                    f"makes its opacity {1.0 - tr:g}; some programs mean "
-                    "opacity by it, so write d instead"
-                )
+            self._note_transparency(material, tr)
             return 1.0 - tr
+        self._note_contradiction(material, tr, opacity)
+        return opacity
+
+    def _note_transparency(self, material: MtlMaterial, tr: float) -> None:
+        """Note a ``Tr`` without ``d``, which is read as transparency, unless it is 0."""
+        if tr > 0.0:
+            self.notes.warn(
+                f"the material {format_name(material.name)} has Tr {tr:g} and no d: it "
+                "is read as transparency, which "
+                f"makes its opacity {1.0 - tr:g}; some programs mean "
+                "opacity by it, so write d instead"
+            )
+
+    def _note_contradiction(
+        self, material: MtlMaterial, tr: float, opacity: float
+    ) -> None:
+        """Note a ``Tr`` that contradicts ``d``, the opacity, in both of its senses."""
         # Programs may round to two digits.
         agrees_as_opacity = abs(tr - opacity) <= 0.01
         agrees_as_transparency = abs(1.0 - tr - opacity) <= 0.01
         if not agrees_as_opacity and not agrees_as_transparency:
             self.notes.warn(
-                f"{material_phrase}, which contradicts its d {opacity:g}; d is used as "
-                "its opacity"
+                f"the material {format_name(material.name)} has Tr {tr:g}, which "
+                f"contradicts its d {opacity:g}; d is used as its opacity"
             )
-        return opacity
 
     def _read_fraction(
         self,
         material: MtlMaterial,
         key: str,
-        use: MapStatement | None,
+        uses: dict[str, MapStatement],
         name: str,
         square: int,
     ) -> float | None:
@@ -545,25 +530,23 @@ class MtlReader:
         Args:
             material: the material.
             key: "pr" or "pm".
-            use: its map, or None.
+            uses: the maps of the material by keyword, such as "map_pr".
             name: name by which the mesh file uses the material.
             square: the UDIM square.
         """
+        use = uses.get(f"map_{key}")
         # Only notes about a map use the keyword; without a map it is None.
         keyword = material.spelling.get(f"map_{key}")
         note_template = f"{keyword} {{name}} {{why}}; it is left out"
         image = self._load_image(use, "numbers", note_template)
         number = parse_fraction(material.read_argument(key))
-        if use is not None and image is not None:
-            self.notes.warn(
-                "textures of roughness and metallic are replaced by their means"
-            )
-            uvs, areas = self.find_mapped_faces(name, square)
-            channel = _select_channel(image, use)[:, :, None]
-            image_uvs = uvs * use.scale + use.offset
-            mean = average_over_faces(channel, image_uvs, areas)
-            return float(mean[0])
-        return number
+        if use is None or image is None:
+            return number
+        self.notes.warn(
+            "textures of roughness and metallic are replaced by their means"
+        )
+        uvs, areas = self.find_mapped_faces(name, square)
+        return _average_mapped_values(image, use, uvs, areas)
 
     def _make_normal_map(
         self, material: MtlMaterial, uses: dict[str, MapStatement]
@@ -578,21 +561,19 @@ class MtlReader:
             uses: its maps by keyword.
         """
         note_template = "the normal map {name} {why}; it is left out"
-        for key in NORMAL_MAPS:
-            if key not in uses:
-                continue
+        for key in (key for key in NORMAL_MAPS if key in uses):
             use = uses[key]
             image = self._load_image(use, "numbers", note_template)
-            material.tracked_statements.mark_read(
-                *(other for other in uses if uses[other].name == use.name)
+            same_image = [other for other in uses if uses[other].name == use.name]
+            material.tracked_statements.mark_read(*same_image)
+            if image is None:
+                continue
+            # These two keywords are for normals alone; bump maps may be either.
+            if key in ("norm", "map_kn") or has_normals(image):
+                return make_normal_map(image, use.bump)
+            self._images.note_missing(
+                use.name, "holds heights, and no normals", note_template
             )
-            if image is not None:
-                # These two keywords are for normals alone; bump maps may be either.
-                if key in ("norm", "map_kn") or has_normals(image):
-                    return make_normal_map(image, use.bump)
-                self._images.note_missing(
-                    use.name, "holds heights, and no normals", note_template
-                )
         return None
 
     def _make_emission(
@@ -607,14 +588,9 @@ class MtlReader:
             material: the material.
             use: its ``map_Ke``, or None.
         """
-        values = parse_numbers(material.read_argument("ke") or "0")  # by default black
-        if values is None or len(values) not in (1, 3) or min(values) < 0:
-            self.notes.warn(
-                f"the emission {format_name(material.read_argument('ke'))} is no "
-                "colour; it is left out"
-            )
+        factor = self._read_emission(material)
+        if factor is None:
             return None
-        factor = np.broadcast_to(values, (3,))
         image = self._load_image(
             use, "colours", "the texture {name} of the emission {why}; it is left out"
         )
@@ -623,6 +599,17 @@ class MtlReader:
         if use is not None and not factor.any():
             factor = np.ones(3)  # exporters leave Ke at 0 if there is a map
         return compute_radiance(factor, image, self.notes)
+
+    def _read_emission(self, material: MtlMaterial) -> Float64Array | None:
+        """Return the factor (3,) of ``Ke``, by default black; None, with a note, if wrong."""
+        values = parse_numbers(material.read_argument("ke") or "0")
+        if values is None or len(values) not in (1, 3) or min(values) < 0:
+            self.notes.warn(
+                f"the emission {format_name(material.read_argument('ke'))} is no "
+                "colour; it is left out"
+            )
+            return None
+        return np.broadcast_to(values, (3,))
 
     @cached_property
     def _images(self) -> FileImages:
@@ -649,6 +636,117 @@ class MtlReader:
         base, gain = map(np.float32, use.range)
         colors = np.clip(image[:, :, :3] * gain + base, 0.0, 1.0)
         return np.concatenate([colors, image[:, :, 3:]], axis=2)
+
+
+@dataclass(frozen=True)
+class _EffectTest:
+    """Tests whether statements of a material change nothing."""
+
+    material: MtlMaterial
+
+    @cached_property
+    def _zero_keys(self) -> set[str]:
+        """Keywords of statements whose numbers are all 0."""
+        return {
+            key
+            for key in self.material.argument_by_keyword
+            if _is_zero(self.material.peek_argument(key))
+        }
+
+    @cached_property
+    def _base_map(self) -> MapStatement | None:
+        """The image of the color."""
+        statement = self.material.argument_by_keyword.get("map_kd", "")
+        return parse_map(without_comment(statement))
+
+    def is_without_effect(self, key: str, statement: str) -> bool:
+        """Return whether a statement changes nothing."""
+        argument = without_comment(statement)
+        if not argument or key in IGNORED_KEYWORDS or key in self._zero_keys:
+            return True
+        if key == "pcr":  # the roughness of a clear coat, which may be absent
+            return "pc" in self._zero_keys
+        if key == "tf":  # a transmission filter, which is grey if numbers are equal
+            return len(set(argument.split())) == 1
+        if key == "map_ka" and self._base_map is not None:
+            # exporters repeat the image of the color as that of ambient light
+            ambient_map = parse_map(argument)
+            return ambient_map is not None and ambient_map.name == self._base_map.name
+        return False
+
+
+def _is_default_option(has_colors: bool, option: str, value: str) -> bool:
+    """Return whether an option of an image has a value that changes nothing.
+
+    `has_colors` is whether the image is one of colors, and not of numbers.
+    """
+    if option == "colorspace":
+        return value.lower() == ("srgb" if has_colors else "linear")
+    return value.lower() == DEFAULT_OPTIONS.get(option) or _is_zero(value)
+
+
+def _is_clamped(use: MapStatement) -> bool:
+    """Return whether an image must not repeat beyond its edges."""
+    return use.options.get("clamp", "").lower() == "on"
+
+
+def _average_mapped_values(
+    image: Float32Array, use: MapStatement, uvs: Float64Array, areas: Float64Array
+) -> float:
+    """Return the mean of a map of numbers over the faces that show it.
+
+    Args:
+        image: (H, W, C) values of the map's image.
+        use: the map.
+        uvs: (F, 3, 2) texture coordinates of the faces, as the file has them.
+        areas: (F,) areas of the faces.
+    """
+    values = _select_channel(image, use)[:, :, None]
+    mean = average_over_faces(values, uvs * use.scale + use.offset, areas)
+    return float(mean[0])
+
+
+def _list_read_options(key: str) -> list[str]:
+    """Return the options that are read of an image with a keyword such as "map_kd"."""
+    read_options = ["s", "o", "mm", "clamp"]  # scale, offset, value range, clamping
+    if key in NORMAL_MAPS:
+        read_options.append("bm")  # bump multiplier
+    elif key not in COLOR_MAPS:
+        read_options.append("imfchan")  # channel of the image
+    return read_options
+
+
+def _prepare_opacity(
+    surface: ImportedSurface, opacity: Float32Array | None
+) -> ImportedSurface:
+    """Return a surface with an opacity map (h, w) as fourth channel of its texture.
+
+    Without a map, the surface only gets a color if it has neither a color nor a
+    texture: it could have no opacity either. It becomes grey.
+    """
+    color = surface.color
+    if color is None:
+        color = np.full(3, NEUTRAL_GREY, np.float32)
+    if opacity is not None:
+        texture = _append_opacity(surface.texture, color, opacity)
+        return replace(surface, texture=texture)
+    if surface.texture is None:
+        return replace(surface, color=color)
+    return surface
+
+
+def _append_opacity(
+    texture: Float32Array | None, color: Float32Array, opacity: Float32Array
+) -> Float32Array:
+    """Return a texture (H, W, 3) with an opacity (h, w), resized, as fourth channel.
+
+    Without a texture, the color (3,) is that of all texels of the opacity.
+    """
+    if texture is None:
+        texture = np.broadcast_to(color, (*opacity.shape, 3))
+    size = (texture.shape[1], texture.shape[0])
+    image = Image.fromarray(opacity).resize(size, Image.Resampling.BILINEAR)
+    return np.concatenate([texture, np.asarray(image)[:, :, None]], axis=2)
 
 
 def _select_channel(picture: Float32Array, use: MapStatement) -> Float32Array:
@@ -685,20 +783,21 @@ def find_libraries(arguments: Sequence[str], references: ReferencedFiles) -> lis
     """
     names: list[str] = []
     for argument in arguments:
-        argument_without_comment = without_comment(argument)
-        if _exists(references, argument):
-            names.append(argument)
-        elif _exists(references, argument_without_comment):
-            names.append(argument_without_comment)
-        else:
-            candidates = _split_libraries(argument_without_comment)
-            have_suffix = all(map(_has_mtl_suffix, candidates))
-            exist = (_exists(references, name) for name in candidates)
-            if have_suffix or any(exist):
-                names += candidates
-            else:
-                names.append(argument_without_comment)
+        names += _find_line_libraries(argument, references)
     return list(dict.fromkeys(filter(None, names)))
+
+
+def _find_line_libraries(argument: str, references: ReferencedFiles) -> list[str]:
+    """Return the names of the material files of one line; see `find_libraries`."""
+    argument_without_comment = without_comment(argument)
+    if _exists(references, argument):
+        return [argument]
+    if _exists(references, argument_without_comment):
+        return [argument_without_comment]
+    candidates = _split_libraries(argument_without_comment)
+    have_suffix = all(map(_has_mtl_suffix, candidates))
+    exist = (_exists(references, name) for name in candidates)
+    return candidates if have_suffix or any(exist) else [argument_without_comment]
 
 
 def _exists(references: ReferencedFiles, name: str) -> bool:
@@ -850,6 +949,15 @@ class MtlMaterial:
         """Return what `read_argument` returns, but don't mark the statement as read."""
         return self.argument_by_keyword.get(key, "").partition("#")[0].strip()
 
+    def add_statement(self, keyword: str, value: str) -> None:
+        """Store a statement, which overrides an earlier one with the same keyword."""
+        key = keyword.lower()
+        earlier_value = self.argument_by_keyword.get(key, value)
+        if earlier_value != value:
+            self.overridden.append(keyword)
+        self.argument_by_keyword[key] = value
+        self.spelling[key] = keyword
+
 
 @dataclass(frozen=True)
 class MapStatement:
@@ -885,14 +993,7 @@ def parse_mtl(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
         if key == "newmtl":
             materials.append(MtlMaterial(" ".join(argument.split()), file))
         elif materials:
-            material = materials[-1]
-            value = argument.strip()
-            if (
-                material.argument_by_keyword.get(key, value) != value
-            ):  # an earlier one differs
-                material.overridden.append(keyword)
-            material.argument_by_keyword[key] = value
-            material.spelling[key] = keyword
+            materials[-1].add_statement(keyword, argument.strip())
         else:
             stray_keywords.append(keyword)
     return materials, stray_keywords
@@ -911,18 +1012,8 @@ def parse_map(argument: str) -> MapStatement | None:
     options, which are removed together with their values. The rest is the name, which
     may have blanks.
     """
-    options: dict[str, str] = {}
-    for match in _KNOWN_OPTION.finditer(argument):
-        for key in _VALUE_PATTERNS:
-            if match[key] is not None:
-                options[key] = match[f"{key}_"]
-    name = " ".join(_KNOWN_OPTION.sub("", argument).split())
-    unknown = _UNKNOWN_OPTION.match(name)
-    while unknown:
-        # The option is stored without its values, since only its name is noted.
-        options[unknown[1].lower()] = ""
-        name = name[unknown.end() :]
-        unknown = _UNKNOWN_OPTION.match(name)
+    options = _parse_known_options(argument)
+    name = _remove_unknown_options(_KNOWN_OPTION.sub("", argument), options)
     if not name:
         return None
     bump, _ = _parse_pair(options, "bm", (1.0, 1.0))  # the option has one number
@@ -934,6 +1025,30 @@ def parse_map(argument: str) -> MapStatement | None:
         range=_parse_pair(options, "mm", (0.0, 1.0)),
         bump=bump,
     )
+
+
+def _parse_known_options(argument: str) -> dict[str, str]:
+    """Return the values of the known options in a statement, by name."""
+    options: dict[str, str] = {}
+    for match in _KNOWN_OPTION.finditer(argument):
+        for key in _VALUE_PATTERNS:
+            if match[key] is not None:
+                options[key] = match[f"{key}_"]
+    return options
+
+
+def _remove_unknown_options(text: str, options: dict[str, str]) -> str:
+    """Return the name after the unknown options of a text, which are added to `options`.
+
+    They are added without their values, since only their names are noted.
+    """
+    name = " ".join(text.split())
+    unknown = _UNKNOWN_OPTION.match(name)
+    while unknown:
+        options[unknown[1].lower()] = ""
+        name = name[unknown.end() :]
+        unknown = _UNKNOWN_OPTION.match(name)
+    return name
 
 
 def _parse_pair(options: dict[str, str], key: str, default: Pair) -> Pair:

@@ -12,7 +12,7 @@ import warnings
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from PIL import Image
@@ -27,6 +27,7 @@ from advsearch.scene.assets import (
     FileAxis,
     Float32Array,
     Float64Array,
+    IntArray,
     Material,
     Mesh,
     ObjectAsset,
@@ -60,6 +61,9 @@ from advsearch.scene.importing.readers import (
     read_mesh_bytes,
 )
 from advsearch.scene.importing.texture import apply_textures, index_materials
+
+if TYPE_CHECKING:
+    from advsearch.scene.rigged import SkeletonRig
 
 
 def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
@@ -134,18 +138,33 @@ def import_object(
     data = read_mesh_bytes(file, "object", list_suffixes())
     parts, notes = read_parts(file, data)
     header = None
-    format_up: str | None = up
     if file.suffix.lower() in GLTF_SUFFIXES:
         header = gltf.read_header(file, data)
         notes += gltf_parts.describe_left_out(header, file.name)
-        format_up = up or "y"
-    if facing is None:
-        front = find_front_axis(file, header, up)
-    else:
-        front = FileAxis(parse_facing_axis(facing, format_up))
+    front = _find_front(file, header, up, facing)
     return make_object(
         parts, notes, file=file, name=make_safe_name(file), up=up, front=front
     )
+
+
+def _find_front(
+    file: Path, header: Header | None, up: str | None, facing: str | None
+) -> FileAxis:
+    """Return the axis along which the front faces: the user's, or that of the format.
+
+    Args:
+        file: the file.
+        header: header of a glTF file, None for others.
+        up: the axis that the user named as up, or None.
+        facing: the axis that the user named as the front, or None.
+
+    Raises:
+        InputError: `facing` is not valid, or along the axis that points up.
+    """
+    if facing is None:
+        return find_front_axis(file, header, up)
+    format_up = up if header is None else up or "y"
+    return FileAxis(parse_facing_axis(facing, format_up))
 
 
 def parse_facing_axis(facing: str, up: str | None) -> str:
@@ -192,25 +211,27 @@ def find_front_axis(
         header: header of a glTF file, or of a file that was converted to glTF.
         up: the axis that points up, if the user named it.
     """
-    suffix = path.suffix.lower()
-    if header is None or suffix in USD_SUFFIXES or up == "z":
-        axis = DEFAULT_FRONT
-        rule = "a format without a rule, as bundled objects face"
-    elif VRM_0 in header.extensionsUsed and VRM_1 not in header.extensionsUsed:
-        axis = "-z"
-        rule = "as VRM 0 defines"
-    elif suffix == BLEND_SUFFIX:
-        axis = "+z"
-        rule = "-y in Blender, as its front view shows"
-    else:
-        axis = "+z"
-        rule = "as glTF defines"
+    axis, rule = _find_front_rule(path, header, up)
     opposite = f"-{axis[1]}" if axis[0] == "+" else f"+{axis[1]}"
     return FileAxis(
         axis,
         f"{path.name}: its front is assumed to face {axis} of the file ({rule}); if it "
         f"faces another axis, set `facing`, such as `facing={opposite}`",
     )
+
+
+def _find_front_rule(
+    path: Path, header: Header | None, up: str | None
+) -> tuple[str, str]:
+    """Return the axis of the front, and the rule that says so; see `find_front_axis`."""
+    suffix = path.suffix.lower()
+    if header is None or suffix in USD_SUFFIXES or up == "z":
+        return DEFAULT_FRONT, "a format without a rule, as bundled objects face"
+    if VRM_0 in header.extensionsUsed and VRM_1 not in header.extensionsUsed:
+        return "-z", "as VRM 0 defines"
+    if suffix == BLEND_SUFFIX:
+        return "+z", "-y in Blender, as its front view shows"
+    return "+z", "as glTF defines"
 
 
 def make_object(
@@ -239,7 +260,6 @@ def make_object(
         InputError: the geometry has NaN, infinite, or only coincident vertices.
     """
     object_notes = Notes(file)
-    is_gltf = file.suffix.lower() in GLTF_SUFFIXES
     parts = _select_visible_parts(parts, object_notes)
     up_axis = _find_up(parts, file, up, front)
     rotation = compute_rotation(up_axis.axis, front.axis)
@@ -248,11 +268,7 @@ def make_object(
     soup, maps = apply_textures(soup, surfaces, object_notes)
     opacity = _find_opacity(maps.color, object_notes)
     material = _compute_mean_material(soup, surfaces, object_notes)
-    # The soup's extent is 1, or less if the repair has removed faces.
-    extent = compute_extent(parts) * float(
-        np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max()
-    )
-    has_unit = is_gltf and MIN_METRES <= extent <= MAX_METRES
+    extent = _compute_repaired_extent(parts, soup)
     return ObjectAsset(
         name=name,
         mesh=_make_mesh(soup, surfaces, file, parts, rotation),
@@ -265,10 +281,26 @@ def make_object(
         opacity=opacity,
         normal_map=maps.normals,
         emission=_compute_emitted(maps.emission, opacity),
-        size_in_metres=extent if has_unit else None,
+        size_in_metres=_find_size_in_metres(file, extent),
         extent=extent,
         file_to_mesh=_compute_file_to_mesh(parts, soup, rotation),
     )
+
+
+def _compute_repaired_extent(parts: list[ImportedPart], soup: TriangleSoup) -> float:
+    """Return the largest extent of a repaired object, in the file's unit.
+
+    The soup's extent is 1, or less if the repair has removed faces.
+    """
+    corners = soup.points[soup.faces].reshape(-1, 3)
+    return compute_extent(parts) * float(np.ptp(corners, axis=0).max())
+
+
+def _find_size_in_metres(file: Path, extent: float) -> float | None:
+    """Return the extent if it is plausible as one in meters, the unit of glTF; or None."""
+    is_gltf = file.suffix.lower() in GLTF_SUFFIXES
+    has_unit = is_gltf and MIN_METRES <= extent <= MAX_METRES
+    return extent if has_unit else None
 
 
 def _select_visible_parts(
@@ -343,19 +375,8 @@ def _compute_mean_material(
         surfaces: the surface of each of its parts.
         notes: notes about the file.
     """
-    # twice the area of each surface, in the order of `surfaces`
-    visible_area = np.bincount(
-        soup.part_of_face,
-        weights=np.linalg.norm(soup.compute_area_vectors(), axis=1),
-        minlength=len(surfaces),
-    )
-    # What a surface does not state has the value of the default material.
-    materials = [
-        Material().with_values(vars(surface), prefix="") for surface in surfaces
-    ]
-    values = np.array(
-        [[material.roughness, material.metallic] for material in materials]
-    )
+    visible_area = _compute_surface_areas(soup, len(surfaces))
+    values = _list_finishes(surfaces)
     visible_values = values[visible_area > 0]
     roughness, metallic = map(float, visible_values[0])
     if not (visible_values == visible_values[0]).all():
@@ -366,6 +387,25 @@ def _compute_mean_material(
             f"means ({roughness:.2g} and {metallic:.2g})"
         )
     return Material(roughness=roughness, metallic=metallic)
+
+
+def _compute_surface_areas(soup: TriangleSoup, n_surfaces: int) -> Float64Array:
+    """Return twice the area (S,) of the faces of each surface."""
+    face_areas = np.linalg.norm(soup.compute_area_vectors(), axis=1)
+    return np.asarray(
+        np.bincount(soup.part_of_face, weights=face_areas, minlength=n_surfaces)
+    )
+
+
+def _list_finishes(surfaces: list[ImportedSurface]) -> Float64Array:
+    """Return the roughness and metallic (S, 2) of surfaces.
+
+    What a surface does not state has the value of the default material.
+    """
+    materials = [
+        Material().with_values(vars(surface), prefix="") for surface in surfaces
+    ]
+    return np.array([[material.roughness, material.metallic] for material in materials])
 
 
 def _limit_warnings(warnings: list[str], file: Path) -> tuple[str, ...]:
@@ -396,14 +436,7 @@ def _make_mesh(
         parts: the parts of the file.
         turn: rotation (3, 3) from the file's axes to ours.
     """
-    material_names, material_of_face = index_materials(soup, surfaces)
-    # There is a group for each material up to the last one with faces.
-    faces_by_material = zip(
-        material_names, group_indices(material_of_face), strict=False
-    )
-    materials = {
-        name: faces for name, faces in faces_by_material if name and len(faces)
-    }
+    materials = _group_faces_by_material(soup, surfaces)
     try:
         mesh, stored_vertices = make_mesh_from_soup(soup)
         normalised_mesh = replace(normalise_mesh(mesh), materials=materials)
@@ -412,6 +445,34 @@ def _make_mesh(
     # None if nothing in the file moves.
     if stored_vertices is None:
         return normalised_mesh
+    rig = _make_rig(mesh, parts, stored_vertices, turn)
+    return replace(normalised_mesh, rig=rig)
+
+
+def _group_faces_by_material(
+    soup: TriangleSoup, surfaces: list[ImportedSurface]
+) -> dict[str, IntArray]:
+    """Return the faces of each material with a name, by that name."""
+    material_names, material_of_face = index_materials(soup, surfaces)
+    # There is a group for each material up to the last one with faces.
+    groups = zip(material_names, group_indices(material_of_face), strict=False)
+    return {name: faces for name, faces in groups if name and len(faces)}
+
+
+def _make_rig(
+    mesh: Mesh,
+    parts: list[ImportedPart],
+    stored_vertices: IntArray,
+    turn: Float64Array,
+) -> SkeletonRig:
+    """Return the rig that moves a mesh.
+
+    Args:
+        mesh: the repaired mesh, before it was normalized.
+        parts: the parts of the file.
+        stored_vertices: (V,) the stored vertex of each vertex of the mesh.
+        turn: rotation (3, 3) from the file's axes to ours.
+    """
     # Vertices were scaled twice: by the extent of the parts when they were joined, and
     # by that of the repaired mesh when it was normalised.
     soup_extent = compute_extent(parts)
@@ -420,10 +481,9 @@ def _make_mesh(
     from advsearch.scene.rigged import SkeletonRig
 
     movable_parts = [part.movable for part in parts if part.movable is not None]
-    rig = SkeletonRig(
+    return SkeletonRig(
         movable_parts, stored_vertices, turn / (soup_extent * mesh_extent)
     )
-    return replace(normalised_mesh, rig=rig)
 
 
 def _compute_file_to_mesh(
@@ -463,18 +523,25 @@ def _compute_emitted(
     """
     if emission is None or opacity is None:
         return emission
-    rows, columns = emission.shape[:2]
-    emission_size = (columns, rows)
+    emission_size = (emission.shape[1], emission.shape[0])
     opacity_size = (opacity.shape[1], opacity.shape[0])
-    width, height = max(emission_size, opacity_size)  # compares widths first
-    resized_opacity = np.asarray(
-        Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR)
+    size = max(emission_size, opacity_size)  # compares widths first
+    image = Image.fromarray(opacity).resize(size, Image.Resampling.BILINEAR)
+    resized_opacity = np.asarray(image)[:, :, None]
+    radiance = np.asarray(
+        _enlarge_by_repeating(emission, size) * resized_opacity, np.float32
     )
+    return radiance if radiance.any() else None
+
+
+def _enlarge_by_repeating(image: Float32Array, size: tuple[int, int]) -> Float32Array:
+    """Return an image (h, w, C) resized to a width and height, without interpolation."""
+    width, height = size
+    rows, columns = image.shape[:2]
     source_rows = np.arange(height) * rows // height
     source_columns = np.arange(width) * columns // width
-    enlarged_emission = emission[source_rows][:, source_columns]
-    radiance = np.asarray(enlarged_emission * resized_opacity[:, :, None], np.float32)
-    return radiance if radiance.any() else None
+    resized: Float32Array = image[source_rows][:, source_columns]
+    return resized
 
 
 TOUCHING_HEIGHT = 0.02
@@ -512,17 +579,22 @@ def guess_up(points: Float64Array, name: str) -> FileAxis:
     if fractions["y"] > MIN_UP_RATIO * fractions["z"]:
         axis = "y"
         other_axis = "z"
-    reason = "its shape fits y and z equally well"
-    if fractions[axis] > MIN_UP_RATIO * fractions[other_axis]:
-        reason = (
-            f"it then rests on {100 * fractions[axis]:.0f} % of what it covers, seen "
-            f"from above, and on {100 * fractions[other_axis]:.0f} % otherwise"
-        )
+    reason = _explain_up(fractions[axis], fractions[other_axis])
     return FileAxis(
         axis,
         f"{name}: {axis} is assumed to be up, because {reason}; if it lies on its "
         f"side, set `up={other_axis}`",
     )
+
+
+def _explain_up(fraction: float, other_fraction: float) -> str:
+    """Return why an axis is up, from the touching fractions with it and the other up."""
+    if fraction > MIN_UP_RATIO * other_fraction:
+        return (
+            f"it then rests on {100 * fraction:.0f} % of what it covers, seen "
+            f"from above, and on {100 * other_fraction:.0f} % otherwise"
+        )
+    return "its shape fits y and z equally well"
 
 
 def compute_touching_fraction(points: Float64Array) -> float:

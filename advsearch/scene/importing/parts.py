@@ -175,9 +175,14 @@ def describe_substitute(color: Float32Array | None) -> str:
 
     Plain white is no color of a material: it only leaves a texture unchanged.
     """
-    if color is None or (color > 0.999).all():
+    if color is None or is_plain_white(color):
         return "neutral grey"
     return f"its base colour ({', '.join(f'{channel:.2f}' for channel in color)})"
+
+
+def is_plain_white(color: Float32Array) -> bool:
+    """Return whether a color (3 or 4,) is white, apart from rounding."""
+    return bool((color > 0.999).all())
 
 
 def apply_opacity(
@@ -197,27 +202,41 @@ def apply_opacity(
     Returns:
         (..., 4), or (..., 3) if it is opaque everywhere.
     """
-    # Imported here, since the reader of USD, a separate process, needs no scipy.
-    from scipy.ndimage import distance_transform_edt
-
     if color is None:
         return None
-    alpha = color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])
-    opacity = alpha * factor
-    if cutoff is not None:
-        opacity = (opacity >= cutoff).astype(np.float32)
     rgb = color[..., :3]
+    opacity = _compute_opacity(color, factor, cutoff)
     if opacity.min() >= 1.0:  # opaque everywhere
         return rgb
     is_cut_out = opacity[..., 0] == 0.0
     is_image = color.ndim == 3  # not a single color
     if is_image and not is_cut_out.all():
-        # for each texel the rows and columns of the nearest one that is not cut out
-        nearest_visible = distance_transform_edt(
-            is_cut_out, return_distances=False, return_indices=True
-        )
-        rgb = rgb[tuple(nearest_visible)]
+        rgb = _fill_cut_out_texels(rgb, is_cut_out)
     return np.concatenate([rgb, opacity], axis=-1)
+
+
+def _compute_opacity(
+    color: Float32Array, factor: Float32Array, cutoff: float | None
+) -> Float32Array:
+    """Return the opacity (..., 1) of a base color (..., 3 or 4); see `apply_opacity`."""
+    alpha = color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])
+    opacity: Float32Array = alpha * factor
+    if cutoff is not None:
+        opacity = (opacity >= cutoff).astype(np.float32)
+    return opacity
+
+
+def _fill_cut_out_texels(rgb: Float32Array, is_cut_out: BoolArray) -> Float32Array:
+    """Return colors (H, W, 3) with those of cut-out texels (H, W) from the nearest other."""
+    # Imported here, since the reader of USD, a separate process, needs no scipy.
+    from scipy.ndimage import distance_transform_edt
+
+    # for each texel the rows and columns of the nearest one that is not cut out
+    nearest_visible = distance_transform_edt(
+        is_cut_out, return_distances=False, return_indices=True
+    )
+    extended: Float32Array = rgb[tuple(nearest_visible)]
+    return extended
 
 
 def clip_to_unit(value: float | None) -> float | None:
@@ -310,14 +329,16 @@ def replace_geometry(
         is_mirrored: whether the new positions are mirrored.
     """
     part = replace(part, vertices=vertices, normals=normals)
-    if not is_mirrored:
-        return part
-    colors = None if part.colors is None else part.colors[:, ::-1]
+    return _reverse_faces(part) if is_mirrored else part
+
+
+def _reverse_faces(part: ImportedPart) -> ImportedPart:
+    """Return a part with the opposite winding and normals."""
     return replace(
         part,
         faces=part.faces[:, ::-1],
-        normals=None if normals is None else -normals,
-        colors=colors,
+        normals=None if part.normals is None else -part.normals,
+        colors=None if part.colors is None else part.colors[:, ::-1],
     )
 
 
@@ -357,26 +378,36 @@ def make_part_from_corners(
         corner_number, return_index=True, return_inverse=True
     )
 
-    def gather_vertex_values(indexed: IndexedValues | None) -> Float64Array | None:
-        """Return values (V, C), NaN for vertices without one; None if all lack one."""
-        if indexed is None:
-            return None
-        rows = indexed.row_of_corner[triangles].reshape(-1)[first_corner]
-        if (rows < 0).all():
-            return None
-        return np.where(rows[:, None] >= 0, indexed.values[rows], np.nan)
-
     point_rows = points.row_of_corner[triangles].reshape(-1)[first_corner]
-    vertices = points.values[point_rows]
     return ImportedPart(
-        vertices=vertices,
+        vertices=points.values[point_rows],
         faces=faces.reshape(-1, 3),
-        normals=gather_vertex_values(normals),
-        uvs=gather_vertex_values(uvs),
+        normals=_gather_vertex_values(normals, triangles, first_corner),
+        uvs=_gather_vertex_values(uvs, triangles, first_corner),
         colors=None if colors is None else colors[triangles],
         surface=surface,
         flat=flat,
     )
+
+
+def _gather_vertex_values(
+    indexed: IndexedValues | None, triangles: IntArray, first_corner: IntArray
+) -> Float64Array | None:
+    """Return values of vertices (V, C), NaN for those without one.
+
+    The result is None if there are no values, or all vertices lack one.
+
+    Args:
+        indexed: values of the corners of all triangles, or None.
+        triangles: (T,) the triangles that are selected.
+        first_corner: (V,) a corner of each vertex, out of the 3 T corners.
+    """
+    if indexed is None:
+        return None
+    rows = indexed.row_of_corner[triangles].reshape(-1)[first_corner]
+    if (rows < 0).all():
+        return None
+    return np.where(rows[:, None] >= 0, indexed.values[rows], np.nan)
 
 
 def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntArray:
@@ -402,11 +433,15 @@ def _number_corners(triangles: IntArray, *columns: IndexedValues | None) -> IntA
         base = len(indexed.values) + 1
         would_overflow = bound * base >= 2**63
         if would_overflow:
-            # Equal numbers are replaced by equal smaller ones, which count from 0.
-            _, corner_number = np.unique(corner_number, return_inverse=True)
-            corner_number = corner_number.reshape(-1)
+            corner_number = _renumber(corner_number)
             bound = len(corner_number)
         digit = indexed.row_of_corner[triangles].reshape(-1) + 1
         corner_number = corner_number * base + digit
         bound *= base
     return corner_number
+
+
+def _renumber(numbers: IntArray) -> IntArray:
+    """Replace equal numbers by equal smaller ones, which count from 0."""
+    _, smaller_numbers = np.unique(numbers, return_inverse=True)
+    return smaller_numbers.reshape(-1)

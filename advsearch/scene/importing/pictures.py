@@ -7,6 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -91,18 +92,29 @@ def load_display_image(
         OSError, ValueError, SyntaxError: its pixels are truncated or corrupt.
     """
     check_decodable(image, path)
-    width, height = image.size
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about large images and odd metadata
         image.load()
-        # factor of the size; the image is not enlarged
-        shrink = 1.0 if limit is None else limit / max(height, width)
-        if shrink >= 1.0:
+        target_shape = _compute_smaller_shape(image.size, limit)
+        if target_shape is None:
             return np.asarray(_VALUE_OF_LEVEL[to_8bit_levels(image, alpha=keep_alpha)])
-        target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
         if is_raw:
             return _average_numbers(image, target_shape)
         return _average_colors(image, target_shape, keep_alpha=keep_alpha)
+
+
+def _compute_smaller_shape(
+    size: tuple[int, int], limit: int | None
+) -> tuple[int, int] | None:
+    """Return the height and width of an image whose longest side becomes the limit.
+
+    The result is None if the image, of a width and height, is not above the limit.
+    """
+    width, height = size
+    shrink = 1.0 if limit is None else limit / max(height, width)
+    if shrink >= 1.0:
+        return None
+    return max(1, round(height * shrink)), max(1, round(width * shrink))
 
 
 # (256,) the values in [0, 1] of 8-bit levels: a table replaces a computation per pixel
@@ -135,25 +147,10 @@ def _average_colors(
         keep_alpha: whether opacity is returned as a fourth channel.
     """
     width, height = image.size
-    linear_of_level = srgb_to_linear(_VALUE_OF_LEVEL)
     is_weighted = keep_alpha or image.has_transparency_data
-
-    def load_band(top: int, end: int) -> Float32Array:
-        """Return rows of linear colors, from `top` to before `end`.
-
-        If colors are weighted, the channels are those of the color (3), the opacity
-        (1), and the color times the opacity (3).
-        """
-        band_image = image.crop((0, top, width, end))
-        levels = to_8bit_levels(band_image, alpha=is_weighted)
-        colors = linear_of_level[levels[:, :, :3]]
-        if not is_weighted:
-            return colors
-        opacity = _VALUE_OF_LEVEL[levels[:, :, 3:]]
-        return np.concatenate([colors, opacity, colors * opacity], axis=2)
-
+    load_band = partial(_load_linear_band, image, is_weighted)
     averaged = average_in_bands(load_band, (height, width), target_shape)
-    # the channels of `load_band`
+    # the channels of `_load_linear_band`
     colors = averaged[:, :, :3]
     opacity = averaged[:, :, 3:4]
     if is_weighted:
@@ -164,6 +161,24 @@ def _average_colors(
     if not keep_alpha:
         return display_colors
     return np.concatenate([display_colors, opacity], axis=2)
+
+
+def _load_linear_band(
+    image: Image.Image, is_weighted: bool, top: int, end: int
+) -> Float32Array:
+    """Return rows of an image as linear colors, from `top` to before `end`.
+
+    If colors are weighted, the channels are those of the color (3), the opacity (1),
+    and the color times the opacity (3).
+    """
+    linear_of_level = srgb_to_linear(_VALUE_OF_LEVEL)
+    band_image = image.crop((0, top, image.size[0], end))
+    levels = to_8bit_levels(band_image, alpha=is_weighted)
+    colors = linear_of_level[levels[:, :, :3]]
+    if not is_weighted:
+        return colors
+    opacity = _VALUE_OF_LEVEL[levels[:, :, 3:]]
+    return np.concatenate([colors, opacity, colors * opacity], axis=2)
 
 
 def average_in_bands(
@@ -277,6 +292,7 @@ of numbers; before `scale_limit`.
 """
 UNREADABLE = "cannot be read as a picture"
 NO_PATH = ": "  # beginning of the message of an error whose path is ""
+_NO_NAME = ""  # path of an image in errors whose message is put after its name
 MIN_TEXTURE_SIDE = 64  # smallest limit of the sides of textures, texels
 MAX_FULL_TEXTURES = 16
 """Number of materials up to which textures may be as large as `TEXTURE_LIMIT`. More
@@ -389,15 +405,19 @@ class FileImages:
             return f"is not read ({problem})"
         except (OSError, ValueError, SyntaxError, EOFError):
             return UNREADABLE
-        width, height = image.size
-        rows, columns = texture.shape[:2]
-        if (columns, rows) != (width, height):
+        self._note_smaller(name, image.size, (texture.shape[1], texture.shape[0]))
+        return texture
+
+    def _note_smaller(
+        self, name: str, size: tuple[int, int], texture_size: tuple[int, int]
+    ) -> None:
+        """Note an image whose texture has another width and height than itself."""
+        if texture_size != size:
             label = f"the texture {format_name(name)}" if name else "a texture"
             self.notes.warn(
-                f"{label} of {width:,} x {height:,} texels is averaged "
-                f"down to {columns:,} x {rows:,}"
+                f"{label} of {size[0]:,} x {size[1]:,} texels is averaged "
+                f"down to {texture_size[0]:,} x {texture_size[1]:,}"
             )
-        return texture
 
     def _load_within_limits(self, image: Image.Image, kind: ImageKind) -> Float32Array:
         """Return the values of an opened image, and count its pixels.
@@ -409,26 +429,31 @@ class FileImages:
             FileFormatError: a limit is exceeded, or the format is not read.
             OSError, ValueError, SyntaxError: the pixels are truncated or corrupt.
         """
-        width, height = image.size
         is_raw = kind == "numbers"
         content = "numbers" if is_raw else "colours"
+        width, height = image.size
         n_pixels = self._pixel_counts[content] + width * height
-        # The caller names the image, so that the path in errors is empty.
-        no_path = ""
-        check_pixels(no_path, width, height)
-        check_most(
-            no_path,
-            n_pixels,
-            LARGEST_SUM,
-            "pictures of at most {} pixels",
-            f"{n_pixels:,} in all",
-        )
+        self._check_pixel_counts(image.size, n_pixels)
         texture = load_display_image(
             image,
             self.max_side,
-            no_path,
+            _NO_NAME,
             keep_alpha=kind == "colours and alpha",
             is_raw=is_raw,
         )
         self._pixel_counts[content] = n_pixels
         return texture
+
+    def _check_pixel_counts(self, size: tuple[int, int], n_pixels: int) -> None:
+        """Raise FileFormatError for an image, or a sum of pixels, that is too large.
+
+        `size` is the width and the height of the image.
+        """
+        check_pixels(_NO_NAME, *size)
+        check_most(
+            _NO_NAME,
+            n_pixels,
+            LARGEST_SUM,
+            "pictures of at most {} pixels",
+            f"{n_pixels:,} in all",
+        )

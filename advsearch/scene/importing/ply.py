@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Float64Array, IntArray
+from advsearch.scene.assets import BoolArray, Float32Array, Float64Array, IntArray
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MAX_CORNERS,
@@ -99,6 +99,39 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
         FileFormatError: the file is no PLY file, has an unknown header, or is shorter
             than its header states.
     """
+    header_end = _find_header_end(data, notes)
+    elements, comments, byte_order = _parse_header(
+        decode_text(data[: header_end.start()]), notes
+    )
+    notes.check_faces(elements["face"].count if "face" in elements else 0)
+    body = data[header_end.end() :]
+    text = b"" if byte_order else body  # an ASCII file has no byte order
+    cells = _read_cells(body, is_ascii=not byte_order)
+    position = 0
+    for element in elements.values():
+        reader = _RowReader(notes, element, cells, text)
+        # This fills in the element, and returns its end, where the next one begins.
+        position = reader.read(position)
+    return elements, comments
+
+
+def _read_cells(body: bytes, *, is_ascii: bool) -> npt.NDArray[np.uint8]:
+    """Return the bytes from which rows are read.
+
+    The numbers of an ASCII file are first parsed to float64; then their bytes are read
+    as those of a binary file.
+    """
+    if is_ascii:
+        return parse_number_array(body, np.float64).view(np.uint8)
+    return np.frombuffer(body, np.uint8)
+
+
+def _find_header_end(data: bytes, notes: Notes) -> re.Match[bytes]:
+    """Return the match of the last line of the header.
+
+    Raises:
+        FileFormatError: the file is no PLY file, or has no complete header.
+    """
     has_magic = data.startswith(b"ply")
     # Some files end their lines in carriage returns alone. These are replaced only to
     # search for the end of the header, whose position stays the same.
@@ -108,26 +141,7 @@ def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[s
         # If `got` is bytes, the message describes what kind of file they are.
         got = "half of one" if has_magic else data
         raise notes.damaged("a PLY file with a complete header", got)
-    elements, comments, byte_order = _parse_header(
-        decode_text(data[: header_end.start()]), notes
-    )
-    notes.check_faces(elements["face"].count if "face" in elements else 0)
-    body = data[header_end.end() :]
-    # `cells` are the bytes from which rows are read. The numbers of an ASCII file are
-    # first parsed to float64; then their bytes are read as those of a binary file.
-    is_binary = byte_order != ""
-    if is_binary:
-        cells = np.frombuffer(body, np.uint8)
-        text = b""
-    else:
-        cells = parse_number_array(body, np.float64).view(np.uint8)
-        text = body
-    position = 0
-    for element in elements.values():
-        reader = _RowReader(notes, element, cells, text)
-        # This fills in the element, and returns its end, where the next one begins.
-        position = reader.read(position)
-    return elements, comments
+    return header_end
 
 
 def _parse_header(
@@ -145,46 +159,73 @@ def _parse_header(
         The elements by name, with the types of their properties and no values yet; the
         comments; and the byte order, "<", ">" or empty for ASCII.
     """
-    elements: dict[str, Element] = {}
-    comments = list[str]()
-    byte_order = None
-    element = None
+    parsed_header = _Header()
     for line in header.splitlines()[1:]:  # the first line is "ply"
-        match line.split():
-            case ["format", kind, *_] if kind in _FORMATS:
-                byte_order = _FORMATS[kind]
-            case ["comment" | "obj_info" as keyword, *_]:
-                comments.append(line.strip().removeprefix(keyword).strip())
-            case ["element", name, count] if (
-                # no more digits than 64 bits have
-                count.isdecimal() and len(count) < 20 and name not in elements
-            ):
-                element = Element(name, int(count))
-                elements[name] = element
-            case ["property", "list", count_kind, kind, name] if (
-                element
-                and count_kind in _TYPES
-                and kind in _TYPES
-                and name not in element.type_by_property
-            ):
-                element.type_by_property[name] = _make_dtype(kind, byte_order)
-                element.count_types[name] = _make_dtype(count_kind, byte_order)
-            case ["property", kind, name] if (
-                element and kind in _TYPES and name not in element.type_by_property
-            ):
-                element.type_by_property[name] = _make_dtype(kind, byte_order)
-            case []:
-                pass
-            case _:
-                raise notes.damaged(
-                    "a PLY header of elements and their properties",
-                    f"the line {format_name(line)}",
-                )
-    if byte_order is None:
+        if not parsed_header.add_line(line):
+            raise notes.damaged(
+                "a PLY header of elements and their properties",
+                f"the line {format_name(line)}",
+            )
+    if parsed_header.byte_order is None:
         raise notes.damaged(
             f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these"
         )
-    return elements, comments, byte_order
+    return parsed_header.elements, parsed_header.comments, parsed_header.byte_order
+
+
+@dataclass
+class _Header:
+    """What the lines of a PLY header state, up to one of them."""
+
+    elements: dict[str, Element] = field(default_factory=dict)
+    comments: list[str] = field(default_factory=list)
+    byte_order: str | None = None  # "<", ">", or "" for ASCII; None if not stated yet
+    last_element: Element | None = None  # the one to which properties belong
+
+    def add_line(self, line: str) -> bool:
+        """Store what a line states, and return whether it is understood."""
+        match line.split():
+            case ["format", kind, *_] if kind in _FORMATS:
+                self.byte_order = _FORMATS[kind]
+            case ["comment" | "obj_info" as keyword, *_]:
+                self.comments.append(line.strip().removeprefix(keyword).strip())
+            case ["element", name, count] if self._is_new_element(name, count):
+                self.last_element = Element(name, int(count))
+                self.elements[name] = self.last_element
+            case ["property", "list", count_kind, kind, name]:
+                return self._add_property(name, kind, count_kind)
+            case ["property", kind, name]:
+                return self._add_property(name, kind)
+            case []:
+                pass
+            case _:
+                return False
+        return True
+
+    def _is_new_element(self, name: str, count: str) -> bool:
+        """Return whether an element has no name of an earlier one, and a valid count."""
+        # no more digits than 64 bits have
+        is_count = count.isdecimal() and len(count) < 20
+        return is_count and name not in self.elements
+
+    def _add_property(
+        self, name: str, kind: str, count_kind: str | None = None
+    ) -> bool:
+        """Add a property to the last element, and return whether it is valid.
+
+        Args:
+            name: name of the property, which must be new.
+            kind: type of its values, such as "float".
+            count_kind: type of the counts of a list; None for a scalar.
+        """
+        element = self.last_element
+        has_kinds = kind in _TYPES and (count_kind is None or count_kind in _TYPES)
+        if element is None or not has_kinds or name in element.type_by_property:
+            return False
+        element.type_by_property[name] = _make_dtype(kind, self.byte_order)
+        if count_kind is not None:
+            element.count_types[name] = _make_dtype(count_kind, self.byte_order)
+        return True
 
 
 def _make_dtype(kind: str, byte_order: str | None) -> np.dtype[np.generic]:
@@ -220,20 +261,19 @@ class _RowReader:
 
     def __post_init__(self) -> None:
         """Make the views of the bytes, and find the sizes of scalars and counts."""
-        element = self.element
-        self.values = {
-            name: self._view_from_any_byte(kind)
-            for name, kind in element.type_by_property.items()
-        }
-        self.counts = {
-            name: self._view_from_any_byte(kind)
-            for name, kind in element.count_types.items()
-        }
+        self.values = self._view_all(self.element.type_by_property)
+        self.counts = self._view_all(self.element.count_types)
         # A list begins with its count. A property without counts is a scalar.
         self.widths = {
             name: self.counts.get(name, values).itemsize
             for name, values in self.values.items()
         }
+
+    def _view_all(
+        self, types: Mapping[str, np.dtype[np.generic]]
+    ) -> dict[str, Numbers]:
+        """Return `_view_from_any_byte` for each property, by its type."""
+        return {name: self._view_from_any_byte(kind) for name, kind in types.items()}
 
     def read(self, position: int) -> int:
         """Read all rows, and return the position of the byte after them.
@@ -254,14 +294,20 @@ class _RowReader:
         # rows would end beyond the file, or the lists at these positions differ in
         # length, that is wrong, and rows are walked one by one.
         starts, end = self._find_even_rows(position)
-        rows_differ = end > len(self.cells) or any(
-            np.ptp(count_at_byte[starts[name]]) != 0
-            for name, count_at_byte in self.counts.items()
-        )
-        if rows_differ:
+        if end > len(self.cells) or self._has_uneven_lists(starts):
             starts, end = self._walk_rows(position, self.element.count)
         self._store_values(starts)
         return end
+
+    def _has_uneven_lists(self, starts: Mapping[str, IntArray]) -> bool:
+        """Return whether some property has lists of several lengths.
+
+        `starts` are, by property, the bytes (rows,) at which it begins in each row.
+        """
+        return any(
+            np.ptp(count_at_byte[starts[name]]) != 0
+            for name, count_at_byte in self.counts.items()
+        )
 
     def _view_from_any_byte(self, kind: np.dtype[np.generic]) -> Numbers:
         """View the bytes as numbers of a type, one for each byte.
@@ -302,20 +348,29 @@ class _RowReader:
         starts = {name: list[int]() for name in self.widths}
         byte = position
         for _ in range(n_rows):
-            for name, width in self.widths.items():
+            for name in self.widths:
                 starts[name].append(byte)
-                self._check_end(byte + width)
-                is_list = name in self.counts
-                if is_list:  # `width` is that of its count, which is before its values
-                    length = self._read_length(name, byte)
-                    byte += self.values[name].itemsize * length
-                byte += width
+                byte = self._find_property_end(name, byte)
         self._check_end(byte)
         arrays = {
             name: np.array(positions, dtype=np.int64)
             for name, positions in starts.items()
         }
         return arrays, byte
+
+    def _find_property_end(self, name: str, byte: int) -> int:
+        """Return the byte after a property that begins at a byte.
+
+        Raises:
+            FileFormatError: the file ends within the scalar or the count of the list,
+                or the list has an impossible length.
+        """
+        end = byte + self.widths[name]
+        self._check_end(end)
+        is_list = name in self.counts
+        if is_list:  # its values follow its count
+            end += self.values[name].itemsize * self._read_length(name, byte)
+        return end
 
     def _read_length(self, name: str, byte: int) -> int:
         """Return the length of the list that begins at a byte."""
@@ -433,13 +488,17 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             f"has Gaussian splats, which are left out: {SPLATS_ADVICE}"
         )
     if points is None:
-        if reader.has_splats:
-            raise FileFormatError(
-                f"{path}: expected a mesh with faces, got Gaussian "
-                f"splats: {SPLATS_ADVICE}"
-            )
-        raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
+        raise _make_no_points_error(path, reader)
     return _make_parts(reader, points, _parse_texture_names(comments))
+
+
+def _make_no_points_error(path: Path, reader: _Properties) -> FileFormatError:
+    """Return the error for a file whose vertices have no x, y and z."""
+    if reader.has_splats:
+        return FileFormatError(
+            f"{path}: expected a mesh with faces, got Gaussian splats: {SPLATS_ADVICE}"
+        )
+    return reader.notes.damaged("a PLY file with vertices that have x, y and z", "none")
 
 
 def _combine_colors(
@@ -482,31 +541,30 @@ def _make_parts(
         texture_names: files of textures that the comments name.
     """
     notes = reader.notes
-    corners, corner_counts = reader.read_polygons(len(points))
-    triangles, polygon = triangulate_and_note(points[corners], corner_counts, notes)
+    corners, counts = reader.read_polygons(len(points))
+    triangles, polygon = triangulate_and_note(points[corners], counts, notes)
     position = IndexedValues(points, corners[triangles])
-    normals = reader.read_columns("vertex", (("nx", "ny", "nz"),))
-    normal = None if normals is None else IndexedValues(normals, position.row_of_corner)
-    uvs = reader.read_uvs(corners, corner_counts, triangles)
-    polygon_textures = reader.read_texture_indices(
-        texture_names, corners, corner_counts
-    )
+    normal = reader.read_normals(position.row_of_corner)
+    uvs = reader.read_uvs(corners, counts, triangles)
+    polygon_textures = reader.read_texture_indices(texture_names, corners, counts)
     texture = polygon_textures[polygon]
     colors = reader.read_colors(position.row_of_corner, polygon)
     surfaces = reader.make_surfaces(texture_names, has_no_colors=colors is None)
-    # Faces without a texture have the index -1, that of the last surface.
-    surfaces.append(ImportedSurface())
     parts = list[ImportedPart]()
-    has_uvs = np.zeros(len(triangles), np.bool_)
-    if uvs is not None:
-        has_uvs = np.asarray((uvs.row_of_corner >= 0).all(axis=1))
-    for group in group_faces(texture, has_uvs):
+    for group in group_faces(texture, _find_mapped_triangles(uvs, len(triangles))):
         surface = surfaces[texture[group[0]]]
         surface, tint = _combine_colors(surface, colors, group, notes)
         parts.append(
             make_part_from_corners(group, position, normal, uvs, tint, surface)
         )
     return parts
+
+
+def _find_mapped_triangles(uvs: IndexedValues | None, n_triangles: int) -> BoolArray:
+    """Return which triangles (T,) have texture coordinates at all corners."""
+    if uvs is None:
+        return np.zeros(n_triangles, np.bool_)
+    return np.asarray((uvs.row_of_corner >= 0).all(axis=1))
 
 
 def _parse_texture_names(comments: Sequence[str]) -> list[str]:
@@ -595,6 +653,11 @@ class _Properties:
                 return group
         return ()
 
+    def read_normals(self, row_of_corner: IntArray) -> IndexedValues | None:
+        """Return the normals of vertices for the corners (T, 3) of triangles, or None."""
+        normals = self.read_columns("vertex", (("nx", "ny", "nz"),))
+        return None if normals is None else IndexedValues(normals, row_of_corner)
+
     def read_polygons(self, n_points: int) -> tuple[IntArray, IntArray]:
         """Return the polygons of the file: its faces, then the triangles of strips.
 
@@ -650,12 +713,7 @@ class _Properties:
                 refers to a missing vertex.
         """
         if (counts < 3).all():
-            got = "points or lines only; export triangles"
-            if self.has_splats:
-                got = f"Gaussian splats: {SPLATS_ADVICE}"
-            raise FileFormatError(
-                f"{self.notes.path}: expected a mesh with faces, got {got}"
-            )
+            raise self._make_no_polygons_error()
         self.notes.check_most(
             int(counts.max()), MAX_CORNERS, "faces with at most {} corners"
         )
@@ -665,6 +723,15 @@ class _Properties:
                 "faces of its own vertices",
                 "a face that refers to a vertex that does not exist",
             )
+
+    def _make_no_polygons_error(self) -> FileFormatError:
+        """Return the error for a file without a polygon of 3 or more corners."""
+        got = "points or lines only; export triangles"
+        if self.has_splats:
+            got = f"Gaussian splats: {SPLATS_ADVICE}"
+        return FileFormatError(
+            f"{self.notes.path}: expected a mesh with faces, got {got}"
+        )
 
     def read_uvs(
         self, corners: IntArray, counts: IntArray, triangles: IntArray
@@ -703,6 +770,22 @@ class _Properties:
         # Faces are the first polygons. Triangles of strips, which follow, have no
         # wedges.
         n_faces = len(wedges.counts)
+        is_mapped = self._find_mapped_polygons(wedges, counts)
+        # (wedge values,) and (corners,): whether they are of a face with coordinates
+        is_used_value = np.repeat(is_mapped[:n_faces], wedges.counts)
+        is_mapped_corner = np.repeat(is_mapped, counts)
+        corner_uvs = wedges.values[is_used_value].astype(np.float64).reshape(-1, 2)
+        distinct_uvs, index_of_uv = _find_distinct_pairs(corner_uvs)
+        uv_of_corner = np.full(int(counts.sum()), -1)  # -1 for none
+        uv_of_corner[is_mapped_corner] = index_of_uv
+        return IndexedValues(distinct_uvs, uv_of_corner[triangles])
+
+    def _find_mapped_polygons(self, wedges: ListValues, counts: IntArray) -> BoolArray:
+        """Return which polygons (P,) have two wedge values for each corner.
+
+        Faces with values, but another number of them, are noted.
+        """
+        n_faces = len(wedges.counts)
         wedge_counts = np.zeros(len(counts), np.int64)
         wedge_counts[:n_faces] = wedges.counts
         is_mapped = wedge_counts == 2 * counts
@@ -711,19 +794,7 @@ class _Properties:
                 "texture coordinates of faces that are not two for each "
                 "corner are left out"
             )
-        # (wedge values,) and (corners,): whether they are of a face with coordinates
-        is_used_value = np.repeat(is_mapped[:n_faces], wedges.counts)
-        is_mapped_corner = np.repeat(is_mapped, counts)
-        corner_uvs = wedges.values[is_used_value].astype(np.float64).reshape(-1, 2)
-        # Equal pairs become one. As complex numbers, u + v i, pairs are compared as
-        # single values.
-        distinct_pairs, index_of_pair = np.unique(
-            corner_uvs.view(np.complex128), return_inverse=True
-        )
-        distinct_uvs = distinct_pairs.view(np.float64).reshape(-1, 2)
-        uv_of_corner = np.full(int(counts.sum()), -1)  # -1 for none
-        uv_of_corner[is_mapped_corner] = index_of_pair.reshape(-1)
-        return IndexedValues(distinct_uvs, uv_of_corner[triangles])
+        return np.asarray(is_mapped)
 
     def read_colors(
         self, vertices: IntArray, polygons: IntArray
@@ -766,20 +837,26 @@ class _Properties:
         values = self.read_columns(element, COLOR_NAMES)
         if values is None:
             return None
-        # The file may name red "red" or "diffuse_red". All three channels are assumed
-        # to have its type.
-        scalars = self.elements[element].scalars
-        red_name, _, _ = self._find_group(element, scalars, COLOR_NAMES)
-        color_type = self.elements[element].type_by_property[red_name]
-        # Alphas have the scale of the colors, which is known here.
-        self._mark_opaque_alphas(element, color_type)
-        full_brightness = _find_scale(values, color_type)
+        full_brightness = _find_scale(values, self._find_color_type(element))
         display = np.clip(np.nan_to_num(values / full_brightness), 0.0, 1.0)
         linear = srgb_to_linear(display.astype(np.float32))
         neutral = srgb_to_linear(np.full((1, 3), NEUTRAL_GREY, np.float32))
         padded = np.concatenate([linear, neutral])
         neutral_row = len(linear)
         return padded[np.minimum(index, neutral_row)].astype(np.float64)
+
+    def _find_color_type(self, element: str) -> np.dtype[np.generic]:
+        """Return the type of the colors of an element, and mark opaque alphas as read.
+
+        All three channels are assumed to have the type of red, which the file may name
+        "red" or "diffuse_red". Alphas have the scale of the colors, so that it is known
+        here whether they are opaque.
+        """
+        scalars = self.elements[element].scalars
+        red_name, _, _ = self._find_group(element, scalars, COLOR_NAMES)
+        color_type = self.elements[element].type_by_property[red_name]
+        self._mark_opaque_alphas(element, color_type)
+        return color_type
 
     def _mark_opaque_alphas(
         self, element: str, color_type: np.dtype[np.generic]
@@ -812,26 +889,18 @@ class _Properties:
             corners: (C,) the vertex of each corner of the polygons.
             counts: (P,) how many corners each polygon has.
         """
-        texture = np.full(len(counts), -1)
         if not names:
-            return texture
+            return np.full(len(counts), -1)
         element = self._find_element_with_texture_number()
         if element is None:
-            if len(names) > 1:
-                self.notes.warn(
-                    f"of its {len(names)} textures only {format_name(names[0])} is "
-                    "used, as its faces have no texnumber"
-                )
+            self._note_single_texture(names)
             return np.zeros(len(counts), np.int64)
-        numbers = _to_integers(self.elements[element].scalars["texnumber"])
-        if element == "face":
-            texture[: len(numbers)] = numbers  # triangles of strips keep -1
-        else:
-            first_corner = np.cumsum(counts) - counts
-            # Polygons without corners at the end would begin past the last corner.
-            first_corner = np.minimum(first_corner, len(corners) - 1)
-            texture = numbers[corners[first_corner]]
-        is_wrong = (texture < -1) | (texture >= len(names))
+        texture = self._read_texture_numbers(element, corners, counts)
+        return self._remove_wrong_numbers(texture, len(names))
+
+    def _remove_wrong_numbers(self, texture: IntArray, n_textures: int) -> IntArray:
+        """Return indices of textures (P,), -1 for those that do not exist, with a note."""
+        is_wrong = (texture < -1) | (texture >= n_textures)
         n_wrong = int(is_wrong.sum())
         if n_wrong:
             self.notes.warn(
@@ -839,6 +908,35 @@ class _Properties:
                 "texture; they have none"
             )
         return np.where(is_wrong, -1, texture)
+
+    def _note_single_texture(self, names: Sequence[str]) -> None:
+        """Note that only the first of several textures is used."""
+        if len(names) > 1:
+            self.notes.warn(
+                f"of its {len(names)} textures only {format_name(names[0])} is "
+                "used, as its faces have no texnumber"
+            )
+
+    def _read_texture_numbers(
+        self, element: str, corners: IntArray, counts: IntArray
+    ) -> IntArray:
+        """Return the `texnumber` of each polygon, (P,), as the file states it.
+
+        Args:
+            element: the element that has them, "face" or "vertex".
+            corners: (C,) the vertex of each corner of the polygons.
+            counts: (P,) how many corners each polygon has.
+        """
+        numbers = _to_integers(self.elements[element].scalars["texnumber"])
+        if element == "face":
+            texture = np.full(len(counts), -1)
+            texture[: len(numbers)] = numbers  # triangles of strips keep -1
+            return texture
+        first_corner = np.cumsum(counts) - counts
+        # Polygons without corners at the end would begin past the last corner.
+        first_corner = np.minimum(first_corner, len(corners) - 1)
+        texture_numbers: IntArray = numbers[corners[first_corner]]
+        return texture_numbers
 
     def _find_element_with_texture_number(self) -> str | None:
         """Return which element has a `texnumber`: faces, else vertices, or none."""
@@ -851,9 +949,10 @@ class _Properties:
     def make_surfaces(
         self, names: Sequence[str], *, has_no_colors: bool
     ) -> list[ImportedSurface]:
-        """Return the surface of each texture.
+        """Return the surface of each texture, and one without texture as the last.
 
-        The alpha of textures is left out, with a note if it is not opaque.
+        The last one is also found by the index -1 of faces without a texture. The alpha
+        of textures is left out, with a note if it is not opaque.
 
         Args:
             names: names of the texture files.
@@ -864,22 +963,41 @@ class _Properties:
         pictures = FileImages(
             materials=len(names), references=references, notes=self.notes
         )
-        surfaces = {}
         substitute = "the colours of its vertices or faces are"
         if has_no_colors:
             substitute = "neutral grey is"
+        # The blank makes the file the subject: "chair.ply names the texture ...".
+        note_template = (
+            f" names the texture {{name}}, which {{why}}; {substitute} used instead"
+        )
+        surfaces = {}
         for name in dict.fromkeys(names):
-            # The blank makes the file the subject: "chair.ply names the texture ...".
-            note_template = (
-                f" names the texture {{name}}, which {{why}}; {substitute} used instead"
-            )
-            texture = pictures.load_file(name, "colours and alpha", note_template)
-            if texture is not None:
-                if texture[:, :, 3].min() < 1.0:
-                    self.notes.warn(f"the alpha of {format_name(name)} is left out")
-                texture = np.ascontiguousarray(texture[:, :, :3])
+            texture = self._load_opaque_texture(pictures, name, note_template)
             surfaces[name] = ImportedSurface(texture=texture, name=name)
-        return [surfaces[name] for name in names]
+        return [*(surfaces[name] for name in names), ImportedSurface()]
+
+    def _load_opaque_texture(
+        self, pictures: FileImages, name: str, note_template: str
+    ) -> Float32Array | None:
+        """Return the texture (H, W, 3) of a file without its alpha, or None with a note."""
+        texture = pictures.load_file(name, "colours and alpha", note_template)
+        if texture is None:
+            return None
+        if texture[:, :, 3].min() < 1.0:
+            self.notes.warn(f"the alpha of {format_name(name)} is left out")
+        return np.ascontiguousarray(texture[:, :, :3])
+
+
+def _find_distinct_pairs(pairs: Float64Array) -> tuple[Float64Array, IntArray]:
+    """Return the distinct pairs (D, 2) out of pairs (N, 2), and the index of each, (N,).
+
+    As complex numbers, u + v i, pairs are compared as single values.
+    """
+    distinct_pairs, index_of_pair = np.unique(
+        pairs.view(np.complex128), return_inverse=True
+    )
+    distinct = distinct_pairs.view(np.float64).reshape(-1, 2)
+    return distinct, index_of_pair.reshape(-1)
 
 
 def _to_integers(values: npt.NDArray[np.generic]) -> IntArray:
@@ -926,18 +1044,7 @@ def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
         counts: (S,) how many vertices each strip has.
     """
     is_end_mark = vertices < 0
-    # Strips start at the beginning of each list, and after each end mark. An end mark
-    # may be the last vertex, and an empty list may be the last one: then the start is
-    # beyond the last vertex, and there is one entry more for it.
-    is_strip_start = np.zeros(len(vertices) + 1, dtype=np.bool_)
-    list_starts = np.cumsum(counts) - counts
-    is_strip_start[list_starts] = True
-    is_strip_start[np.flatnonzero(is_end_mark) + 1] = True
-    # (N,) for each vertex its index, the index of its strip's first vertex, and its
-    # position in the strip
-    index = np.arange(len(vertices))
-    strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
-    position = index - strip_start
+    position = _find_positions_in_strips(is_end_mark, counts)
     # Every vertex of a strip, except the first two, is the last one of a triangle.
     last_corner = np.flatnonzero((position >= 2) & ~is_end_mark)
     triangles: IntArray = np.stack(
@@ -951,3 +1058,25 @@ def _split_strips(vertices: IntArray, counts: IntArray) -> IntArray:
     a, b, c = triangles.T
     is_degenerate = (a == b) | (b == c) | (a == c)
     return np.asarray(triangles[~is_degenerate])
+
+
+def _find_positions_in_strips(is_end_mark: BoolArray, counts: IntArray) -> IntArray:
+    """Return the position (N,) of each vertex in its strip, from 0.
+
+    Strips start at the beginning of each list, and after each end mark.
+
+    Args:
+        is_end_mark: (N,) which vertices of all lists end a strip.
+        counts: (S,) how many vertices each list has.
+    """
+    # An end mark may be the last vertex, and an empty list may be the last one: then
+    # the start is beyond the last vertex, and there is one entry more for it.
+    is_strip_start = np.zeros(len(is_end_mark) + 1, dtype=np.bool_)
+    list_starts = np.cumsum(counts) - counts
+    is_strip_start[list_starts] = True
+    is_strip_start[np.flatnonzero(is_end_mark) + 1] = True
+    # (N,) for each vertex its index, and the index of its strip's first vertex
+    index = np.arange(len(is_end_mark))
+    strip_start = np.maximum.accumulate(np.where(is_strip_start[:-1], index, 0))
+    index_in_strip: IntArray = index - strip_start
+    return index_in_strip

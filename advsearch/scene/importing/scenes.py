@@ -38,6 +38,7 @@ from advsearch.scene.importing.gltf_entries import (
     CameraEntry,
     Header,
     LightEntry,
+    Perspective,
 )
 from advsearch.scene.importing.gltf_skeleton import iterate_node_poses
 from advsearch.scene.importing.objects import find_front_axis, make_object, read_parts
@@ -132,23 +133,35 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     surroundings = _make_surrounding_meshes(
         path, header, parts, object_nodes, names, front, frame, notes
     )
-    candela_per_unit, unit_note = _find_light_unit(header, parts, bool(lights))
-    if unit_note:
-        notes.append(f"{path.name}: {unit_note}")
+    candela_per_unit = _choose_light_unit(path, header, parts, bool(lights), notes)
     surroundings += _make_lamps(
         path, header, lights, candela_per_unit, node_poses, names, frame
     )
     cameras = _make_cameras(path, header, node_poses, frame)
     notes.extend(gltf_parts.describe_changed_lights(header, path.name))
-    asset = make_object(
-        object_parts,
+    asset = _make_node_object(path, node, object_parts, front, notes)
+    return ImportedScene(asset, tuple(surroundings), cameras)
+
+
+def _make_node_object(
+    path: Path,
+    node: str,
+    parts: list[ImportedPart],
+    front: FileAxis,
+    notes: list[str],
+) -> ObjectAsset:
+    """Return the parts of a node as the object, whose name has those of file and node.
+
+    `notes` are warnings about the file so far.
+    """
+    return make_object(
+        parts,
         notes,
         file=path,
         name=f"{make_safe_name(path)}-{sanitize_name(node)}",
         up="y",
         front=front,
     )
-    return ImportedScene(asset, tuple(surroundings), cameras)
 
 
 def _find_node_lights(header: Header, nodes: Iterable[int]) -> dict[int, LightEntry]:
@@ -243,9 +256,8 @@ def _find_node(
         UnknownNameError: no candidate has the name.
         InputError: several candidates have the name.
     """
-    candidates = sorted(
-        with_ancestors(header.parent_of_node, {part.node for part in parts})
-    )
+    drawing_nodes = {part.node for part in parts}
+    candidates = sorted(with_ancestors(header.parent_of_node, drawing_nodes))
     labels = {index: header.get_node_label(index) for index in candidates}
     matches = [
         index for index, label in labels.items() if name in (label, f"node {index}")
@@ -254,12 +266,19 @@ def _find_node(
         known_names = list(dict.fromkeys(labels.values()))
         raise UnknownNameError(f"node of {path.name}", name, known_names)
     if len(matches) > 1:
-        choices = ", ".join(f"{path.name}#node {index}" for index in matches[:10])
-        raise InputError(
-            f"{path}: {len(matches)} nodes have the name {format_name(name)}; choose "
-            f"one of {choices}"
-        )
+        raise _make_ambiguous_node_error(path, name, matches)
     return matches[0]
+
+
+def _make_ambiguous_node_error(
+    path: Path, name: str, matches: Sequence[int]
+) -> InputError:
+    """Return the error for a name that several nodes have, which are listed."""
+    choices = ", ".join(f"{path.name}#node {index}" for index in matches[:10])
+    return InputError(
+        f"{path}: {len(matches)} nodes have the name {format_name(name)}; choose "
+        f"one of {choices}"
+    )
 
 
 def _check_surroundings(path: Path, count: int) -> None:
@@ -297,9 +316,8 @@ def _make_surrounding_mesh(
     mesh_to_object = np.eye(4)
     mesh_to_object[:3, :3] *= frame.size / object_frame.size
     mesh_to_object[:3, 3] = object_frame.to_frame(frame.origin)
-    return make_mesh_part(
-        shape.name, shape, mesh_to_object, shape.material
-    ), shape.warnings
+    part = make_mesh_part(shape.name, shape, mesh_to_object, shape.material)
+    return part, shape.warnings
 
 
 def list_node_names(path: Path) -> list[str]:
@@ -382,32 +400,47 @@ def read_file_contents(path: Path) -> FileContents:
     # Errors about an unknown suffix also list the one of Mitsuba's files.
     data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_SUFFIX))
     parts, notes = read_parts(path, data)
-    name = make_safe_name(path)
     if path.suffix.lower() not in GLTF_SUFFIXES:
-        front = find_front_axis(path, header=None)
         # The axis that points up is guessed from the shape.
-        asset = make_object(parts, notes, file=path, name=name, up=None, front=front)
-        return FileContents(asset)
+        return FileContents(_make_full_object(path, parts, notes, header=None))
     header = gltf.read_header(path, data)
     notes += gltf_parts.describe_changed_lights(header, path.name)
-    asset = make_object(
-        parts, notes, file=path, name=name, up="y", front=find_front_axis(path, header)
+    asset = _make_full_object(path, parts, notes, header)
+    light_names = tuple(
+        light.name or f"light {index}" for index, light in enumerate(header.lights)
     )
+    node_poses = dict(iterate_node_poses(header))
+    camera_names = tuple(_make_camera_names(header, node_poses).values())
+    nodes = _measure_nodes(header, parts)
+    return FileContents(asset, nodes, light_names, camera_names)
+
+
+def _make_full_object(
+    path: Path, parts: list[ImportedPart], notes: list[str], header: Header | None
+) -> ObjectAsset:
+    """Return all parts of a file as one object; y is up in glTF, which has a header."""
+    return make_object(
+        parts,
+        notes,
+        file=path,
+        name=make_safe_name(path),
+        up=None if header is None else "y",
+        front=find_front_axis(path, header),
+    )
+
+
+def _measure_nodes(
+    header: Header, parts: Sequence[ImportedPart]
+) -> tuple[NodeContents, ...]:
+    """Return the contents of the nodes with parts, in their order."""
     parts_of_node = _group_by_node(parts)
     mesh_names = _make_mesh_names(header, parts, UniqueNames(RESERVED_NAMES))
-    nodes = [
+    return tuple(
         _measure_node(
             header.get_node_label(index), mesh_names[index], parts_of_node[index]
         )
         for index in sorted(parts_of_node)
-    ]
-    lights = tuple(
-        light.name or f"light {index}" for index, light in enumerate(header.lights)
     )
-    cameras = tuple(
-        _make_camera_names(header, dict(iterate_node_poses(header))).values()
-    )
-    return FileContents(asset, tuple(nodes), lights, cameras)
 
 
 def _measure_node(
@@ -449,14 +482,8 @@ def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFra
         parts: the parts.
         turn: rotation (3, 3) from the file's axes to ours.
     """
-    face_corners = []
-    for part in select_visible_parts(parts):
-        triangles = part.vertices[part.faces]
-        doubled_area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
-        extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
-        has_area = doubled_area > MIN_DOUBLED_AREA * extent**2
-        face_corners.append(triangles[has_area].reshape(-1, 3))
-    points = np.concatenate(face_corners) @ turn.T
+    face_corners = map(_find_visible_corners, select_visible_parts(parts))
+    points = np.concatenate(list(face_corners)) @ turn.T
     is_valid = (
         np.isfinite(points).all() and len(points) and np.ptp(points, axis=0).max() > 0.0
     )
@@ -465,6 +492,33 @@ def _compute_frame(parts: Sequence[ImportedPart], turn: Float64Array) -> FileFra
         return FileFrame(size=1.0, origin=np.zeros(3), rotation=turn)
     origin, size = find_footing(points)
     return FileFrame(size=size, origin=origin, rotation=turn)
+
+
+def _find_visible_corners(part: ImportedPart) -> Float64Array:
+    """Return the corners (3 F, 3) of the faces of a part that have an area."""
+    triangles = part.vertices[part.faces]
+    doubled_area = np.linalg.norm(compute_area_vectors(triangles), axis=1)
+    extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    has_area = doubled_area > MIN_DOUBLED_AREA * extent**2
+    corners: Float64Array = triangles[has_area].reshape(-1, 3)
+    return corners
+
+
+def _choose_light_unit(
+    path: Path,
+    header: Header,
+    parts: Sequence[ImportedPart],
+    has_lights: bool,
+    notes: list[str],
+) -> float:
+    """Return how many candela are one unit of radiant intensity, which may be noted.
+
+    The arguments are those of `_find_light_unit`, and warnings about the file `path`.
+    """
+    candela_per_unit, unit_note = _find_light_unit(header, parts, has_lights)
+    if unit_note:
+        notes.append(f"{path.name}: {unit_note}")
+    return candela_per_unit
 
 
 def _find_light_unit(
@@ -536,19 +590,8 @@ def _make_lamp(
         InputError: it is too far away or too bright.
     """
     position, intensity = _position_light(light, candela_per_unit, pose, frame)
-    # `MAX_DISTANCE` is also the limit of intensities. NaN is out of range.
-    is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE
-    if not is_in_range.all():
-        raise InputError(
-            f"{path}: expected the light {name} within {MAX_DISTANCE:g} object sizes, "
-            f"and with an intensity of at most {MAX_DISTANCE:g}, got more; correct its "
-            "position or its intensity, or remove it"
-        )
-    x, y, z = map(float, position)
-    red, green, blue = map(float, intensity)
-    lamp = PointLamp(
-        name, dark=not intensity.any(), position=(x, y, z), intensity=(red, green, blue)
-    )
+    _check_light(path, name, position, intensity)
+    lamp = _make_point_lamp(name, position, intensity)
     if light.type != "spot":
         return lamp
     return SpotLamp(
@@ -557,6 +600,32 @@ def _make_lamp(
         cutoff=math.degrees(light.spot.outerConeAngle),
         beam=math.degrees(light.spot.innerConeAngle),
     )
+
+
+def _make_point_lamp(
+    name: str, position: Float64Array, intensity: Float64Array
+) -> PointLamp:
+    """Return a lamp at a position (3,) with a radiant intensity (3,)."""
+    x, y, z = map(float, position)
+    red, green, blue = map(float, intensity)
+    is_dark = not intensity.any()
+    return PointLamp(
+        name, dark=is_dark, position=(x, y, z), intensity=(red, green, blue)
+    )
+
+
+def _check_light(
+    path: Path, name: str, position: Float64Array, intensity: Float64Array
+) -> None:
+    """Raise InputError if a light is too far away or too bright."""
+    # `MAX_DISTANCE` is also the limit of intensities. NaN is out of range.
+    is_in_range = np.abs([*position, *intensity]) <= MAX_DISTANCE
+    if not is_in_range.all():
+        raise InputError(
+            f"{path}: expected the light {name} within {MAX_DISTANCE:g} object sizes, "
+            f"and with an intensity of at most {MAX_DISTANCE:g}, got more; correct its "
+            "position or its intensity, or remove it"
+        )
 
 
 def _position_light(
@@ -624,27 +693,41 @@ def _make_camera(
             field of view.
     """
     assert camera.perspective is not None
-    # The columns are the camera's axes in our coordinates. The scale of its node has no
-    # effect, so they are made unit vectors.
+    matrix = _compute_camera_pose(pose, frame)
+    fov = _compute_fov_degrees(camera.perspective)
+    problem = _find_camera_problem(matrix, fov)
+    if problem:
+        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
+    return PosedCamera(matrix, fov, upright=camera.perspective.aspectRatio is None)
+
+
+def _compute_camera_pose(pose: Float64Array, frame: FileFrame) -> Float64Array:
+    """Return the pose (4, 4) of a camera in a frame, from the pose of its node in the file.
+
+    The first three columns are the camera's axes, as unit vectors: the scale of its
+    node has no effect.
+    """
     axes = frame.rotation @ pose[:3, :3] @ GLTF_CAMERA_AXES
     axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-12)
     matrix = np.eye(4)
     matrix[:3, :3] = axes
     # `to_frame` moves and scales points that are rotated to our axes already.
     matrix[:3, 3] = frame.to_frame(frame.rotation @ pose[:3, 3])
-    # `yfov` is the field of view along the height. Ours is along the larger side: in a
-    # wide image that is the width, whose tangent is larger by the aspect ratio. If the
-    # file has no aspect ratio, that of the rendered image is used (glTF 2.0, section
-    # 5.13). It is not known here, so that `upright` states that `fov` is along the
-    # height.
-    aspect_ratio = camera.perspective.aspectRatio
+    return matrix
+
+
+def _compute_fov_degrees(perspective: Perspective) -> float:
+    """Return the field of view of a camera along the larger side of its image, degrees.
+
+    `yfov` is the field of view along the height. In a wide image the larger side is the
+    width, whose tangent is larger by the aspect ratio. If the file has no aspect ratio,
+    that of the rendered image is used (glTF 2.0, section 5.13). It is not known here,
+    so that the result is along the height.
+    """
+    aspect_ratio = perspective.aspectRatio
     larger_side_ratio = 1.0 if aspect_ratio is None else max(aspect_ratio, 1.0)
-    half_tangent = math.tan(camera.perspective.yfov / 2.0)
-    fov = math.degrees(2.0 * math.atan(half_tangent * larger_side_ratio))
-    problem = _find_camera_problem(matrix, fov)
-    if problem:
-        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
-    return PosedCamera(matrix, fov, upright=aspect_ratio is None)
+    half_tangent = math.tan(perspective.yfov / 2.0)
+    return math.degrees(2.0 * math.atan(half_tangent * larger_side_ratio))
 
 
 def _find_camera_problem(matrix: Float64Array, fov: float) -> str | None:
@@ -657,10 +740,21 @@ def _find_camera_problem(matrix: Float64Array, fov: float) -> str | None:
         matrix: (4, 4) its pose, with unit vectors as axes.
         fov: its field of view in degrees.
     """
-    axes = matrix[:3, :3]
     is_near = (np.abs(matrix[:3, 3]) <= MAX_DISTANCE).all()  # False for NaN
     if not is_near:
         return f"within {MAX_DISTANCE:g} object sizes, got more; correct its position"
+    axes_problem = _find_axes_problem(matrix[:3, :3])
+    if axes_problem is not None:
+        return axes_problem
+    if not 0.0 < fov <= MAX_FOV:
+        return (
+            f"with a field of view up to {MAX_FOV:g} degrees, got {fov:.4g}; correct it"
+        )
+    return None
+
+
+def _find_axes_problem(axes: Float64Array) -> str | None:
+    """Return what is wrong with the axes of a camera, the columns (3, 3), or None."""
     if not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
         return (
             "to have a direction, got axes without length; correct the scale of its "
@@ -673,9 +767,5 @@ def _find_camera_problem(matrix: Float64Array, fov: float) -> str | None:
         advice = "apply the scale of the nodes above it (in Blender Ctrl A)"
         return (
             f"under nodes that only rotate, move and scale it, got {got} axes; {advice}"
-        )
-    if not 0.0 < fov <= MAX_FOV:
-        return (
-            f"with a field of view up to {MAX_FOV:g} degrees, got {fov:.4g}; correct it"
         )
     return None

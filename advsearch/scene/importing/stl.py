@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Float32Array, Float64Array
+from advsearch.scene.assets import BoolArray, Float32Array, Float64Array
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import Notes, decode_text, detect_file_kind
 from advsearch.scene.importing.parts import NEUTRAL_GREY, ImportedPart, ImportedSurface
@@ -46,9 +47,7 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     Raises:
         FileFormatError: the file is corrupt, or has no facets.
     """
-    n_facets = 0
-    if len(data) >= _FACETS_START:
-        (n_facets,) = struct.unpack_from("<I", data, _HEADER_SIZE)
+    n_facets = _read_n_facets(data)
     expected_size = _FACETS_START + _FACET_DTYPE.itemsize * n_facets
     corner_colors = None
     if len(data) == expected_size:
@@ -57,27 +56,50 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _parse_text(data, notes)
     else:
-        got = detect_file_kind(data)
-        if got is None:
-            got = f"{len(data)} bytes, which is neither ASCII nor that long"
-        raise notes.damaged(
-            f"an STL file (in binary, {expected_size} bytes for its number of facets)",
-            got,
-        )
+        raise _make_size_error(data, expected_size, notes)
     if not len(points):
         raise FileFormatError(
             f"{path}: expected a mesh with faces, got none; export triangles"
         )
+    return [_make_facets_part(points, corner_colors)]
+
+
+def _read_n_facets(data: bytes) -> int:
+    """Return the number of facets that a binary file states; 0 for a shorter file."""
+    if len(data) < _FACETS_START:
+        return 0
+    n_facets: int = struct.unpack_from("<I", data, _HEADER_SIZE)[0]
+    return n_facets
+
+
+def _make_size_error(data: bytes, expected_size: int, notes: Notes) -> FileFormatError:
+    """Return the error for a file that is no text, and has no size of a binary file."""
+    got = detect_file_kind(data)
+    if got is None:
+        got = f"{len(data)} bytes, which is neither ASCII nor that long"
+    return notes.damaged(
+        f"an STL file (in binary, {expected_size} bytes for its number of facets)",
+        got,
+    )
+
+
+def _make_facets_part(
+    points: Float64Array, corner_colors: Float64Array | None
+) -> ImportedPart:
+    """Return facets as a part.
+
+    Args:
+        points: (3 F, 3) their corners.
+        corner_colors: (F, 3, 3) linear colors of the corners, or None.
+    """
     surface = ImportedSurface()
     if corner_colors is not None:
         # white, which the colors of facets multiply
         surface = ImportedSurface(color=np.ones(3, np.float32))
     faces = np.arange(len(points)).reshape(-1, 3)
-    return [
-        ImportedPart(
-            vertices=points, faces=faces, colors=corner_colors, surface=surface
-        )
-    ]
+    return ImportedPart(
+        vertices=points, faces=faces, colors=corner_colors, surface=surface
+    )
 
 
 def _read_facets(data: bytes, notes: Notes) -> tuple[Float64Array, Float64Array | None]:
@@ -137,16 +159,27 @@ def _parse_text(data: bytes, notes: Notes) -> Float64Array:
         raise notes.damaged(
             "facets with 3 vertices", f"{len(vertices):,} vertices in all"
         )
+    points = _parse_vertices(vertices, notes)
+    _record_unknown_words(data, notes)
+    return points.reshape(-1, 3)
+
+
+def _parse_vertices(vertices: list[Any], notes: Notes) -> Float64Array:
+    """Return the numbers of matches of `_VERTEX`; raise FileFormatError for other words."""
     try:
         points = np.array(vertices).astype(np.float64)
     except ValueError:
         raise notes.damaged(
             "three numbers after each 'vertex'", "something else"
         ) from None
+    return points
+
+
+def _record_unknown_words(data: bytes, notes: Notes) -> None:
+    """Record the first words of lines that the format does not have."""
     for word in re.findall(rb"^[ \t]*([^\s\d]\S*)", data, re.MULTILINE):
         if decode_text(word).lower() not in _WORDS:
             notes.record("statement", decode_text(word))
-    return points.reshape(-1, 3)
 
 
 def _read_colors(
@@ -169,26 +202,39 @@ def _read_colors(
     # (F, 3) the highest bits first, which are VisCAM's red and Magics' blue
     channels = [(attributes >> shift) & 31 for shift in (10, 5, 0)]
     colors = np.stack(channels, axis=1).astype(np.float32) / np.float32(31.0)
+    is_flag_set = attributes & _COLOR_FLAG != 0
     object_color = _read_magics_color(head, notes)
     if object_color is not None:
-        colors = colors[:, ::-1]
-        default_color = object_color
         # If no facet has any bit set, colors were not stored, and all facets have the
         # object's.
-        has_any_bits = bool(attributes.any())
-        is_flag_unset = attributes & _COLOR_FLAG == 0
-        has_color = is_flag_unset & has_any_bits
-    else:
-        default_color = np.full(3, NEUTRAL_GREY, np.float32)
-        has_color = attributes & _COLOR_FLAG != 0
-        if not has_color.any():
-            if attributes.any():
-                # a kind and a name, as in "property 'confidence' is left out"
-                notes.record(
-                    "attribute bytes of its facets, which are no colours of Magics or "
-                    "VisCAM,",
-                    f"{attributes.max():#06x}",
-                )
-            return None
+        has_color = ~is_flag_set & bool(attributes.any())
+        return _fill_colors(colors[:, ::-1], has_color, object_color)
+    if is_flag_set.any():
+        neutral_color = np.full(3, NEUTRAL_GREY, np.float32)
+        return _fill_colors(colors, is_flag_set, neutral_color)
+    _record_attributes(attributes, notes)
+    return None
+
+
+def _fill_colors(
+    colors: Float32Array, has_color: BoolArray, default_color: Float32Array
+) -> Float64Array:
+    """Return linear colors (F, 3): display colors of facets that have one, or a default.
+
+    Args:
+        colors: (F, 3) display colors of facets.
+        has_color: (F,) which facets have a color.
+        default_color: (3,) display color of the others.
+    """
     display = np.where(has_color[:, None], colors, default_color).astype(np.float32)
     return np.asarray(srgb_to_linear(display), dtype=np.float64)
+
+
+def _record_attributes(attributes: Attributes, notes: Notes) -> None:
+    """Record the largest of the attributes (F,) that are no colors, unless it is 0."""
+    if attributes.any():
+        # a kind and a name, as in "property 'confidence' is left out"
+        notes.record(
+            "attribute bytes of its facets, which are no colours of Magics or VisCAM,",
+            f"{attributes.max():#06x}",
+        )

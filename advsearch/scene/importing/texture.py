@@ -15,7 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
-from advsearch.scene.assets import Float32Array, Float64Array, IntArray, group_indices
+from advsearch.scene.assets import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    IntArray,
+    group_indices,
+)
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.geometry import (
@@ -110,24 +116,39 @@ def apply_textures(
     # `soup.colors` are vertex colors, factors of the base color.
     has_uniform_factor = bool((soup.colors == soup.colors[0, 0]).all())
     _, material_of_face = index_materials(soup, surfaces)
-    # Objects that need no baking are returned in this block.
-    shares_emission = False
+    cropped = None
     if is_uniform and has_uniform_factor:
         if not first_surface.images:
             return _texture_plain(soup, first_surface, material_of_face)
         cropped = _crop_images(soup, first_surface)
-        if cropped is not None:
-            uvs, images = cropped
-            shares_emission = _shares_emission(uvs, first_surface, images)
-            if not shares_emission:
-                return _texture_with_images(
-                    soup, uvs, first_surface.with_images(images)
-                )
+    if cropped is None:
+        reason = _describe_reason(soup, used_surfaces, is_uniform, has_uniform_factor)
+        return _unwrap_and_bake(soup, surfaces, material_of_face, reason, notes)
+    uvs, images = cropped
+    if _shares_emission(uvs, first_surface, images):
+        reason = SHARED_LIGHT_REASON
+        return _unwrap_and_bake(soup, surfaces, material_of_face, reason, notes)
+    return _texture_with_images(soup, uvs, first_surface.with_images(images))
+
+
+def _unwrap_and_bake(
+    soup: TriangleSoup,
+    surfaces: Sequence[ImportedSurface],
+    material_of_face: IntArray,
+    reason: str,
+    notes: Notes,
+) -> tuple[TriangleSoup, SurfaceMaps]:
+    """Return a soup with new UVs, and the maps that are baked for it.
+
+    Args:
+        soup: the object.
+        surfaces: the surface of each of its parts.
+        material_of_face: (F,) index of each face's material.
+        reason: why it is baked, for the note.
+        notes: notes about the file.
+    """
     unwrapped_soup = unwrap(soup, material_of_face)
     maps = bake(unwrapped_soup.uvs, soup, surfaces)
-    reason = SHARED_LIGHT_REASON
-    if not shares_emission:
-        reason = _describe_reason(soup, used_surfaces, is_uniform, has_uniform_factor)
     notes.warn(f"{reason} ({_describe_size(len(maps.color), soup, surfaces)})")
     return unwrapped_soup, maps
 
@@ -203,9 +224,8 @@ def _has_overlap(uvs: Float64Array, material: IntArray) -> bool:
     size = BAKED_SIZE
     # The negative tolerance leaves out texels on the border of a face, which neighbours
     # share.
-    face, row, column, _ = rasterize_triangles(
-        uvs * size - 0.5, (size, size), tolerance=-1e-6
-    )
+    texels = uvs * size - 0.5
+    face, row, column, _ = rasterize_triangles(texels, (size, size), tolerance=-1e-6)
     # Smallest and largest material on each texel: if they differ, it is shared. Texels
     # without a face have a largest one of -1.
     texel = row * size + column
@@ -278,27 +298,35 @@ def _describe_reason(
         has_uniform_factor: whether vertex colors are the same everywhere.
     """
     if not is_uniform:
-        # Materials without a name are different if they are different objects.
-        n_materials = len({surface.name or id(surface) for surface in used})
-        if n_materials > 1:
-            baked_things = f"the colours of its {n_materials} materials"
-        else:
-            baked_things = "the pictures of its material"
-        return f"{baked_things} were baked into one texture"
+        return f"{_describe_materials(used)} were baked into one texture"
     is_tinted = soup.colors.min() < 1.0
     if not has_uniform_factor or is_tinted:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
-        substitute = "its normal map is left out"
-        if used[0].texture is not None:
-            substitute = "the texture's mean colour is used"
-        return (
-            "it has a texture, but lacks texture coordinates; where they are missing, "
-            f"{substitute}"
-        )
+        return _describe_missing_uvs(used[0])
     return (
         "its texture coordinates repeat or hardly use the texture; it was unwrapped "
         "anew and its texture resampled"
+    )
+
+
+def _describe_materials(used: Sequence[ImportedSurface]) -> str:
+    """Describe what of an object's surfaces is baked, as the subject of a sentence."""
+    # Materials without a name are different if they are different objects.
+    n_materials = len({surface.name or id(surface) for surface in used})
+    if n_materials > 1:
+        return f"the colours of its {n_materials} materials"
+    return "the pictures of its material"
+
+
+def _describe_missing_uvs(surface: ImportedSurface) -> str:
+    """Return the sentence about an object with one surface that lacks UVs."""
+    substitute = "its normal map is left out"
+    if surface.texture is not None:
+        substitute = "the texture's mean colour is used"
+    return (
+        "it has a texture, but lacks texture coordinates; where they are missing, "
+        f"{substitute}"
     )
 
 
@@ -424,14 +452,7 @@ def _crop_to_window(
     window_lower = uvs.min(axis=(0, 1)) - largest_texel
     window_upper = uvs.max(axis=(0, 1)) + largest_texel
     window_size = window_upper - window_lower
-    # The window is a texel larger than the UVs, which is allowed for here.
-    tolerance = largest_texel.max()
-    is_inside = (
-        window_lower.min() >= -_UV_TOLERANCE - tolerance
-        and window_upper.max() <= 1.0 + _UV_TOLERANCE + tolerance
-    )
-    uv_area = np.abs(compute_doubled_areas(uvs)).sum() / 2.0
-    fills_square = is_inside and uv_area >= _MIN_UV_AREA
+    fills_square = _fills_square(uvs, window_lower, window_upper, largest_texel.max())
     if window_size.max() > _MAX_WINDOW or fills_square:
         return uvs, pictures
     cropped = [
@@ -439,6 +460,27 @@ def _crop_to_window(
         for picture in pictures
     ]
     return (uvs - window_lower) / window_size, cropped
+
+
+def _fills_square(
+    uvs: Float64Array,
+    window_lower: Float64Array,
+    window_upper: Float64Array,
+    tolerance: float,
+) -> bool:
+    """Return whether UVs are inside of the unit square, and use enough of it.
+
+    Args:
+        uvs: (F, 3, 2).
+        window_lower, window_upper: (2,) corners of the window.
+        tolerance: by how much the window is larger than the UVs.
+    """
+    is_inside = (
+        window_lower.min() >= -_UV_TOLERANCE - tolerance
+        and window_upper.max() <= 1.0 + _UV_TOLERANCE + tolerance
+    )
+    uv_area = np.abs(compute_doubled_areas(uvs)).sum() / 2.0
+    return bool(is_inside and uv_area >= _MIN_UV_AREA)
 
 
 def _get_size(picture: Float32Array) -> IntArray:
@@ -508,14 +550,10 @@ def bake(
         Maps (N, N, ...) with room for the texels that the object shows.
     """
     size = _choose_size(_count_texels(soup, surfaces))
-    texels = _Texels(
-        *rasterize_triangles(
-            _to_texels(uvs, (size, size)), (size, size), tolerance=1e-9
-        )
-    )
+    texels = _rasterize(uvs, size)
     maps = _make_blank_maps(surfaces, size)
     # (T, 3) factor of the base color at each texel
-    factor = np.einsum("tk,tkc->tc", texels.weights, soup.colors[texels.face])
+    factor = texels.interpolate(soup.colors)
     # the texels of each part, up to the last one that has any
     texels_of_part = group_indices(soup.part_of_face[texels.face])
     for surface, index in zip(surfaces, texels_of_part, strict=False):
@@ -524,13 +562,21 @@ def bake(
         part_texels = texels.select(index)
         file_uvs = part_texels.interpolate(soup.uvs)
         color = _sample_base_color(surface, file_uvs, soup, surfaces)
-        tinted_color = _tint(color, factor[index])
-        maps.color[part_texels.row, part_texels.column, : color.shape[1]] = tinted_color
+        _put_colors(maps.color, part_texels, _tint(color, factor[index]))
         if np.isfinite(file_uvs).all():
             _bake_bumps_and_emission(maps, surface, part_texels, file_uvs, soup, uvs)
-    is_inside = np.zeros((size, size), np.bool_)
-    is_inside[texels.row, texels.column] = True
-    return _fill_gaps(maps, is_inside)
+    return _fill_gaps(maps, texels.make_mask(size))
+
+
+def _put_colors(color_map: Float32Array, texels: _Texels, colors: Float32Array) -> None:
+    """Put colors (T, C) into texels of a map (N, N, C or 4), whose opacity may stay."""
+    color_map[texels.row, texels.column, : colors.shape[1]] = colors
+
+
+def _rasterize(uvs: Float64Array, size: int) -> _Texels:
+    """Return the texels of a square map that faces with UVs (F, 3, 2) cover."""
+    corners = _to_texels(uvs, (size, size))
+    return _Texels(*rasterize_triangles(corners, (size, size), tolerance=1e-9))
 
 
 def _bake_bumps_and_emission(
@@ -554,12 +600,9 @@ def _bake_bumps_and_emission(
     y = texels.row
     x = texels.column
     if maps.normals is not None and surface.normal_map is not None:
+        colors = sample_texture(surface.normal_map, file_uvs)
         maps.normals[y, x] = convert_normals(
-            sample_texture(surface.normal_map, file_uvs),
-            soup,
-            uvs,
-            texels.face,
-            texels.weights,
+            colors, soup, uvs, texels.face, texels.weights
         )
     if maps.emission is not None and surface.emission is not None:
         maps.emission[y, x] = sample_texture(surface.emission, file_uvs)
@@ -589,6 +632,12 @@ class _Texels(NamedTuple):
     def interpolate(self, values: Float64Array) -> Float64Array:
         """Return values (F, 3, C) of corners at the texels, (T, C)."""
         return np.asarray(np.einsum("tk,tkc->tc", self.weights, values[self.face]))
+
+    def make_mask(self, size: int) -> BoolArray:
+        """Return which texels (size, size) of a square map these are."""
+        is_covered = np.zeros((size, size), np.bool_)
+        is_covered[self.row, self.column] = True
+        return is_covered
 
 
 def _make_blank_maps(surfaces: Sequence[ImportedSurface], size: int) -> SurfaceMaps:
@@ -655,15 +704,25 @@ def _sample_base_color(
     if surface.texture is None:
         color = _get_plain_color(surface)
     else:
-        # several parts may have the same texture
-        shows_texture = [other.texture is surface.texture for other in surfaces]
-        is_selected = np.array(shows_texture)[soup.part_of_face]
-        areas = np.linalg.norm(soup.compute_area_vectors(), axis=1)[is_selected]
-        mean = average_over_faces(
-            _to_linear(surface.texture), soup.uvs[is_selected], areas
-        )
-        color = _to_display(mean)
+        color = _compute_mean_color(surface.texture, soup, surfaces)
     return np.broadcast_to(color[None], (len(uvs), len(color)))
+
+
+def _compute_mean_color(
+    texture: Float32Array, soup: TriangleSoup, surfaces: Sequence[ImportedSurface]
+) -> Float32Array:
+    """Return the mean color (3 or 4,) of a texture over the faces that show it.
+
+    Args:
+        texture: (H, W, 3 or 4), display-referred as the result.
+        soup: the object.
+        surfaces: the surfaces of its parts, several of which may have the texture.
+    """
+    shows_texture = [surface.texture is texture for surface in surfaces]
+    is_selected = np.array(shows_texture)[soup.part_of_face]
+    areas = np.linalg.norm(soup.compute_area_vectors(), axis=1)[is_selected]
+    mean = average_over_faces(_to_linear(texture), soup.uvs[is_selected], areas)
+    return _to_display(mean)
 
 
 def _count_texels(soup: TriangleSoup, surfaces: Sequence[ImportedSurface]) -> float:
@@ -722,13 +781,26 @@ def average_over_faces(
     n_samples = len(areas) * len(weights)
     n_batches = -(-n_samples // _MAX_SAMPLES)
     for batch in np.array_split(np.arange(len(areas)), n_batches):
-        sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs[batch]).reshape(-1, 2)
-        texels = _sample_nearest(texture, sample_uvs)
-        face_means = texels.reshape(len(batch), len(weights), -1).mean(
-            axis=1, dtype=np.float64
-        )
+        face_means = _average_each_face(texture, uvs[batch], weights)
         weighted_sum += areas[batch] @ face_means
     return np.asarray(weighted_sum / areas.sum(), np.float32)
+
+
+def _average_each_face(
+    texture: Float32Array, uvs: Float64Array, weights: Float64Array
+) -> Float64Array:
+    """Return the mean (F, C) of a texture over each of some faces.
+
+    Args:
+        texture: (H, W, C).
+        uvs: (F, 3, 2).
+        weights: (P, 3) barycentric weights of the samples.
+    """
+    sample_uvs = np.einsum("pk,fkc->fpc", weights, uvs).reshape(-1, 2)
+    texels = _sample_nearest(texture, sample_uvs)
+    samples = texels.reshape(len(uvs), len(weights), -1)
+    means: Float64Array = samples.mean(axis=1, dtype=np.float64)
+    return means
 
 
 def _compute_sample_weights(steps: int) -> Float64Array:
@@ -831,19 +903,35 @@ def _unmirror(
         maps: maps for these UVs.
     """
     soup = replace(soup, uvs=uvs)
-    normals = maps.normals
     is_mirrored = compute_doubled_areas(uvs) < 0.0
     area = np.linalg.norm(soup.compute_area_vectors(), axis=1)
     mirrored_fraction = float(area[is_mirrored].sum() / area.sum())
-    if normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
+    if maps.normals is None or mirrored_fraction < MIN_MIRRORED_FRACTION:
         return soup, maps
     if 1.0 - mirrored_fraction < MIN_MIRRORED_FRACTION:  # (almost) all are mirrored
-        return soup, replace(maps, normals=_reverse_component(normals, component=1))
-    new_uvs = uvs.copy()
-    # In units of the old width, the right half is from 1 to 2, and its u runs
-    # backwards. Then both halves are scaled to [0, 1].
+        reversed_normals = _reverse_component(maps.normals, component=1)
+        return soup, replace(maps, normals=reversed_normals)
+    new_uvs = _move_to_right_half(uvs, is_mirrored)
+    return replace(soup, uvs=new_uvs), _double_maps(maps, maps.normals)
+
+
+def _move_to_right_half(uvs: Float64Array, is_mirrored: BoolArray) -> Float64Array:
+    """Return UVs (F, 3, 2) in a map of twice the width, mirrored faces in its right half.
+
+    In units of the old width, the right half is from 1 to 2, and its u runs backwards.
+    Then both halves are scaled to [0, 1].
+    """
+    new_uvs: Float64Array = uvs.copy()
     new_uvs[is_mirrored, :, 0] = 2.0 - new_uvs[is_mirrored, :, 0]
     new_uvs[:, :, 0] /= 2.0
+    return new_uvs
+
+
+def _double_maps(maps: SurfaceMaps, normals: Float32Array) -> SurfaceMaps:
+    """Return maps of twice the width, whose right half is a mirrored copy of the left.
+
+    `normals` (H, W, 3) are those of the maps.
+    """
     # u runs the other way in the right half, so that the normals' x is reversed.
     mirrored_normals = _reverse_component(normals[:, ::-1], component=0)
     emission = maps.emission
@@ -852,7 +940,7 @@ def _unmirror(
         emission = np.concatenate([emission, emission[:, ::-1]], axis=1)
     color = np.concatenate([maps.color, maps.color[:, ::-1]], axis=1)
     normals = np.concatenate([normals, mirrored_normals], axis=1)
-    return replace(soup, uvs=new_uvs), SurfaceMaps(color, normals, emission)
+    return SurfaceMaps(color, normals, emission)
 
 
 def _reverse_component(normals: Float32Array, component: int) -> Float32Array:
@@ -894,11 +982,7 @@ def convert_normals(
     normal = normalize_vectors(np.einsum("tk,tkc->tc", weights, old_soup.normals[face]))
     old_tangent = _compute_tangents(old_soup, normal, face)
     new_tangent = _compute_tangents(replace(old_soup, uvs=new_uvs), normal, face)
-    # The bitangents have different definitions. In the file it points up the image,
-    # which is normal x tangent, or its opposite where UVs are mirrored. The result is
-    # for the renderer, in which it is always normal x tangent.
-    mirror_sign = np.sign(compute_doubled_areas(old_soup.uvs[face]))[:, None]
-    old_bitangent = np.cross(normal, old_tangent) * mirror_sign
+    old_bitangent = _compute_file_bitangents(old_soup, normal, old_tangent, face)
     new_bitangent = np.cross(normal, new_tangent)
     x, y, z = np.moveaxis(texels.astype(np.float64) * 2.0 - 1.0, -1, 0)  # decoded
     in_plane = x[:, None] * old_tangent + y[:, None] * old_bitangent
@@ -908,6 +992,24 @@ def convert_normals(
     # Tangents are NaN on faces without area in UV space.
     is_valid = np.isfinite(bumps).all(axis=1, keepdims=True)
     return encode_normals(np.where(is_valid, bumps, [0.0, 0.0, 1.0]))
+
+
+def _compute_file_bitangents(
+    soup: TriangleSoup, normal: Float64Array, tangent: Float64Array, face: IntArray
+) -> Float64Array:
+    """Return the bitangents (T, 3) of a file, which point up the image.
+
+    They are normal x tangent, or the opposite where UVs are mirrored. For the renderer,
+    bitangents are always normal x tangent.
+
+    Args:
+        soup: the object, with the file's UVs.
+        normal, tangent: (T, 3) unit vectors.
+        face: (T,) index of a face for each.
+    """
+    mirror_sign = np.sign(compute_doubled_areas(soup.uvs[face]))[:, None]
+    bitangent: Float64Array = np.cross(normal, tangent) * mirror_sign
+    return bitangent
 
 
 def _compute_tangents(

@@ -53,12 +53,16 @@ class TrackedKeys(Generic[T]):
         self._read: set[str] = set()
         self._nested: dict[str, TrackedKeys[Any]] = {}
         for key, value in values.items():
-            folded = fold(key)
-            if folded in self._spelling:
-                earlier_key = self._spelling[folded]
-                self.repeated.append(earlier_key)
-            self._values[folded] = value
-            self._spelling[folded] = key
+            self._add_value(key, value)
+
+    def _add_value(self, key: str, value: T) -> None:
+        """Store the value of a key, which replaces that of an equal folded key."""
+        folded = self._fold(key)
+        if folded in self._spelling:
+            earlier_key = self._spelling[folded]
+            self.repeated.append(earlier_key)
+        self._values[folded] = value
+        self._spelling[folded] = key
 
     def get(self, *keys: str) -> T | None:
         """Return the value of the first of several folded keys that has one, or None.

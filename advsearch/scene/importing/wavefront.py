@@ -146,6 +146,11 @@ class _Triangles:
     is_flat: BoolArray
     has_uvs: BoolArray
 
+    def get_material_name(self, triangle: int) -> str:
+        """Return the name of a triangle's material, "" if it has none."""
+        index = self.material_index[triangle]
+        return self.material_names[index] if index >= 0 else ""
+
     def measure_mapped_faces(
         self, material_name: str, square: int
     ) -> tuple[Float64Array, Float64Array]:
@@ -177,17 +182,10 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             that it does not contain, or has no faces.
     """
     lines = ObjLines(data, notes)
-    tables = {kind: lines.read_table(kind) for kind in TABLES}
-    if not len(tables["v"]):
-        raise notes.damaged(EXPECTED, got=data)
+    tables = _read_tables(lines, data)
     faces = lines.read_faces({kind: len(table) for kind, table in tables.items()})
     _, corner_counts, _ = faces
-    if (corner_counts < 3).all():
-        raise FileFormatError(
-            f"{path}: expected a mesh with faces, got points or "
-            "lines only; export triangles"
-        )
-
+    _check_has_faces(path, corner_counts)
     statements = _parse_statements(lines, notes)
 
     def find_mapped_faces(name: str, square: int) -> tuple[Float64Array, Float64Array]:
@@ -203,13 +201,40 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     names_libraries = bool(statements.library_lines)
     return [
         _make_part(triangles, group, reader, names_libraries)
-        for group in group_faces(
-            triangles.material_index,
-            triangles.has_uvs,
-            triangles.is_flat,
-            triangles.udim_square,
-        )
+        for group in _group_triangles(triangles)
     ]
+
+
+def _read_tables(lines: ObjLines, data: bytes) -> dict[str, Float64Array]:
+    """Return the points, UVs and normals of a file, by the keywords "v", "vt" and "vn".
+
+    Raises:
+        FileFormatError: a line is wrong, or there are no points, so that `data`, the
+            content of the file, is of another kind.
+    """
+    tables = {kind: lines.read_table(kind) for kind in TABLES}
+    if not len(tables["v"]):
+        raise lines.notes.damaged(EXPECTED, got=data)
+    return tables
+
+
+def _check_has_faces(path: Path, corner_counts: IntArray) -> None:
+    """Raise FileFormatError if all polygons have fewer than 3 corners."""
+    if (corner_counts < 3).all():
+        raise FileFormatError(
+            f"{path}: expected a mesh with faces, got points or "
+            "lines only; export triangles"
+        )
+
+
+def _group_triangles(triangles: _Triangles) -> list[IntArray]:
+    """Return the triangles of each part; see `read_obj`."""
+    return group_faces(
+        triangles.material_index,
+        triangles.has_uvs,
+        triangles.is_flat,
+        triangles.udim_square,
+    )
 
 
 def _make_triangles(
@@ -264,9 +289,7 @@ def _make_part(
             material gets a note about that.
     """
     first = group[0]  # all triangles of the group have the same properties
-    name = ""
-    if triangles.material_index[first] >= 0:
-        name = triangles.material_names[triangles.material_index[first]]
+    name = triangles.get_material_name(first)
     square = int(triangles.udim_square[first])
     has_colors = triangles.colors is not None
     mtl_surface = _find_material(reader, name, square, has_colors, names_libraries)
@@ -386,11 +409,25 @@ def _find_material(
     if mtl_surface is not None:
         return mtl_surface
     substitute = "the colour of its vertices" if has_colors else "neutral grey"
+    _note_missing_material(reader, name, substitute, names_libraries)
+    return MtlSurface(ImportedSurface(name=without_comment(name)))
+
+
+def _note_missing_material(
+    reader: MtlReader, name: str, substitute: str, names_libraries: bool
+) -> None:
+    """Note a material that no material file has, unless all of these are missing.
+
+    Args:
+        reader: reader of the materials.
+        name: name of the material.
+        substitute: what is used instead, such as "neutral grey".
+        names_libraries: whether the file names material files.
+    """
     substitute_text = f"{substitute} is used instead"
     if reader.n_libraries:
-        lacking_files = (
-            "its .mtl file lacks" if reader.n_libraries == 1 else "its .mtl files lack"
-        )
+        is_single = reader.n_libraries == 1
+        lacking_files = "its .mtl file lacks" if is_single else "its .mtl files lack"
         reader.notes.warn_that_file(
             f"uses the material {format_name(name)}, which {lacking_files}; "
             f"{substitute_text}"
@@ -399,7 +436,6 @@ def _find_material(
         reader.notes.warn_that_file(
             f"uses materials and names no material file (mtllib); {substitute_text}"
         )
-    return MtlSurface(ImportedSurface(name=without_comment(name)))
 
 
 def _combine_colors(
@@ -517,6 +553,21 @@ def _read_colors(
         notes: notes about the file; weights and opacities, which are not read, are
             recorded.
     """
+    _record_unread_numbers(table, notes)
+    stored_colors: Float64Array | None = table[:, 3:6]
+    if np.isnan(table[:, 5]).all():
+        stored_colors = lines.read_zbrush_colors(len(table))
+    if stored_colors is None:
+        return None
+    has_color = np.asarray(np.isfinite(stored_colors).all(axis=1))
+    scale = _find_color_scale(stored_colors[has_color])
+    colors = np.where(has_color[:, None], stored_colors / scale, NEUTRAL_GREY)
+    display = np.clip(colors, 0.0, 1.0).astype(np.float32)
+    return np.asarray(srgb_to_linear(display), dtype=np.float64)
+
+
+def _record_unread_numbers(table: Float64Array, notes: Notes) -> None:
+    """Record weights and opacities in the numbers (V, 7) of ``v`` lines."""
     weight = table[:, 3]
     opacity = table[:, 6]
     # a fourth number without a fifth is a weight, not a color
@@ -524,20 +575,16 @@ def _read_colors(
         notes.record("weights of vertices, the fourth number of", "v")
     if np.isfinite(opacity).any() and not np.isin(opacity, (1.0, 255.0)).all():
         notes.record("opacities of vertices, the seventh number of", "v")
-    stored_colors: Float64Array | None = table[:, 3:6]
-    if np.isnan(table[:, 5]).all():
-        stored_colors = lines.read_zbrush_colors(len(table))
-    if stored_colors is None:
-        return None
-    has_color = np.asarray(np.isfinite(stored_colors).all(axis=1))
-    # A color in [0, 1] may be a little over 1, but not over 2. In [0, 255] a file whose
-    # largest value is 2 would be black, which no one stores.
-    is_in_bytes = has_color.any() and stored_colors[has_color].max() > 2.0
-    scale = 255.0 if is_in_bytes else 1.0
-    colors = np.where(has_color[:, None], stored_colors / scale, NEUTRAL_GREY)
-    return np.asarray(
-        srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64
-    )
+
+
+def _find_color_scale(colors: Float64Array) -> float:
+    """Return the value of full brightness, 1 or 255, in colors (N, 3) of vertices.
+
+    A color in [0, 1] may be a little over 1, but not over 2. In [0, 255] a file whose
+    largest value is 2 would be black, which no one stores.
+    """
+    is_in_bytes = len(colors) and colors.max() > 2.0
+    return 255.0 if is_in_bytes else 1.0
 
 
 Bytes = npt.NDArray[np.uint8]
@@ -574,9 +621,6 @@ class ObjLines:
     def __init__(self, data: bytes, notes: Notes) -> None:
         """Find the lines of a file, and the kind of each by its first bytes.
 
-        All lines are compared at once: the arrays of their first, second and third
-        bytes with those of the keywords.
-
         Args:
             data: the bytes of the file.
             notes: notes about the file.
@@ -595,21 +639,29 @@ class ObjLines:
         # The normalized text ends in a line break, so that every line has an end.
         self.line_ends = np.flatnonzero(self.text_bytes == _NEWLINE)
         self.line_starts = np.concatenate([[0], self.line_ends[:-1] + 1])
+        self.kind_of_line = self._find_kinds()
+
+    def _find_kinds(self) -> npt.NDArray[np.int8]:
+        """Return the kind (L,) of each line by its first bytes.
+
+        All lines are compared at once: the arrays of their first, second and third
+        bytes with those of the keywords.
+        """
         # so that the third byte exists in a last line that is shorter
         padded = np.concatenate([self.text_bytes, np.full(3, _NEWLINE, np.uint8)])
         first_byte, second_byte, third_byte = (
             padded[self.line_starts + offset] for offset in range(3)
         )
         # A keyword has one or two letters, and then a blank or a line break.
-        self.kind_of_line = np.full(len(self.line_starts), OTHER_KIND, dtype=np.int8)
+        kind_of_line = np.full(len(self.line_starts), OTHER_KIND, dtype=np.int8)
         for index, kind in enumerate(KINDS):
+            matches = first_byte == ord(kind[0])
+            after_keyword = second_byte
             if len(kind) == 2:
-                matches = (first_byte == ord(kind[0])) & (second_byte == ord(kind[1]))
+                matches &= second_byte == ord(kind[1])
                 after_keyword = third_byte
-            else:
-                matches = first_byte == ord(kind[0])
-                after_keyword = second_byte
-            self.kind_of_line[matches & _IS_BLANK[after_keyword]] = index
+            kind_of_line[matches & _IS_BLANK[after_keyword]] = index
+        return kind_of_line
 
     def iterate_others(self) -> Iterator[tuple[int, str, str]]:
         """Yield the row, keyword and argument of each line that is not in `KINDS`.
@@ -645,19 +697,7 @@ class ObjLines:
         ).astype(np.float64, copy=False)
         if counts.min() < min_count or len(values) != counts.sum():
             self._raise_for_numbers(kind, rows)
-        # If all lines have equally many numbers, as usual, the table is a reshape.
-        if (counts == counts[0]).all():
-            table = values.reshape(len(rows), -1)[:, :columns]
-            n_missing = columns - table.shape[1]
-            return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
-        # Otherwise each number is written to its row and column.
-        first_of_line = np.cumsum(counts) - counts
-        column = np.arange(len(values)) - np.repeat(first_of_line, counts)
-        row = np.repeat(np.arange(len(rows)), counts)
-        is_in_table = column < columns
-        table = np.full((len(rows), columns), fill)
-        table[row[is_in_table], column[is_in_table]] = values[is_in_table]
-        return table
+        return _make_number_table(values, counts, columns, fill)
 
     def _raise_for_numbers(self, kind: str, rows: IntArray) -> NoReturn:
         """Raise FileFormatError for the first line whose numbers are wrong."""
@@ -703,17 +743,31 @@ class ObjLines:
                 continue
             # This changes `corners`, of which `kind_indices` is a view.
             self._resolve_relative(kind_indices, kind, rows, sizes)
-            largest = kind_indices.max()
-            if largest > counts[kind]:
-                corner_ends = np.cumsum(sizes)
-                corner = int(kind_indices.argmax())
-                face = np.searchsorted(corner_ends, corner, side="right")
-                raise self.notes.damaged(
-                    f"at least {largest} {kind!r} lines",
-                    f"{counts[kind]}, and a face on line {rows[face] + 1} that refers "
-                    f"to number {largest} (is the file cut short?)",
-                )
+            self._check_rows_exist(kind_indices, kind, counts[kind], rows, sizes)
         return corners - 1, sizes, rows  # the file counts from 1, and has 0 for none
+
+    def _check_rows_exist(
+        self, index: IntArray, kind: str, count: int, rows: IntArray, sizes: IntArray
+    ) -> None:
+        """Raise FileFormatError if a face refers to a missing row of a table.
+
+        Args:
+            index: (C,) indices of all corners, from 1.
+            kind: keyword of the table.
+            count: number of its rows.
+            rows: (P,) the row of each face's line in the file.
+            sizes: (P,) the number of corners of each face.
+        """
+        largest = index.max()
+        if largest <= count:
+            return
+        corner = int(index.argmax())
+        face = np.searchsorted(np.cumsum(sizes), corner, side="right")
+        raise self.notes.damaged(
+            f"at least {largest} {kind!r} lines",
+            f"{count}, and a face on line {rows[face] + 1} that refers "
+            f"to number {largest} (is the file cut short?)",
+        )
 
     def _check_sizes(self, rows: IntArray, sizes: IntArray) -> None:
         """Raise FileFormatError for a last face cut short, or faces over a limit.
@@ -828,29 +882,34 @@ class ObjLines:
             axis=1,
         )
         for line_number, words in self._iterate_words(rows):
-            row = line_number - 1
-            counts = counts_before_line[row]
+            counts = counts_before_line[line_number - 1]
             for word in words:
-                if not _CORNER.fullmatch(word):
-                    raise self.notes.damaged(
-                        f"whole numbers in the face on line {line_number}",
-                        format_name(word),
-                    )
-                # A missing index, as in 1//3, is valid. It is replaced by 1, which is
-                # always valid, too.
-                indices = [int(text or "1") for text in word.split("/")]
-                # A corner may have fewer indices than there are tables.
-                is_wrong = any(
-                    index == 0 or index < -count
-                    for index, count in zip(indices, counts, strict=False)
-                )
-                if is_wrong:
-                    raise self.notes.damaged(
-                        f"indices that count from 1 in the face on line {line_number}",
-                        format_name(word),
-                    )
+                self._check_corner(word, line_number, counts)
         # No single face is wrong, but they could not be parsed together.
         raise self.notes.damaged("whole numbers in faces", "something else")
+
+    def _check_corner(self, word: str, line_number: int, counts: IntArray) -> None:
+        """Raise FileFormatError for a corner of a face that has a wrong index.
+
+        Args:
+            word: the corner, such as "1/2/3".
+            line_number: its line, from 1.
+            counts: (3,) number of rows above that line, of each table.
+        """
+        where = f"in the face on line {line_number}"
+        if not _CORNER.fullmatch(word):
+            raise self.notes.damaged(f"whole numbers {where}", format_name(word))
+        # A missing index, as in 1//3, is valid. It is replaced by 1, which is
+        # always valid, too.
+        indices = [int(text or "1") for text in word.split("/")]
+        # A corner may have fewer indices than there are tables.
+        is_wrong = any(
+            index == 0 or index < -count
+            for index, count in zip(indices, counts, strict=False)
+        )
+        if is_wrong:
+            expected = f"indices that count from 1 {where}"
+            raise self.notes.damaged(expected, format_name(word))
 
 
 def _normalize_lines(data: bytes) -> bytes:
@@ -862,11 +921,7 @@ def _normalize_lines(data: bytes) -> bytes:
         data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         + b"\n"
     )
-    # A backslash at the end of a line joins it with the next one, but not if the line
-    # is a comment. So backslashes at the end of comments are removed first.
-    if _CONTINUATION.search(text):
-        without_continued_comments = _CONTINUED_COMMENT.sub(rb"\1\n", text)
-        text = _CONTINUATION.sub(b" ", without_continued_comments)
+    text = _join_continued_lines(text)
     # Leading blanks of lines are removed.
     has_leading_blanks = b"\n " in text or b"\n\t" in text or text[:1] in b" \t"
     if has_leading_blanks:
@@ -875,6 +930,50 @@ def _normalize_lines(data: bytes) -> bytes:
     if b"\nfo" in text:
         text = re.sub(rb"\nfo(?=[ \t])", b"\nf", text)
     return text
+
+
+def _join_continued_lines(text: bytes) -> bytes:
+    """Join lines that end in a backslash with the next one, except for comments."""
+    if not _CONTINUATION.search(text):
+        return text
+    # Backslashes at the end of comments join nothing, and are removed first.
+    without_continued_comments = _CONTINUED_COMMENT.sub(rb"\1\n", text)
+    return _CONTINUATION.sub(b" ", without_continued_comments)
+
+
+def _make_number_table(
+    values: Float64Array, counts: IntArray, n_columns: int, fill: float
+) -> Float64Array:
+    """Return the numbers of lines as a table (N, columns); see `_fill_table`.
+
+    Usually all lines have equally many numbers. Then the table is a reshape.
+    """
+    if (counts != counts[0]).any():
+        return _fill_table(values, counts, n_columns, fill)
+    table = values.reshape(len(counts), -1)[:, :n_columns]
+    n_missing = n_columns - table.shape[1]
+    return np.pad(table, ((0, 0), (0, n_missing)), constant_values=fill)
+
+
+def _fill_table(
+    values: Float64Array, counts: IntArray, n_columns: int, fill: float
+) -> Float64Array:
+    """Return a table (N, columns) of lines with different counts of numbers.
+
+    Args:
+        values: the numbers of all lines, concatenated.
+        counts: (N,) how many numbers each line has; those beyond the last column are
+            left out.
+        n_columns: number of columns.
+        fill: value of missing numbers.
+    """
+    first_of_line = np.cumsum(counts) - counts
+    column = np.arange(len(values)) - np.repeat(first_of_line, counts)
+    row = np.repeat(np.arange(len(counts)), counts)
+    is_in_table = column < n_columns
+    table = np.full((len(counts), n_columns), fill)
+    table[row[is_in_table], column[is_in_table]] = values[is_in_table]
+    return table
 
 
 def _count_words(data: Bytes) -> IntArray:
@@ -943,15 +1042,19 @@ def _parse_corners(data: Bytes) -> tuple[IntArray, IntArray] | None:
     ):
         return None
     corner_starts = number_starts[is_first]
-    line_ends = np.flatnonzero(data == _NEWLINE)
-    # (P,) corners before the end of each line, and those of each line alone
-    n_corners_before_end = np.searchsorted(corner_starts, line_ends)
-    sizes = np.diff(n_corners_before_end, prepend=0)
+    sizes = _count_corners(data, corner_starts)
     # (N,) the corner of each number: the number of corners that have begun, minus 1
     corner_of_number = np.cumsum(is_first) - 1
     corners = np.zeros((len(corner_starts), 3), dtype=np.int64)
     corners[corner_of_number, column] = values
     return corners, sizes
+
+
+def _count_corners(data: Bytes, corner_starts: IntArray) -> IntArray:
+    """Return the number of corners (P,) of each line, given the first byte of each."""
+    line_ends = np.flatnonzero(data == _NEWLINE)
+    n_corners_before_end = np.searchsorted(corner_starts, line_ends)
+    return np.diff(n_corners_before_end, prepend=0)
 
 
 def _find_numbers(data: Bytes) -> tuple[IntArray, BoolArray]:

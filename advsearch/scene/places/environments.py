@@ -25,6 +25,7 @@ from advsearch.scene.places.place_file import (
     resolve_sibling_path,
     split_light,
 )
+from advsearch.scene.places.schema import PlaceFile, PlaceLight
 from advsearch.trust.stored_files import track_opened_files
 
 
@@ -48,47 +49,73 @@ def import_place(spec: str) -> EnvironmentAsset:
     path = Path(name)
     with track_opened_files(path):
         file = read_place_file(path)
-        light_name = requested_light
-        if light_name is None:
-            light_name = next(iter(file.lights))
-        if light_name not in file.lights:
-            raise UnknownNameError(
-                f"light of {path}:",
-                light_name,
-                file.lights,
-                f"Write it as {path}#NAME.",
-            )
+        light_name = _find_light_name(path, file, requested_light)
         light = file.lights[light_name]
         place = read_place(path, file, light.variant)
-        if light.map in list_environments():
-            environment = load_environment(light.map)
-        else:
-            environment = import_environment(resolve_sibling_path(path, light.map))
-    candelas = None
-    if light.lux is not None:
-        illuminance = _compute_illuminance(environment)
-        if illuminance <= 0.0:
-            raise InputError(
-                f"{path}: lights.{light_name}: expected a map with light for its lux, "
-                f"got {light.map}, which is black where the sky is; leave lux out"
-            )
-        candelas = light.lux / illuminance
-    asset_name = place.name
-    if requested_light is not None:
-        # `make_safe_name` leaves out the suffix of a file. The name of a light may have
-        # a dot in it, so that a suffix is added.
-        asset_name = make_safe_name(Path(f"{place.name}-{light_name}.x"))
+        environment = _load_light_map(path, light)
     return replace(
         environment,
-        name=asset_name,
+        name=_make_asset_name(place.name, requested_light),
         source=spec,
         warnings=(*environment.warnings, *place.notes),
         # The ground is that of the place, not one that belongs to the map.
         photographed=False,
         ground=None,
-        candelas=candelas,
+        candelas=_compute_candelas(path, light_name, light, environment),
         place=place,
     )
+
+
+def _make_asset_name(name: str, requested_light: str | None) -> str:
+    """Return the name of a place, with that of the light if one is requested."""
+    if requested_light is None:
+        return name
+    # `make_safe_name` leaves out the suffix of a file. The name of a light may have a
+    # dot in it, so that a suffix is added.
+    return make_safe_name(Path(f"{name}-{requested_light}.x"))
+
+
+def _find_light_name(path: Path, file: PlaceFile, requested: str | None) -> str:
+    """Return the name of the light that is requested, or of the first if it is None.
+
+    Raises UnknownNameError: the file of a place, `path`, has no such light.
+    """
+    light_name = requested
+    if light_name is None:
+        light_name = next(iter(file.lights))
+    if light_name not in file.lights:
+        raise UnknownNameError(
+            f"light of {path}:",
+            light_name,
+            file.lights,
+            f"Write it as {path}#NAME.",
+        )
+    return light_name
+
+
+def _load_light_map(path: Path, light: PlaceLight) -> EnvironmentAsset:
+    """Return the map of a light: a bundled environment, or a file beside the place's."""
+    if light.map in list_environments():
+        return load_environment(light.map)
+    return import_environment(resolve_sibling_path(path, light.map))
+
+
+def _compute_candelas(
+    path: Path, light_name: str, light: PlaceLight, environment: EnvironmentAsset
+) -> float | None:
+    """Return the luminance in cd/m2 of a radiance of 1; None for a light without lux.
+
+    Raises InputError: the map, `environment`, is black.
+    """
+    if light.lux is None:
+        return None
+    illuminance = _compute_illuminance(environment)
+    if illuminance <= 0.0:
+        raise InputError(
+            f"{path}: lights.{light_name}: expected a map with light for its lux, "
+            f"got {light.map}, which is black where the sky is; leave lux out"
+        )
+    return light.lux / illuminance
 
 
 def _compute_illuminance(environment: EnvironmentAsset) -> float:

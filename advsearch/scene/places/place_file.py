@@ -28,6 +28,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, UnknownNameError
+from advsearch.scene.assets import Float32Array
 from advsearch.scene.footprint import Footprint, Solid
 from advsearch.scene.importing.files import format_name, make_safe_name
 from advsearch.scene.parts import MeshPart, Place
@@ -86,12 +87,17 @@ def read_place_file(path: Path) -> PlaceFile:
     try:
         return PlaceFile.model_validate(content)
     except ValidationError as error:
-        first_error = error.errors(include_url=False, include_input=False)[0]
-        where = format_name(".".join(map(str, first_error["loc"])), quoted=False)
-        problem = first_error["msg"].removeprefix("Value error, ")[:200]
-        raise FileFormatError(
-            f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example"
-        ) from None
+        raise _make_invalid_entry_error(path, error) from None
+
+
+def _make_invalid_entry_error(path: Path, error: ValidationError) -> FileFormatError:
+    """Return the error for the first wrong entry of the file of a place."""
+    first_error = error.errors(include_url=False, include_input=False)[0]
+    where = format_name(".".join(map(str, first_error["loc"])), quoted=False)
+    problem = first_error["msg"].removeprefix("Value error, ")[:200]
+    return FileFormatError(
+        f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example"
+    )
 
 
 def resolve_sibling_path(path: Path, name: str) -> Path:
@@ -122,13 +128,7 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
             file has.
     """
     parts, notes = read_place_meshes(resolve_sibling_path(path, file.mesh), variant)
-    names = [part.name for part in parts]
-    for stated_names in (file.ground, file.lamps):
-        for name in stated_names:
-            if name not in names:
-                raise UnknownNameError(
-                    f"mesh of {file.mesh}:", name, names, f"It is named in {path}."
-                )
+    _check_mesh_names(path, file, [part.name for part in parts])
     solids = tuple(
         Solid(entry.name, outline)
         for entry in file.solids
@@ -141,6 +141,16 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
     parts[0] = replace(parts[0], solids=solids)
     directory = Path(os.path.abspath(path)).parent
     return Place(make_safe_name(directory), file, tuple(parts), tuple(notes))
+
+
+def _check_mesh_names(path: Path, file: PlaceFile, names: list[str]) -> None:
+    """Raise UnknownNameError if a place's file states a mesh that is not in `names`."""
+    for stated_names in (file.ground, file.lamps):
+        for name in stated_names:
+            if name not in names:
+                raise UnknownNameError(
+                    f"mesh of {file.mesh}:", name, names, f"It is named in {path}."
+                )
 
 
 @lru_cache(maxsize=8)
@@ -176,26 +186,42 @@ def make_place_parts(
     are_lamps_on = is_dark and candelas is not None
     scene_parts: list[MeshPart] = []
     for part in place.parts:
-        emission = part.emission
-        if part.name in place.file.lamps:
-            emission = None  # off
-            if are_lamps_on:
-                # one texel of the color that the file states
-                emission = np.array([[place.file.lamps[part.name]]], np.float32)
+        emission = _find_emission(place, part, are_lamps_on)
         if emission is not None:
             emission = emission / radiance_unit
-        solids = tuple(
-            Solid(name, Footprint(outline / metres, low / metres, high / metres))
-            for name, (outline, low, high) in part.solids
-        )
-        mesh = replace(part.mesh, vertices=part.mesh.vertices / np.float32(metres))
-        scene_parts.append(
-            replace(
-                part,
-                place=place,
-                mesh=mesh,
-                solids=solids,
-                emission=emission,
-            )
-        )
+        scene_parts.append(_make_scene_part(place, part, metres, emission))
     return tuple(scene_parts)
+
+
+def _make_scene_part(
+    owner: Place, part: MeshPart, metres: float, emission: Float32Array | None
+) -> MeshPart:
+    """Return a mesh of a place with an emission, and lengths in units of some metres."""
+    vertices = part.mesh.vertices / np.float32(metres)
+    return replace(
+        part,
+        place=owner,
+        mesh=replace(part.mesh, vertices=vertices),
+        solids=_scale_solids(part.solids, metres),
+        emission=emission,
+    )
+
+
+def _find_emission(
+    owner: Place, part: MeshPart, are_lamps_on: bool
+) -> Float32Array | None:
+    """Return the luminance (H, W, 3) that a mesh of a place emits, in cd/m2, or None."""
+    if part.name not in owner.file.lamps:
+        return part.emission
+    if not are_lamps_on:
+        return None
+    # one texel of the color that the file states
+    return np.array([[owner.file.lamps[part.name]]], np.float32)
+
+
+def _scale_solids(solids: tuple[Solid, ...], metres: float) -> tuple[Solid, ...]:
+    """Return solids with lengths in units of a number of metres."""
+    return tuple(
+        Solid(name, Footprint(outline / metres, low / metres, high / metres))
+        for name, (outline, low, high) in solids
+    )

@@ -11,10 +11,10 @@ what faces up.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.pictures import without_pillows_limit
 from advsearch.scene.assets import (
+    Float32Array,
     Float64Array,
     IntArray,
     Material,
@@ -195,13 +196,30 @@ def read_place_meshes(
             f"{path}: expected meshes with faces, got none; export triangles"
         )
     _check_materials(path, len(groups))
+    return _make_mesh_parts(path, header, groups, surfaces), list(notes)
+
+
+def _make_mesh_parts(
+    path: Path,
+    header: Header,
+    groups: Mapping[NameAndMaterial, Sequence[ImportedPart]],
+    surfaces: Mapping[int | None, ImportedSurface],
+) -> list[MeshPart]:
+    """Return a mesh for each group of parts, with the surface of their material.
+
+    Args:
+        path: the file, for messages.
+        header: header of the file.
+        groups: parts by the name of their mesh and the index of their material.
+        surfaces: surfaces by the index of the material.
+    """
     names = UniqueNames(RESERVED_NAMES)
     parts = list[MeshPart]()
     for (name, material), members in groups.items():
         part = _make_part(path, names.make_unique(name), members, surfaces[material])
         # adds specular and clear coat, which `surfaces` do not have
         parts.append(_with_finish(path, header, material, part))
-    return parts, list(notes)
+    return parts
 
 
 def _drop_supported_extensions(header: Header) -> Header:
@@ -261,13 +279,16 @@ def _select_material(
         return primitive.material
     for mapping in _read_extension(path, _Mappings, extension).mappings:
         if variant in mapping.variants:
-            if mapping.material >= len(header.materials):
-                expected = (
-                    f"glTF with {mapping.material + 1} materials, as it refers to"
-                )
-                raise damaged(path, expected, f"{len(header.materials)}")
+            _check_material_exists(path, header, mapping.material)
             return mapping.material
     return primitive.material
+
+
+def _check_material_exists(path: Path, header: Header, index: int) -> None:
+    """Raise FileFormatError if a file has no material with an index."""
+    if index >= len(header.materials):
+        expected = f"glTF with {index + 1} materials, as it refers to"
+        raise damaged(path, expected, f"{len(header.materials)}")
 
 
 def _list_posed_meshes(header: Header) -> list[tuple[int, Float64Array]]:
@@ -299,28 +320,44 @@ def _read_primitives(
     Returns:
         The primitives in the pose of each node, and the surface of each material.
     """
-    header = file.header
-    posed_meshes = _list_posed_meshes(header)
+    posed_meshes = _list_posed_meshes(file.header)
     used_meshes = dict.fromkeys(mesh for mesh, _ in posed_meshes)
     pieces = _read_pieces(file, list(used_meshes), variant)
     fitted = _fit_surfaces(file, pieces, notes)
     primitives: list[PosedPrimitive] = []
     for mesh, pose in posed_meshes:
-        for index, primitive in enumerate(header.meshes[mesh].primitives):
+        for index, primitive in enumerate(file.header.meshes[mesh].primitives):
             piece = pieces.get((mesh, index))
-            if piece is None:  # it is made of points or lines
-                continue
-            _surface, uv_scale, uv_shift = fitted[piece.material_index]
-            part = transform_part(_fit_uvs(piece.part, uv_scale, uv_shift), pose)
-            # The material of the variant decides about the surface, and the original
-            # one about the name of the mesh, see `_group_by_material`.
-            primitives.append(
-                PosedPrimitive(
-                    primitive.material, variant_material=piece.material_index, part=part
-                )
-            )
+            if piece is not None:  # otherwise it is made of points or lines
+                _surface, uv_scale, uv_shift = fitted[piece.material_index]
+                part = _fit_uvs(piece.part, uv_scale, uv_shift)
+                primitives.append(_pose_primitive(primitive, piece, part, pose))
     surfaces = {material: surface for material, (surface, _, _) in fitted.items()}
     return primitives, surfaces
+
+
+def _pose_primitive(
+    primitive: Primitive,
+    piece: PrimitiveData,
+    part: ImportedPart,
+    pose: Float64Array,
+) -> PosedPrimitive:
+    """Return a primitive in the pose (4, 4) of a node.
+
+    The material of the variant decides about the surface, and the original one about
+    the name of the mesh, see `_group_by_material`.
+
+    Args:
+        primitive: entry of the primitive, with its original material.
+        piece: the same with its material in the variant.
+        part: its geometry, with UVs that fit its surface.
+        pose: pose of the node.
+    """
+    return PosedPrimitive(
+        primitive.material,
+        variant_material=piece.material_index,
+        part=transform_part(part, pose),
+    )
 
 
 def _fit_uvs(
@@ -388,9 +425,7 @@ def _fit_surfaces(
 
     Raises FileFormatError, InputError: there are too many materials or texels.
     """
-    pieces_by_material: dict[int | None, list[PrimitiveData]] = {}
-    for piece in pieces.values():
-        pieces_by_material.setdefault(piece.material_index, []).append(piece)
+    pieces_by_material = _group_pieces(pieces.values())
     _check_materials(file.path, len(pieces_by_material))
     surfaces = GltfSurfaces(file, notes, TEXTURE_LIMIT)
     fit_by_material: dict[
@@ -401,13 +436,28 @@ def _fit_surfaces(
         fit_by_material[material] = surfaces.make_surface(material, members)
         surface, _uv_scale, _uv_shift = fit_by_material[material]
         n_texels += _count_texels(surface)
-        check_most(
-            file.path,
-            n_texels,
-            MAX_TEXELS,
-            "textures of at most {} texels, counted for each material",
-        )
+        _check_n_texels(file.path, n_texels)
     return fit_by_material
+
+
+def _check_n_texels(path: Path, n_texels: int) -> None:
+    """Raise FileFormatError if the images of all surfaces have too many texels."""
+    check_most(
+        path,
+        n_texels,
+        MAX_TEXELS,
+        "textures of at most {} texels, counted for each material",
+    )
+
+
+def _group_pieces(
+    pieces: Iterable[PrimitiveData],
+) -> dict[int | None, list[PrimitiveData]]:
+    """Return the primitives of each material, by the material's index."""
+    pieces_by_material: dict[int | None, list[PrimitiveData]] = {}
+    for piece in pieces:
+        pieces_by_material.setdefault(piece.material_index, []).append(piece)
+    return pieces_by_material
 
 
 def _check_materials(path: Path, count: int) -> None:
@@ -445,24 +495,32 @@ def _group_by_material(
         The parts of each mesh, by its name and the index of its material in the
         variant.
     """
-    # for each material, those that the variant puts in its place
-    variant_materials: dict[int | None, set[int | None]] = {}
-    for primitive in primitives:
-        materials = variant_materials.setdefault(primitive.material, set())
-        materials.add(primitive.variant_material)
+    variant_materials = _find_variant_materials(primitives)
     parts_by_mesh: dict[NameAndMaterial, list[ImportedPart]] = {}
     for material, variant_material, part in primitives:
         is_split = len(variant_materials[material]) > 1
         naming_material = variant_material if is_split else material
         name = _name_material(header, naming_material)
         parts_by_mesh.setdefault((name, variant_material), []).append(part)
+    sorted_meshes = sorted(parts_by_mesh, key=_get_material_order)
+    return {mesh: parts_by_mesh[mesh] for mesh in sorted_meshes}
 
-    def get_order(mesh: NameAndMaterial) -> int:
-        """Return the index of a mesh's material; below all others without one."""
-        _, material = mesh
-        return -1 if material is None else material
 
-    return {mesh: parts_by_mesh[mesh] for mesh in sorted(parts_by_mesh, key=get_order)}
+def _find_variant_materials(
+    primitives: Sequence[PosedPrimitive],
+) -> dict[int | None, set[int | None]]:
+    """Return for each original material those by which the variant replaces it."""
+    variant_materials: dict[int | None, set[int | None]] = {}
+    for primitive in primitives:
+        materials = variant_materials.setdefault(primitive.material, set())
+        materials.add(primitive.variant_material)
+    return variant_materials
+
+
+def _get_material_order(mesh: NameAndMaterial) -> int:
+    """Return the index of a mesh's material; below all others without one."""
+    _, material = mesh
+    return -1 if material is None else material
 
 
 def _name_material(header: Header, index: int | None) -> str:
@@ -488,12 +546,7 @@ def _make_part(
 
     Raises InputError: the joined geometry cannot be used.
     """
-    color = surface.color
-    if color is None:
-        color = np.full(3, NEUTRAL_GREY, np.float32)
-    texture = surface.texture
-    if texture is None:
-        texture = np.broadcast_to(color, (2, 2, len(color)))
+    texture = _make_texture(surface)
     opacity = None
     if texture.shape[-1] == 4:
         opacity = np.ascontiguousarray(texture[..., 3])
@@ -513,6 +566,16 @@ def _make_part(
     )
 
 
+def _make_texture(surface: ImportedSurface) -> Float32Array:
+    """Return the texture (H, W, 3 or 4) of a surface, or 2 x 2 texels of its color."""
+    if surface.texture is not None:
+        return surface.texture
+    color = surface.color
+    if color is None:
+        color = np.full(3, NEUTRAL_GREY, np.float32)
+    return np.broadcast_to(color, (2, 2, len(color)))
+
+
 def _with_finish(
     path: Path, header: Header, index: int | None, part: MeshPart
 ) -> MeshPart:
@@ -530,24 +593,38 @@ def _with_finish(
     """
     entry = MaterialEntry() if index is None else header.materials[index]
     finish = _read_extension(path, _Finish, entry.extensions)
-    # The fraction that is reflected of light along the normal is ((n - 1) / (n + 1))^2
-    # for an index of refraction n (Fresnel). A specular of 1 here reflects
-    # `REFLECTANCE`.
-    ior = finish.KHR_materials_ior.ior
-    facing_reflectance = (
-        finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
-    )
-    # Rounded, so that glTF's default of 1.5 gives exactly the value of our default.
-    specular = min(round(facing_reflectance / REFLECTANCE, 9), 1.0)
+    specular = _compute_specular(finish)
     coat = finish.KHR_materials_clearcoat
     material = replace(part.material, specular=specular, clearcoat=coat.clearcoatFactor)
     part = replace(part, material=material)
     is_plain = part.opacity is None and part.normal_map is None
     if coat.clearcoatFactor == 0.0 or not is_plain:
         return part
-    # The width of the coat's lobe is the square of glTF's roughness; Mitsuba's goes
-    # from `DULL_COAT` at a gloss of 0 to `GLOSSY_COAT` at 1.
-    gloss = (DULL_COAT - coat.clearcoatRoughnessFactor**2) / (DULL_COAT - GLOSSY_COAT)
+    surface = _make_coated_surface(material, coat.clearcoatRoughnessFactor)
+    return replace(part, surface=surface)
+
+
+def _compute_specular(finish: _Finish) -> float:
+    """Return the specular of a material, from its index of refraction and its factor.
+
+    The fraction that is reflected of light along the normal is ((n - 1) / (n + 1))^2
+    for an index of refraction n (Fresnel). A specular of 1 here reflects `REFLECTANCE`.
+    """
+    ior = finish.KHR_materials_ior.ior
+    facing_reflectance = (
+        finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
+    )
+    # Rounded, so that glTF's default of 1.5 gives exactly the value of our default.
+    return min(round(facing_reflectance / REFLECTANCE, 9), 1.0)
+
+
+def _make_coated_surface(material: Material, coat_roughness: float) -> dict[str, Any]:
+    """Return Mitsuba's description of a surface with a clear coat, by its roughness.
+
+    The width of the coat's lobe is the square of glTF's roughness; Mitsuba's goes from
+    `DULL_COAT` at a gloss of 0 to `GLOSSY_COAT` at 1.
+    """
+    gloss = (DULL_COAT - coat_roughness**2) / (DULL_COAT - GLOSSY_COAT)
     principled = {
         "type": "principled",
         "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
@@ -555,7 +632,7 @@ def _with_finish(
         **vars(material),
         "clearcoat_gloss": min(max(gloss, 0.0), 1.0),
     }
-    return replace(part, surface={"type": "twosided", "bsdf": principled})
+    return {"type": "twosided", "bsdf": principled}
 
 
 def _join(members: Sequence[ImportedPart]) -> Mesh:
@@ -565,30 +642,33 @@ def _join(members: Sequence[ImportedPart]) -> Mesh:
     become 0, and missing normals those of the faces. All normals become unit vectors.
     """
     rotation = compute_rotation("y", "+z")  # from glTF's axes
-    vertices = list[Float64Array]()
-    faces = list[IntArray]()
-    normals = list[Float64Array]()
-    uvs = list[Float64Array]()
-    n_vertices = 0
-    for part in map(_with_normals, members):
-        part_normals = part.normals
-        assert part_normals is not None
-        part_uvs = part.uvs
-        if part_uvs is None:
-            part_uvs = np.zeros((len(part.vertices), 2))
-        vertices.append(part.vertices)
-        faces.append(part.faces + n_vertices)
-        normals.append(part_normals)
-        uvs.append(part_uvs)
-        n_vertices += len(part.vertices)
-    directions = np.concatenate(normals)
+    parts = [_with_normals(part) for part in members]
+    vertices = np.concatenate([part.vertices for part in parts])
+    directions = np.concatenate(
+        [part.normals for part in parts if part.normals is not None]  # all have some
+    )
     directions /= np.maximum(compute_lengths(directions), 1e-12)
     return Mesh(
-        multiply_rows(np.concatenate(vertices), rotation.T).astype(np.float32),
-        np.concatenate(faces).astype(np.uint32),
+        multiply_rows(vertices, rotation.T).astype(np.float32),
+        _join_faces(parts).astype(np.uint32),
         multiply_rows(directions, rotation.T).astype(np.float32),
-        np.concatenate(uvs).astype(np.float32),
+        np.concatenate([_get_uvs(part) for part in parts]).astype(np.float32),
     )
+
+
+def _join_faces(parts: Sequence[ImportedPart]) -> IntArray:
+    """Return the faces (F, 3) of all parts, as indices of all their vertices."""
+    faces = list[IntArray]()
+    n_vertices = 0
+    for part in parts:
+        faces.append(part.faces + n_vertices)
+        n_vertices += len(part.vertices)
+    return np.concatenate(faces)
+
+
+def _get_uvs(part: ImportedPart) -> Float64Array:
+    """Return the texture coordinates (V, 2) of a part; 0 if it has none."""
+    return np.zeros((len(part.vertices), 2)) if part.uvs is None else part.uvs
 
 
 def _with_normals(part: ImportedPart) -> ImportedPart:

@@ -79,12 +79,7 @@ class SolidEntry(_Entry):
         lower height is not first, the outline is not convex, or the name is not a
         single line of text.
         """
-        has_positions = self.at is not None
-        has_radius = self.radius is not None
-        has_outline = self.outline is not None
-        is_round = has_radius and has_positions and not has_outline
-        is_outlined = has_outline and not has_radius and not has_positions
-        if not (is_round or is_outlined):
+        if not (self._is_round() or self._is_outlined()):
             raise ValueError(
                 "expected either an outline, or a radius and the positions that it is "
                 "at"
@@ -99,6 +94,16 @@ class SolidEntry(_Entry):
                 "turn; split it into convex ones"
             )
         return self
+
+    def _is_round(self) -> bool:
+        """Return whether the entry has a radius and positions, and no outline."""
+        has_positions = self.at is not None
+        return self.radius is not None and has_positions and self.outline is None
+
+    def _is_outlined(self) -> bool:
+        """Return whether the entry has an outline, and neither radius nor positions."""
+        has_outline = self.outline is not None
+        return has_outline and self.radius is None and self.at is None
 
     def list_footprints(self) -> list[Footprint]:
         """Return the outline, or a round one at each position, in metres.

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.scene.assembly import IMAGE_INPUTS
-from advsearch.scene.assets import BoolArray, Float32Array
+from advsearch.scene.assets import BoolArray, Float32Array, IntArray
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import (
@@ -92,28 +92,18 @@ class SurfaceView:
         """
         self.base_radiance = samples.radiance[camera_index]
         self.coverage = samples.coverage[camera_index]
-        height, width = self.base_radiance.shape[:2]
+        n_pixels = self.base_radiance.shape[0] * self.base_radiance.shape[1]
         n_cells = shape[0] * shape[1]
-        # Rays are numbered camera after camera, and `samples.ray_index`, the ray of
-        # each sample, is ascending. So this camera's samples lie between those of its
-        # first ray and of the next camera's first ray.
-        n_rays = height * width * RAYS_PER_PIXEL
-        first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
-        start, end = torch.searchsorted(samples.ray_index, first_rays).tolist()
-        ray = samples.ray_index[start:end] - camera_index * n_rays
-        pixel = ray // RAYS_PER_PIXEL
-        # Each look-up reads four cells: `columns` and `fractions` are (n, 4).
-        columns, fractions = find_bilinear_weights(samples.uv[start:end].numpy(), shape)
-        # The columns of the back follow the `n_cells` columns of the front.
-        is_back = samples.is_back[start:end].numpy()
-        columns += np.int32(n_cells) * is_back[:, None]
-        weights = fractions * samples.diffuse_weight[start:end].numpy()[:, None]
+        selected = _find_camera_samples(samples, camera_index, n_pixels)
+        first_ray = camera_index * n_pixels * RAYS_PER_PIXEL
+        pixel = (samples.ray_index[selected] - first_ray) // RAYS_PER_PIXEL
+        columns, weights = _find_cell_weights(samples, selected, shape)
         # The samples are sorted by pixel, and each has four entries. So the entries of
         # row p begin at 4 times the number of samples in the pixels before p.
-        row_starts = np.searchsorted(pixel.numpy(), np.arange(height * width + 1)) * 4
+        row_starts = np.searchsorted(pixel.numpy(), np.arange(n_pixels + 1)) * 4
         self.matrix = scipy.sparse.csr_matrix(
             (weights.ravel(), columns.ravel(), row_starts.astype(np.int32)),
-            (height * width, sides * n_cells),
+            (n_pixels, sides * n_cells),
             copy=False,
         )
 
@@ -127,6 +117,44 @@ class SurfaceView:
         """
         from_object = multiply_sparse(self.matrix, reflected)
         return self.base_radiance + from_object.reshape(self.base_radiance.shape)
+
+
+def _find_camera_samples(
+    samples: ViewSamples, camera_index: int, n_pixels: int
+) -> slice:
+    """Return which samples are those of a camera's rays.
+
+    Rays are numbered camera after camera, and `samples.ray_index`, the ray of each
+    sample, is ascending. So the camera's samples lie between those of its first ray and
+    of the next camera's first ray.
+
+    Args:
+        samples: samples of all cameras.
+        camera_index: index of the camera.
+        n_pixels: number of pixels of each camera.
+    """
+    n_rays = n_pixels * RAYS_PER_PIXEL
+    first_rays = torch.tensor([camera_index, camera_index + 1]) * n_rays
+    start, end = torch.searchsorted(samples.ray_index, first_rays).tolist()
+    return slice(start, end)
+
+
+def _find_cell_weights(
+    samples: ViewSamples, selected: slice, shape: tuple[int, int]
+) -> tuple[Ints, Float32Array]:
+    """Return the four cells of the fine grid that each sample reads, and their weights.
+
+    Both are (n, 4). The cells of the back follow those of the front.
+
+    Args:
+        samples: samples of all cameras.
+        selected: the n samples of one camera.
+        shape: rows and columns of the fine grid.
+    """
+    cells, fractions = find_bilinear_weights(samples.uv[selected].numpy(), shape)
+    is_back = samples.is_back[selected].numpy()
+    cells += np.int32(shape[0] * shape[1]) * is_back[:, None]
+    return cells, fractions * samples.diffuse_weight[selected].numpy()[:, None]
 
 
 def multiply_sparse(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
@@ -234,37 +262,55 @@ class Arrangement:
             texture_shape: rows and columns of the texture whose color is searched.
             seed: seed of the rays.
         """
-        scene = renderer.scene
-        self._scene = scene
+        self._scene = renderer.scene
         self.inputs = {
             name: inputs[name] for name in inputs if name not in IMAGE_INPUTS
         }
-        scene.set_inputs(self.inputs)
-        description = scene.description_and_filter[0]
-        vertices = self._get_object_buffer("vertices")
-        normals = self._get_object_buffer("normals")
-        object_center = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-        charts = rasterize_charts(description.meshes[OBJECT].mesh, OBJECT_TEXELS)
-        surfaces = self._make_object_texels(charts, vertices, normals)
-        self.n_sides = len(surfaces)
+        self._scene.set_inputs(self.inputs)
+        description = self._scene.description_and_filter[0]
         self._has_ground = description.get_number("ground.size") > 0.0
         # height of the camera that photographed the ground; None for a plain ground
         self._capture_height = (
             None if description.photograph is None else description.capture_height
         )
+        self.fine_shape, self._upsampling = _make_fine_grid(texture_shape)
+        object_center = self._lay_texels(seed)
+        self.lobes = self._measure_lobes()
+        self.world_to_map = torch.tensor(
+            get_world_to_map(self._scene), dtype=torch.float32
+        )
+        self._ground_below = self._find_ground_below(object_center)
+        self._views = self._make_view_tracer(object_center)
+
+    def _measure_lobes(self) -> list[Lobes]:
+        """Return the lobes of each surface.
+
+        Both sides of the object have the same gloss, and the ground has none.
+        """
+        n_grounds = len(self.texels.grids) - self.n_sides
+        object_lobes = [self._measure_object_lobes()] * self.n_sides
+        return object_lobes + [Lobes.make_diffuse()] * n_grounds
+
+    def _lay_texels(self, seed: int) -> Float32Array:
+        """Lay texels over all surfaces, and find what they see of sky and each other.
+
+        Returns:
+            The center (3,) of the object in world space.
+        """
+        vertices = self._get_object_buffer("vertices")
+        normals = self._get_object_buffer("normals")
+        object_center: Float32Array = 0.5 * (
+            vertices.min(axis=0) + vertices.max(axis=0)
+        )
+        object_mesh = self._scene.description_and_filter[0].meshes[OBJECT].mesh
+        charts = rasterize_charts(object_mesh, OBJECT_TEXELS)
+        surfaces = self._make_object_texels(charts, vertices, normals)
+        self.n_sides = len(surfaces)
         # The ground comes after the sides of the object, so that its index among the
         # grids is `n_sides`.
         if self._has_ground:
             surfaces.append(self._make_ground_texels(object_center))
         self.texels: texels.LitTexels = texels.join_texels(surfaces)
-        # The fine grid has this number of cells along each side of a texel.
-        refinement = max(1, math.ceil(MIN_FINE_SIZE / min(texture_shape)))
-        self.fine_shape = (texture_shape[0] * refinement, texture_shape[1] * refinement)
-        self._upsampling = None
-        if refinement > 1:
-            self._upsampling = _make_upsampling_matrix(texture_shape, self.fine_shape)
-
-        # what texels see of the sky and of each other
         met_cells = self._trace_texels(seed)
         self._view_matrices = texels.make_view_matrices(
             met_cells, self.texels.texel_of_cell, len(self.texels.positions)
@@ -273,14 +319,8 @@ class Arrangement:
             surfaces, charts, vertices, normals, met_cells
         )
         if self._has_ground:
-            ground_texels = surfaces[-1]
-            self._smooth = self._make_ground_smoothing(ground_texels, met_cells)
-        # both sides of the object have the same gloss, and the ground has none
-        self.lobes = [self._measure_object_lobes()] * self.n_sides
-        self.lobes += [Lobes.make_diffuse()] * (len(surfaces) - self.n_sides)
-        self.world_to_map = torch.tensor(get_world_to_map(scene), dtype=torch.float32)
-        self._ground_below = self._find_ground_below(object_center)
-        self._views = self._make_view_tracer(object_center)
+            self._smooth = self._make_ground_smoothing(surfaces[-1], met_cells)
+        return object_center
 
     def _make_lookup_matrices(
         self,
@@ -450,15 +490,7 @@ class Arrangement:
         # The object's front is the first grid, so that its texels and cells are
         # numbered from 0.
         front = self.texels.select_grid(0)
-        opacity = self._scene.description_and_filter[0].meshes[OBJECT].opacity
-        candidates = np.arange(front.start, front.stop)
-        if opacity is not None:
-            n_rows, n_columns = self.texels.grids[0].shape
-            row, column = np.divmod(self.texels.cell_of_texel[front], n_columns)
-            opacity_row = row * opacity.shape[0] // n_rows
-            opacity_column = column * opacity.shape[1] // n_columns
-            texel_opacity = opacity[opacity_row, opacity_column]
-            candidates = candidates[texel_opacity >= texel_opacity.max()]
+        candidates = self._find_opaque_texels(front)
         # Any candidate would do: the gloss is the same all over the object.
         texel = candidates[len(candidates) // 2]
         return measure_lobes(
@@ -468,6 +500,24 @@ class Arrangement:
             self.texels.positions[texel],
             self.texels.normals[texel],
         )
+
+    def _find_opaque_texels(self, front: slice) -> IntArray:
+        """Return the texels of the object's front with the largest opacity.
+
+        Without an opacity map these are all. The front is the first grid, so that its
+        texels and cells are numbered from 0.
+        """
+        opacity = self._scene.description_and_filter[0].meshes[OBJECT].opacity
+        candidates = np.arange(front.start, front.stop)
+        if opacity is None:
+            return candidates
+        n_rows, n_columns = self.texels.grids[0].shape
+        row, column = np.divmod(self.texels.cell_of_texel[front], n_columns)
+        opacity_row = row * opacity.shape[0] // n_rows
+        opacity_column = column * opacity.shape[1] // n_columns
+        texel_opacity = opacity[opacity_row, opacity_column]
+        opaque_texels: IntArray = candidates[texel_opacity >= texel_opacity.max()]
+        return opaque_texels
 
     def _find_ground_below(self, center: Float32Array) -> tuple[Tensor, Tensor]:
         """Find where the blurred maps, seen from the object's center, show the ground.
@@ -740,6 +790,21 @@ class Arrangement:
         )
 
 
+def _make_fine_grid(
+    texture_shape: tuple[int, int],
+) -> tuple[tuple[int, int], scipy.sparse.csr_matrix | None]:
+    """Return rows and columns of the fine grid, and the matrix from the texture to it.
+
+    The matrix is None if the fine grid has the shape of the texture.
+    """
+    # The fine grid has this number of cells along each side of a texel.
+    refinement = max(1, math.ceil(MIN_FINE_SIZE / min(texture_shape)))
+    fine_shape = (texture_shape[0] * refinement, texture_shape[1] * refinement)
+    if refinement == 1:
+        return fine_shape, None
+    return fine_shape, _make_upsampling_matrix(texture_shape, fine_shape)
+
+
 def _make_upsampling_matrix(
     texture: tuple[int, int], fine: tuple[int, int]
 ) -> scipy.sparse.csr_matrix:
@@ -751,16 +816,19 @@ def _make_upsampling_matrix(
         texture: rows and columns of the texture.
         fine: rows and columns of the fine grid.
     """
-    n_rows, n_columns = fine
+    texel, fractions = find_bilinear_weights(_compute_cell_centers(fine), texture)
+    n_fine = fine[0] * fine[1]
+    row_starts = np.arange(n_fine + 1, dtype=np.int32) * 4
+    entries = (fractions.ravel(), texel.ravel(), row_starts)
+    return scipy.sparse.csr_matrix(entries, (n_fine, texture[0] * texture[1]))
+
+
+def _compute_cell_centers(shape: tuple[int, int]) -> Float32Array:
+    """Return the centers (cells, 2) of a grid's cells, as columns and rows in [0, 1]."""
+    n_rows, n_columns = shape
     y, x = np.meshgrid(
         (np.arange(n_rows) + 0.5) / n_rows,
         (np.arange(n_columns) + 0.5) / n_columns,
         indexing="ij",
     )
-    uv = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
-    texel, fractions = find_bilinear_weights(uv, texture)
-    row_starts = np.arange(n_rows * n_columns + 1, dtype=np.int32) * 4
-    entries = (fractions.ravel(), texel.ravel(), row_starts)
-    return scipy.sparse.csr_matrix(
-        entries, (n_rows * n_columns, texture[0] * texture[1])
-    )
+    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)

@@ -6,7 +6,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +21,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.description import OBJECT
-from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL
+from advsearch.scene.mitsuba_backend.surface import RAYS_PER_PIXEL, ViewSamples
 from advsearch.scene.predictor import (
     MAX_BYTES,
     NOISE,
@@ -125,9 +132,7 @@ class SurfaceRenderer(Predictor):
         }
         inputs = self.compute_inputs(u)
         self.base_color = self.get_color(inputs)
-        fixed_inputs = {
-            name: inputs[name] for name in inputs if name not in FREE_INPUTS
-        }
+        fixed_inputs = _drop_free_inputs(inputs)
         texture_shape = (self.base_color.shape[0], self.base_color.shape[1])
         with torch.no_grad():
             self.arrangement = Arrangement(traced, fixed_inputs, texture_shape, seed)
@@ -151,9 +156,7 @@ class SurfaceRenderer(Predictor):
         not change it: so it is compared here.
         """
         expected = {**self.arrangement.inputs, COLOR_INPUT: self.base_color}
-        fixed_inputs = {
-            name: inputs[name] for name in inputs if name not in FREE_INPUTS
-        }
+        fixed_inputs = _drop_free_inputs(inputs)
         fixed_inputs[COLOR_INPUT] = self.get_color(inputs)
         return expected.keys() == fixed_inputs.keys() and not any(
             inputs_differ(expected[name], fixed_inputs[name]) for name in expected
@@ -196,10 +199,13 @@ class SurfaceRenderer(Predictor):
 
     def compute_light(self, inputs: Mapping[str, Tensor]) -> ArrangementLight:
         """Compute the light under the environment of scene inputs."""
-        padded = inputs.get(
-            ENVIRONMENT_INPUT, self._scene_values[ENVIRONMENT_INPUT]
-        ).detach()
+        padded = self._get_environment(inputs)
         return self.arrangement.compute_light(padded, self.base_color)
+
+    def _get_environment(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """Return the padded map (H, W + 2, 3) of scene inputs, without a graph."""
+        stated_map = self._scene_values[ENVIRONMENT_INPUT]
+        return inputs.get(ENVIRONMENT_INPUT, stated_map).detach()
 
     def get_light_and_factor(
         self, inputs: Mapping[str, Tensor]
@@ -211,23 +217,23 @@ class SurfaceRenderer(Predictor):
         is returned is that of `inputs`. A light is computed on first use. Up to
         `MAX_BYTES` of lights are stored; the oldest are dropped first.
         """
-        fingerprint = MapFingerprint.compute(
-            inputs.get(
-                ENVIRONMENT_INPUT, self._scene_values[ENVIRONMENT_INPUT]
-            ).detach()
-        )
+        fingerprint = MapFingerprint.compute(self._get_environment(inputs))
         for stored_fingerprint, light in self.stored_lights.items():
             factor = stored_fingerprint.compute_map_ratio(fingerprint)
             if factor is not None:
                 return light, factor
         light = self.compute_light(inputs)
         self.stored_lights[fingerprint] = light
-        # `self.n_bytes` includes the stored lights. The new one stays in any case.
+        self._drop_old_lights()
+        return light, torch.ones(3)
+
+    def _drop_old_lights(self) -> None:
+        """Drop the oldest lights over the limit of memory; the newest stays in any case."""
+        # `self.n_bytes` includes the stored lights.
         while len(self.stored_lights) > 1 and self.n_bytes > scale_limit(MAX_BYTES):
             oldest = next(iter(self.stored_lights))
             self.stored_lights.pop(oldest)
             self.n_dropped += 1
-        return light, torch.ones(3)
 
     def _choose_light(
         self, inputs: Mapping[str, Tensor]
@@ -254,23 +260,8 @@ class SurfaceRenderer(Predictor):
             inputs: scene inputs of each camera. Views come in the order of groups;
                 `LitCameraView.camera_index` is the index in `inputs`.
         """
-        cameras_of_light: dict[ArrangementLight, list[int]] = {}
-        light_factors = []
-        for camera_index, camera_inputs in enumerate(inputs):
-            light, light_factor = self._choose_light(camera_inputs)
-            cameras_of_light.setdefault(light, []).append(camera_index)
-            light_factors.append(light_factor)
-        cameras = [
-            self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
-        ]
-        # A generator, not a list: each `next` starts one launch, and returns the
-        # function that waits for its samples.
-        launches = (
-            self.arrangement.start_tracing(
-                [cameras[camera_index] for camera_index in camera_indices], light
-            )
-            for light, camera_indices in cameras_of_light.items()
-        )
+        cameras_of_light, light_factors = self._group_by_light(inputs)
+        launches = self._iterate_launches(inputs, cameras_of_light)
         finish_launch = next(launches)
         for light, camera_indices in cameras_of_light.items():
             samples = finish_launch()
@@ -282,6 +273,40 @@ class SurfaceRenderer(Predictor):
                 yield LitCameraView(
                     camera_index, view, light, light_factors[camera_index]
                 )
+
+    def _group_by_light(
+        self, inputs: Sequence[Mapping[str, Tensor]]
+    ) -> tuple[dict[ArrangementLight, list[int]], list[Tensor | float]]:
+        """Return the cameras under each light, and for each camera the light's factor.
+
+        Args:
+            inputs: scene inputs of each camera.
+        """
+        cameras_of_light: dict[ArrangementLight, list[int]] = {}
+        light_factors = []
+        for camera_index, camera_inputs in enumerate(inputs):
+            light, light_factor = self._choose_light(camera_inputs)
+            cameras_of_light.setdefault(light, []).append(camera_index)
+            light_factors.append(light_factor)
+        return cameras_of_light, light_factors
+
+    def _iterate_launches(
+        self,
+        inputs: Sequence[Mapping[str, Tensor]],
+        cameras_of_light: Mapping[ArrangementLight, Sequence[int]],
+    ) -> Iterator[Callable[[], ViewSamples]]:
+        """Start the launch of each light; yield a function that waits for its samples.
+
+        Args:
+            inputs: scene inputs of each camera.
+            cameras_of_light: indices of the cameras under each light.
+        """
+        cameras = [
+            self._select_camera_inputs(camera_inputs) for camera_inputs in inputs
+        ]
+        for light, camera_indices in cameras_of_light.items():
+            lit_cameras = [cameras[camera_index] for camera_index in camera_indices]
+            yield self.arrangement.start_tracing(lit_cameras, light)
 
     def compose_images(
         self,
@@ -307,19 +332,18 @@ class SurfaceRenderer(Predictor):
         images = dict[int, Tensor]()
         for lit_view in views:
             light = lit_view.light
+            camera_index = lit_view.camera_index
             if light not in reflected_by_light:
                 reflected_by_light[light] = light.compute_reflected(fine_color)
             radiance = lit_view.view.compute_radiance(reflected_by_light[light])
             # from the stored light to that of the camera's environment
             radiance = radiance * lit_view.light_factor
-            images[lit_view.camera_index] = self.path_renderer.finish_image(
+            images[camera_index] = self.path_renderer.finish_image(
                 radiance,
-                inputs[lit_view.camera_index],
-                full_configurations[lit_view.camera_index],
+                inputs[camera_index],
+                full_configurations[camera_index],
             )
-        return torch.stack(
-            [images[camera_index] for camera_index in range(len(inputs))]
-        )
+        return torch.stack([images[index] for index in range(len(inputs))])
 
     def predict_images(self, us: Sequence[Tensor]) -> list[Tensor]:
         """Return images of configurations that differ in camera and environment only.
@@ -348,6 +372,11 @@ class SurfaceRenderer(Predictor):
         return lit_view.view.compute_radiance(reflected) * lit_view.light_factor
 
 
+def _drop_free_inputs(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return scene inputs without those that may change."""
+    return {name: inputs[name] for name in inputs if name not in FREE_INPUTS}
+
+
 def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
     """Return why light on surfaces cannot predict a space's images; None if it can.
 
@@ -362,12 +391,9 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
     refusal = find_scene_refusal(renderer)
     if refusal is not None:
         return refusal
-    for group in renderer.plan.groups:
-        # A group with the estimator "image" changes only the finished image.
-        if group.control in varying or group.estimator == "image":
-            continue
-        if renderer.inputs_by_group.get(group.name, frozenset()) != {COLOR_INPUT}:
-            return Refusal(f"{group.name} changes more than the object's base color")
+    refusal = _find_searched_group_refusal(renderer, varying)
+    if refusal is not None:
+        return refusal
     changed = find_changed_inputs(renderer, varying)
     # A change of anything else moves or repaints surfaces, so that the stored light
     # would no longer hold.
@@ -378,6 +404,19 @@ def find_refusal(renderer: Renderer, varying: Collection[str]) -> Refusal | None
         )
     if not changed & CAMERA_INPUTS:
         return Refusal("no camera varies", RefusalCause.NO_CAMERA)
+    return None
+
+
+def _find_searched_group_refusal(
+    renderer: Renderer, varying: Collection[str]
+) -> Refusal | None:
+    """Return why a searched group, which does not vary, is refused; None if none is."""
+    for group in renderer.plan.groups:
+        # A group with the estimator "image" changes only the finished image.
+        if group.control in varying or group.estimator == "image":
+            continue
+        if renderer.inputs_by_group.get(group.name, frozenset()) != {COLOR_INPUT}:
+            return Refusal(f"{group.name} changes more than the object's base color")
     return None
 
 
@@ -424,12 +463,20 @@ def find_changed_inputs(renderer: Renderer, varying: Collection[str]) -> frozens
             renderer.space.inputs(renderer.start)
         )
         for fraction in PROBE_FRACTIONS:
-            u = renderer.start.clone()
-            for group in renderer.space.groups:
-                if group.control in varying or group.name in varying:
-                    u[group.coordinates] = fraction
+            u = _set_varying_to_fraction(renderer, varying, fraction)
             inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
             for name in start_inputs.keys() | inputs.keys():
                 if inputs_differ(start_inputs.get(name), inputs.get(name)):
                     changed.add(name)
     return frozenset(changed)
+
+
+def _set_varying_to_fraction(
+    renderer: Renderer, varying: Collection[str], fraction: float
+) -> Tensor:
+    """Return the start (d,) with the coordinates of some controls at a fraction."""
+    u = renderer.start.clone()
+    for group in renderer.space.groups:
+        if group.control in varying or group.name in varying:
+            u[group.coordinates] = fraction
+    return u

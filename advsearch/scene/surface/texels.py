@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -158,18 +158,9 @@ def make_ground_texels(
         center: x and y of the object's center.
     """
     half_width = min(half_width, MAX_GROUND_REACH)
-    # The width of a texel is in proportion to the slope of the position. At the center
-    # the slope is scale * rate, and for equal texels it would be `half_width`, which is
-    # scale * sinh(rate). So the center's texel is narrower than an equal one by the
-    # ratio sinh(rate) / rate: the rate is the one for which it is `MIN_TEXEL_WIDTH`.
-    equal_width = 2.0 * half_width / GROUND_TEXELS
-    rate = _find_warp_rate(equal_width / MIN_TEXEL_WIDTH)
+    rate = _find_ground_rate(half_width)
     scale = half_width / math.sinh(rate)
-    axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
-    axis_offset = scale * np.sinh(rate * axis_position)
-    y, x = np.meshgrid(axis_offset + center[1], axis_offset + center[0], indexing="ij")
-    positions = np.stack([x, y, np.full_like(x, height)], axis=-1)
-    positions = positions.reshape(-1, 3).astype(np.float32)
+    positions = _compute_ground_positions(rate, scale, height, center)
     up = np.array([0.0, 0.0, 1.0], dtype=np.float32)
     normals = np.broadcast_to(up, positions.shape).copy()
     grid = TexelGrid(
@@ -189,6 +180,29 @@ def make_ground_texels(
     )
 
 
+def _find_ground_rate(half_width: float) -> float:
+    """Return the rate for which the ground's texel at the center is `MIN_TEXEL_WIDTH`.
+
+    The width of a texel is in proportion to the slope of the position. At the center
+    the slope is scale * rate, and for equal texels it would be `half_width`, which is
+    scale * sinh(rate). So the center's texel is narrower than an equal one by the ratio
+    sinh(rate) / rate.
+    """
+    equal_width = 2.0 * half_width / GROUND_TEXELS
+    return _find_warp_rate(equal_width / MIN_TEXEL_WIDTH)
+
+
+def _compute_ground_positions(
+    rate: float, scale: float, height: float, center: tuple[float, float]
+) -> Float32Array:
+    """Return the positions (n, 3) of the ground's texels; see `make_ground_texels`."""
+    axis_position = (np.arange(GROUND_TEXELS) + 0.5) * 2.0 / GROUND_TEXELS - 1.0
+    axis_offset = scale * np.sinh(rate * axis_position)
+    y, x = np.meshgrid(axis_offset + center[1], axis_offset + center[0], indexing="ij")
+    positions = np.stack([x, y, np.full_like(x, height)], axis=-1)
+    return positions.reshape(-1, 3).astype(np.float32)
+
+
 def _find_warp_rate(ratio: float) -> float:
     """Find the rate with sinh(rate) / rate = ratio, by bisection.
 
@@ -206,96 +220,127 @@ def _find_warp_rate(ratio: float) -> float:
     return lower
 
 
-def _weigh_neighbours(
-    texels: LitTexels,
-    charts: Charts,
-    grid_position: tuple[Float64Array, Float64Array],
-    points: Float32Array,
-    normals: Float32Array,
-    texel_width: float,
-    buried: BoolArray,
-) -> tuple[IntArray, Float64Array]:
-    """Return the texels around points and their weights in a joint bilateral filter.
+class _SurfacePoints(NamedTuple):
+    """Points on a mesh.
+
+    Attributes:
+        row: (N,) their rows in the grid of the mesh's charts; the center of a cell has
+            an integer.
+        column: (N,) their columns, likewise.
+        position: (N, 3) in world space.
+        normal: (N, 3) at the points.
+    """
+
+    row: Float64Array
+    column: Float64Array
+    position: Float32Array
+    normal: Float32Array
+
+
+@dataclass(frozen=True, eq=False)
+class _BilateralFilter:
+    """A joint bilateral filter of light on a mesh.
 
     A texel's weight is the product of three: one falls with the distance in the grid,
     one with the distance in space, and one with the angle between the normals.
 
-    Args:
+    Attributes:
         texels: texels of the mesh.
         charts: charts of the mesh.
-        grid_position: rows and columns (N,) of the points in the grid of the charts.
-        points: (N, 3) in world space.
-        normals: (N, 3) at the points.
         texel_width: texel width in world space.
         buried: (n,) texels that do not count.
-
-    Returns:
-        Indices of texels, -1 outside of the charts, and weights, both (N, neighbours).
     """
-    y, x = grid_position
-    n_rows, n_columns = charts.is_covered.shape
-    # The index of the texel in each cell of the grid; -1 outside of the charts. Texels
-    # are the covered cells, numbered row by row.
-    texel_at = np.cumsum(charts.is_covered.ravel()).reshape(n_rows, n_columns) - 1
-    texel_at = np.where(charts.is_covered, texel_at, -1)
 
-    def weigh(row: IntArray, column: IntArray, texel: IntArray) -> Float64Array:
-        """Return the weights (N,) of the neighbours at rows and columns.
+    texels: LitTexels
+    charts: Charts
+    texel_width: float
+    buried: BoolArray
 
-        A neighbour outside of the charts has the index -1, and gets the weight 0.
+    def weigh_texels(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
+        """Return the texels whose light counts at points, and their weights.
+
+        Returns:
+            Indices of texels, and weights that add up to 1 for each point, both
+            (N, neighbors). Indices with the weight 0 mean nothing.
         """
-        grid_distance = ((row - y) ** 2 + (column - x) ** 2) / (2.0 * GRID_SIGMA**2)
-        offset = texels.positions[texel] - points
-        distance = (offset**2).sum(axis=1) / (2.0 * (SPACE_SIGMA * texel_width) ** 2)
-        cosine = (texels.normals[texel] * normals).sum(axis=1)
-        # A neighbour round an edge, which faces elsewhere, has other light. The power
+        texel_index, weights = self.weigh_neighbors(points)
+        # Points without any weight are changed in `texel_index` and `weights`.
+        self.use_nearest_texel(points, texel_index, weights)
+        weights /= weights.sum(axis=1, keepdims=True)
+        return texel_index, weights
+
+    def weigh_neighbors(self, points: _SurfacePoints) -> tuple[IntArray, Float64Array]:
+        """Return the texels around points, and their weights.
+
+        Returns:
+            Indices of texels, -1 outside of the charts, and weights, both
+            (N, neighbors).
+        """
+        texel_at = self._number_texels()
+        n_rows, n_columns = texel_at.shape
+        neighbors = []
+        weights = []
+        for row, column in _iter_neighbourhood(points.row, points.column):
+            is_inside = (
+                (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
+            )
+            clipped_row = row.clip(0, n_rows - 1)
+            clipped_column = column.clip(0, n_columns - 1)
+            texel = np.where(is_inside, texel_at[clipped_row, clipped_column], -1)
+            neighbors.append(texel)
+            weights.append(self._weigh(points, row, column, texel))
+        return np.stack(neighbors, axis=1), np.stack(weights, axis=1)
+
+    def _number_texels(self) -> IntArray:
+        """Return the index of the texel in each cell of the grid; -1 outside of charts.
+
+        Texels are the covered cells, numbered row by row.
+        """
+        is_covered = self.charts.is_covered
+        texel_at = np.cumsum(is_covered.ravel()).reshape(is_covered.shape) - 1
+        return np.where(is_covered, texel_at, -1)
+
+    def _weigh(
+        self, points: _SurfacePoints, row: IntArray, column: IntArray, texel: IntArray
+    ) -> Float64Array:
+        """Return the weights (N,) of the neighbors of points at rows and columns.
+
+        A neighbor outside of the charts has the index -1, and gets the weight 0.
+        """
+        squared_distance = (row - points.row) ** 2 + (column - points.column) ** 2
+        grid_distance = squared_distance / (2.0 * GRID_SIGMA**2)
+        offset = self.texels.positions[texel] - points.position
+        space_sigma = SPACE_SIGMA * self.texel_width
+        distance = (offset**2).sum(axis=1) / (2.0 * space_sigma**2)
+        cosine = (self.texels.normals[texel] * points.normal).sum(axis=1)
+        # A neighbor round an edge, which faces elsewhere, has other light. The power
         # lets it count for half at 24 degrees, and for nothing at a right angle.
         similarity = np.clip(cosine, 0.0, 1.0) ** 8
         weight = np.exp(-grid_distance - distance) * similarity
         # The look-ups with -1 have read the last texel, which has no effect.
-        is_used = (texel >= 0) & ~buried[texel]
+        is_used = (texel >= 0) & ~self.buried[texel]
         return np.where(is_used, weight, 0.0)
 
-    neighbours = []
-    weights = []
-    for row, column in _iter_neighbourhood(y, x):
-        is_inside = (row >= 0) & (row < n_rows) & (column >= 0) & (column < n_columns)
-        clipped_row = row.clip(0, n_rows - 1)
-        clipped_column = column.clip(0, n_columns - 1)
-        texel = np.where(is_inside, texel_at[clipped_row, clipped_column], -1)
-        neighbours.append(texel)
-        weights.append(weigh(row, column, texel))
-    return np.stack(neighbours, axis=1), np.stack(weights, axis=1)
+    def use_nearest_texel(
+        self, points: _SurfacePoints, texel_index: IntArray, weights: Float64Array
+    ) -> None:
+        """Give all the weight to the nearest texel if no neighbor of a point has any.
 
-
-def _use_nearest_texel(
-    texels: LitTexels,
-    charts: Charts,
-    grid_position: tuple[Float64Array, Float64Array],
-    texel_index: IntArray,
-    weights: Float64Array,
-) -> None:
-    """Give all the weight to the nearest texel if no neighbour of a point has any.
-
-    Both `texel_index` and `weights` are changed in place.
-
-    Args:
-        texels: texels of the mesh.
-        charts: charts of the mesh.
-        grid_position: rows and columns (N,) of the points in the grid of the charts.
-        texel_index: (N, neighbours) texels around the points; the first column is
-            overwritten for points without weights.
-        weights: (N, neighbours) their weights, likewise.
-    """
-    y, x = grid_position
-    n_rows, n_columns = charts.is_covered.shape
-    is_unweighted = weights.sum(axis=1) < 1e-6  # too little to divide by
-    nearest_row = np.round(y[is_unweighted]).astype(int).clip(0, n_rows - 1)
-    nearest_column = np.round(x[is_unweighted]).astype(int).clip(0, n_columns - 1)
-    texel_index[is_unweighted, 0] = texels.texel_of_cell[
-        nearest_row * n_columns + nearest_column
-    ]
-    weights[is_unweighted, 0] = 1.0
+        Args:
+            points: the points.
+            texel_index: (N, neighbors) texels around the points; the first column is
+                overwritten for points without weights.
+            weights: (N, neighbors) their weights, likewise.
+        """
+        n_rows, n_columns = self.charts.is_covered.shape
+        is_unweighted = weights.sum(axis=1) < 1e-6  # too little to divide by
+        row = points.row[is_unweighted]
+        column = points.column[is_unweighted]
+        nearest_row = np.round(row).astype(int).clip(0, n_rows - 1)
+        nearest_column = np.round(column).astype(int).clip(0, n_columns - 1)
+        nearest_cell = nearest_row * n_columns + nearest_column
+        texel_index[is_unweighted, 0] = self.texels.texel_of_cell[nearest_cell]
+        weights[is_unweighted, 0] = 1.0
 
 
 def make_lookup_matrix(
@@ -326,37 +371,43 @@ def make_lookup_matrix(
         # With no texel left there would be no light at all: so all of them count.
         buried = np.zeros_like(buried)
     fine_charts = rasterize_charts(charts.mesh, shape)
-    position, normal = _interpolate(fine_charts, vertices, normals)
     # Cells up to `BORDER_TEXELS` outside of a chart count too: interpolation at the
     # chart's border reads them.
-    rows, columns = np.nonzero(fine_charts.texels_to_covered <= BORDER_TEXELS)
-    points = position[rows, columns]
-    point_normals = normal[rows, columns]
+    is_near_chart = fine_charts.texels_to_covered <= BORDER_TEXELS
+    points = _find_cell_points(fine_charts, is_near_chart, vertices, normals, charts)
     texel_width = _compute_texel_width(charts, vertices)
-    n_rows, n_columns = charts.is_covered.shape
-    # centers of the finer cells in the grid of the charts
-    grid_position = (
-        (rows + 0.5) * n_rows / shape[0] - 0.5,
-        (columns + 0.5) * n_columns / shape[1] - 0.5,
-    )
-
-    texel_index, weights = _weigh_neighbours(
-        texels,
-        charts,
-        grid_position=grid_position,
-        points=points,
-        normals=point_normals,
-        texel_width=texel_width,
-        buried=buried,
-    )
-    # Points without any weight are changed in `texel_index` and `weights`.
-    _use_nearest_texel(texels, charts, grid_position, texel_index, weights)
-    weights /= weights.sum(axis=1, keepdims=True)
-
-    n_fine_cells = shape[0] * shape[1]
+    bilateral_filter = _BilateralFilter(texels, charts, texel_width, buried)
+    texel_index, weights = bilateral_filter.weigh_texels(points)
     _first, n_texels = texels.first_texels[:2]  # of the first surface
-    fine_cell = rows * shape[1] + columns
-    return _make_sparse(fine_cell, texel_index, weights, (n_fine_cells, n_texels))
+    size = (shape[0] * shape[1], n_texels)
+    return _make_sparse(np.flatnonzero(is_near_chart), texel_index, weights, size)
+
+
+def _find_cell_points(
+    fine_charts: Charts,
+    is_selected: BoolArray,
+    vertices: Float32Array,
+    normals: Float32Array,
+    charts: Charts,
+) -> _SurfacePoints:
+    """Return the surface points of cells of a finer grid.
+
+    Args:
+        fine_charts: charts of the mesh in the finer grid.
+        is_selected: (h, w) which cells of it.
+        vertices, normals: (V, 3) in world space.
+        charts: charts in whose grid the points have their rows and columns.
+    """
+    position, normal = _interpolate(fine_charts, vertices, normals)
+    rows, columns = np.nonzero(is_selected)
+    n_fine_rows, n_fine_columns = is_selected.shape
+    n_rows, n_columns = charts.is_covered.shape
+    return _SurfacePoints(
+        row=(rows + 0.5) * n_rows / n_fine_rows - 0.5,
+        column=(columns + 0.5) * n_columns / n_fine_columns - 0.5,
+        position=position[rows, columns],
+        normal=normal[rows, columns],
+    )
 
 
 def _make_sparse(
@@ -431,6 +482,18 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
         sees_sky = np.ones_like(sees_sky)
     is_used = sees_sky.reshape(width, width)
     nearest_used = _find_nearest(is_used)
+    weights = _make_binomial_weights(is_used)
+    # The row of a texel that is not used is that of the nearest one that is.
+    rows = weights.astype(np.float32)[nearest_used]
+    return to_torch_csr(rows)
+
+
+def _make_binomial_weights(is_used: BoolArray) -> scipy.sparse.csr_array:
+    """Return the weights (n, n) of used texels (w, w) for each texel.
+
+    Rows sum to 1, or to 0 if no texel nearby is used.
+    """
+    width = len(is_used)
     # along one axis: each texel and two neighbours on each side
     axis_weights = scipy.sparse.diags_array(
         BINOMIAL, offsets=range(-2, 3), shape=(width, width), dtype=np.float64
@@ -444,9 +507,7 @@ def make_smoothing_matrix(ground: LitTexels, sees_sky: BoolArray) -> Tensor:
     entries_per_row = np.diff(weights.indptr)
     row_sum_of_entry = np.repeat(weights.sum(axis=1), entries_per_row)
     weights.data /= np.maximum(row_sum_of_entry, 1e-12)
-    # The row of a texel that is not used is that of the nearest one that is.
-    rows = weights.astype(np.float32)[nearest_used]
-    return to_torch_csr(rows)
+    return weights
 
 
 def _interpolate(
@@ -528,30 +589,16 @@ def prepare_sky(padded: Tensor) -> SkyLight:
     light in any case.
     """
     radiance = padded[:, 1:-1].detach()
-    n_rows, n_columns = radiance.shape[:2]
-    # The texels of the first and last row are centered at the poles.
-    polar = torch.linspace(0.0, math.pi, n_rows)
-    # The solid angle of a texel is proportional to the sine of its polar angle. At a
-    # pole the sine is 0, but the texel there reaches half a texel from the pole. So it
-    # gets the sine at a quarter of a texel, in the middle of that half.
-    sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
-    sine = sine[:, None].expand(n_rows, n_columns)
-    luminance = radiance @ LUMINANCE_WEIGHTS
-    mean_luminance = float((luminance * sine).sum() / sine.sum())
-    # the fraction of each texel's light that is above the limit
-    hot_fraction = (
-        1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
-    ).clamp_min(0.0)
-    hot_power = hot_fraction * luminance * sine
-    if float(hot_power.sum()) > MIN_HOT_FRACTION * mean_luminance * float(sine.sum()):
-        hot_directions, hot_light = _sample_hot(
-            radiance * hot_fraction[..., None], hot_power
-        )
+    sine = _compute_texel_sines(radiance.shape[0], radiance.shape[1])
+    hot_fraction = _find_hot_fraction(radiance, sine)
+    hot_directions = torch.zeros(0, 3)
+    hot_light = torch.zeros(0, 3)
+    remaining = radiance
+    if hot_fraction is not None:
+        hot_radiance = radiance * hot_fraction[..., None]
+        hot_power = hot_fraction * (radiance @ LUMINANCE_WEIGHTS) * sine
+        hot_directions, hot_light = _sample_hot(hot_radiance, hot_power)
         remaining = radiance * (1.0 - hot_fraction[..., None])
-    else:
-        hot_directions = torch.zeros(0, 3)
-        hot_light = torch.zeros(0, 3)
-        remaining = radiance
     return SkyLight(
         padded=padded,
         cell_radiance=_average_cells(remaining, sine, SKY_SHAPE).reshape(-1, 3),
@@ -559,6 +606,39 @@ def prepare_sky(padded: Tensor) -> SkyLight:
         hot_directions=hot_directions,
         hot_light=hot_light,
     )
+
+
+def _find_hot_fraction(radiance: Tensor, sine: Tensor) -> Tensor | None:
+    """Return the fraction (H, W) of each texel's light that is above the limit.
+
+    The result is None if no more than `MIN_HOT_FRACTION` of all light is.
+
+    Args:
+        radiance: (H, W, 3) radiance of the texels.
+        sine: (H, W) their solid angles, in any unit.
+    """
+    luminance = radiance @ LUMINANCE_WEIGHTS
+    mean_luminance = float((luminance * sine).sum() / sine.sum())
+    hot_fraction = (
+        1.0 - HOT_FACTOR * mean_luminance / luminance.clamp_min(1e-12)
+    ).clamp_min(0.0)
+    hot_power = float((hot_fraction * luminance * sine).sum())
+    if hot_power > MIN_HOT_FRACTION * mean_luminance * float(sine.sum()):
+        return hot_fraction
+    return None
+
+
+def _compute_texel_sines(n_rows: int, n_columns: int) -> Tensor:
+    """Return the solid angles of a map's texels (rows, columns), in proportion.
+
+    The solid angle of a texel is proportional to the sine of its polar angle. The
+    texels of the first and last row are centered at the poles. At a pole the sine is 0,
+    but the texel there reaches half a texel from the pole. So it gets the sine at a
+    quarter of a texel, in the middle of that half.
+    """
+    polar = torch.linspace(0.0, math.pi, n_rows)
+    sine = polar.sin().clamp_min(math.sin(0.25 * math.pi / n_rows))
+    return sine[:, None].expand(n_rows, n_columns)
 
 
 def _sample_hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
@@ -656,28 +736,47 @@ def blur_map(radiance: Tensor) -> Tensor:
     Returns:
         (n_widths, h, w, 3) one blurred map for each width.
     """
-    n_rows, n_columns = radiance.shape[:2]
-    polar = (torch.arange(n_rows) + 0.5) * math.pi / n_rows
-    frequency = torch.arange(n_columns // 2 + 1)
     maps = []
     for blur_width in BLUR_WIDTHS:
         sigma = blur_width / math.sqrt(2.0)
-        exponent = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
-        # Each row is weighted by its solid angle, which is small near the poles.
-        column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
-        column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
-        # A row is periodic, so that it is blurred in the frequency domain: there the
-        # factor is exp(-(frequency s)^2 / 2), where s is the sigma of the azimuth. Near
-        # a pole, an angle sigma along the row is a large azimuth: s = sigma / sine.
-        row_filter = torch.exp(
-            -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
-        )
-        column_blurred = column_kernel @ radiance.reshape(n_rows, -1)
-        spectrum = torch.fft.rfft(column_blurred.reshape(n_rows, n_columns, 3), dim=1)
-        maps.append(
-            torch.fft.irfft(spectrum * row_filter[..., None], n=n_columns, dim=1)
-        )
+        maps.append(_blur_rows(_blur_columns(radiance, sigma), sigma))
     return torch.stack(maps).clamp_min(0.0)
+
+
+def _compute_polar_angles(n_rows: int) -> Tensor:
+    """Return the polar angles (h,) of the centers of a map's rows, radians."""
+    return (torch.arange(n_rows) + 0.5) * math.pi / n_rows
+
+
+def _blur_columns(radiance: Tensor, sigma: float) -> Tensor:
+    """Blur a map (h, w, 3) along its columns, by an angle in radians.
+
+    Each row is weighted by its solid angle, which is small near the poles.
+    """
+    polar = _compute_polar_angles(len(radiance))
+    exponent = (polar[:, None] - polar[None, :]).square() / (2.0 * sigma**2)
+    column_kernel = torch.exp(-exponent) * polar.sin()[None, :]
+    column_kernel = column_kernel / column_kernel.sum(dim=1, keepdim=True)
+    blurred = column_kernel @ radiance.reshape(len(radiance), -1)
+    return blurred.reshape(len(radiance), -1, 3)
+
+
+def _blur_rows(radiance: Tensor, sigma: float) -> Tensor:
+    """Blur a map (h, w, 3) along its rows, by an angle in radians.
+
+    A row is periodic, so that it is blurred in the frequency domain: there the factor
+    is exp(-(frequency s)^2 / 2), where s is the sigma of the azimuth. Near a pole, an
+    angle sigma along the row is a large azimuth: s = sigma / sine.
+    """
+    n_columns = radiance.shape[1]
+    polar = _compute_polar_angles(len(radiance))
+    frequency = torch.arange(n_columns // 2 + 1)
+    row_filter = torch.exp(
+        -0.5 * (frequency[None, :] * sigma / polar.sin()[:, None]).square()
+    )
+    spectrum = torch.fft.rfft(radiance, dim=1) * row_filter[..., None]
+    blurred: Tensor = torch.fft.irfft(spectrum, n=n_columns, dim=1)
+    return blurred
 
 
 def compute_directions(size: tuple[int, int]) -> Tensor:
@@ -738,27 +837,31 @@ def make_view_matrices(
             has; a grid also has cells that are no texels.
         n_texels: number of texels of all grids.
     """
-    count, n_rays = met_cells.shape
-    row = np.repeat(np.arange(count), n_rays)
-    cell = met_cells.ravel()
-    is_sky = cell >= len(texel_of_cell)
-    is_texel = (cell >= 0) & (cell < len(texel_of_cell))
+    n_cells = len(texel_of_cell)
+    is_sky = met_cells >= n_cells
+    is_texel = (met_cells >= 0) & (met_cells < n_cells)
+    sky_column = met_cells[is_sky] - n_cells
+    sky_view = _make_ray_matrix(is_sky, sky_column, SKY_SHAPE[0] * SKY_SHAPE[1])
+    texel_column = texel_of_cell[met_cells[is_texel]]
+    return sky_view, _make_ray_matrix(is_texel, texel_column, n_texels)
 
-    def make_matrix(
-        mask: BoolArray, column: npt.NDArray[np.integer[Any]], width: int
-    ) -> Tensor:
-        """Return a matrix in which each ray of a mask counts pi / n_rays.
 
-        `column` has an entry for each True of the mask.
-        """
-        values = np.full(len(column), math.pi / n_rays, dtype=np.float32)
-        entries = (values, (row[mask], column))
-        return to_torch_csr(scipy.sparse.coo_matrix(entries, (count, width)).tocsr())
+def _make_ray_matrix(
+    is_entry: BoolArray, column: npt.NDArray[np.integer[Any]], n_columns: int
+) -> Tensor:
+    """Return a sparse matrix (n, columns) in which selected rays count pi / n_rays.
 
-    sky_column = cell[is_sky] - len(texel_of_cell)
-    sky_view = make_matrix(is_sky, sky_column, SKY_SHAPE[0] * SKY_SHAPE[1])
-    texel_view = make_matrix(is_texel, texel_of_cell[cell[is_texel]], n_texels)
-    return sky_view, texel_view
+    Args:
+        is_entry: (n, rays) which rays of each texel are selected.
+        column: for each of these, texel by texel, its column.
+        n_columns: number of columns.
+    """
+    n_texels, n_rays = is_entry.shape
+    row = np.repeat(np.arange(n_texels), n_rays)
+    values = np.full(len(column), math.pi / n_rays, dtype=np.float32)
+    entries = (values, (row[is_entry.ravel()], column))
+    size = (n_texels, n_columns)
+    return to_torch_csr(scipy.sparse.coo_matrix(entries, size).tocsr())
 
 
 def look_up_environment(padded: Tensor, directions: Tensor) -> Tensor:

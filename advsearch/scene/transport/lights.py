@@ -124,15 +124,7 @@ def find_light_groups(renderer: Renderer) -> LightGroups:
     harmonic_groups = set()
     brightest_values = []
     with torch.no_grad():
-        base_inputs = renderer.scene.input_assembler(renderer.space.inputs(reference))
-        for group in renderer.space.groups:
-            effect = _measure_effect(renderer, group, reference, base_inputs)
-            if effect is None:  # the group changes more than light
-                continue
-            only_changes_image = effect.changed <= IMAGE_INPUTS
-            changes_light = not only_changes_image
-            if changes_light and has_fixed_lights(renderer):
-                continue
+        for group, effect in _iterate_light_effects(renderer, reference):
             groups[group.name] = effect.changed
             if effect.is_harmonic:
                 # The light that it adds has basis maps of its own, so that the map of
@@ -153,6 +145,27 @@ class _Effect(NamedTuple):
     brightest: Tensor
 
 
+def _iterate_light_effects(
+    renderer: Renderer, reference: Tensor
+) -> Iterator[tuple[Group, _Effect]]:
+    """Yield each group that changes only light or the finished image, and its effect.
+
+    Groups that change light are left out if the scene has lights that are no inputs.
+
+    Args:
+        renderer: renderer of the space.
+        reference: (d,) configuration from which one group at a time is varied.
+    """
+    base_inputs = renderer.scene.input_assembler(renderer.space.inputs(reference))
+    for group in renderer.space.groups:
+        effect = _measure_effect(renderer, group, reference, base_inputs)
+        if effect is None:  # the group changes more than light
+            continue
+        only_changes_image = effect.changed <= IMAGE_INPUTS
+        if only_changes_image or not has_fixed_lights(renderer):
+            yield group, effect
+
+
 def _measure_effect(
     renderer: Renderer, group: Group, reference: Tensor, base_inputs: Inputs
 ) -> _Effect | None:
@@ -168,25 +181,41 @@ def _measure_effect(
     brightest = reference
     for configuration in _sample_configurations(group, reference):
         inputs = renderer.scene.input_assembler(renderer.space.inputs(configuration))
-        for name in base_inputs.keys() | inputs.keys():
-            change = _find_change(
-                name,
-                before=base_inputs.get(name),
-                after=inputs.get(name),
-                n_coordinates=group.size,
-            )
-            if change is _Change.OTHER:
-                return None
-            if change is not _Change.NONE:
-                changed.add(name)
-            if name == ENVIRONMENT_INPUT and change is _Change.HARMONICS:
-                is_harmonic = True
+        changes = _find_input_changes(base_inputs, inputs, group.size)
+        if changes is None:
+            return None
+        changed |= {name for name in changes if changes[name] is not _Change.NONE}
+        is_harmonic |= changes.get(ENVIRONMENT_INPUT) is _Change.HARMONICS
         if ENVIRONMENT_INPUT in inputs:
             power = float(inputs[ENVIRONMENT_INPUT].sum())
             if power > max_power:
                 max_power = power
                 brightest = configuration
     return _Effect(frozenset(changed), is_harmonic, brightest)
+
+
+def _find_input_changes(
+    base_inputs: Inputs, inputs: Inputs, n_coordinates: int
+) -> dict[str, _Change] | None:
+    """Return how each input changes; None if one changes in more than light.
+
+    Args:
+        base_inputs: scene inputs at the reference configuration.
+        inputs: scene inputs once a group is changed.
+        n_coordinates: number of coordinates of the group.
+    """
+    changes: dict[str, _Change] = {}
+    for name in base_inputs.keys() | inputs.keys():
+        change = _find_change(
+            name,
+            before=base_inputs.get(name),
+            after=inputs.get(name),
+            n_coordinates=n_coordinates,
+        )
+        if change is _Change.OTHER:
+            return None
+        changes[name] = change
+    return changes
 
 
 def _sample_configurations(group: Group, reference: Tensor) -> Iterator[Tensor]:
@@ -245,24 +274,35 @@ def _find_change(
         return _Change.POWER
     if name != ENVIRONMENT_INPUT or before.shape != after.shape:
         return _Change.OTHER
+    return _find_environment_change(before, after, n_coordinates)
+
+
+def _find_environment_change(
+    before: Tensor, after: Tensor, n_coordinates: int
+) -> _Change:
+    """Return how a group of coordinates changes the environment's map (H, W, 3)."""
     # a multiple of the map before, by one factor for each color channel
     if _is_weighted_sum(after, before[None]):
         return _Change.POWER
     # A control that adds harmonics has a coordinate for each coefficient. So a group
     # with a single coordinate adds none, and the expensive test below is saved.
-    if n_coordinates == 1:
-        return _Change.OTHER
-    harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
-    # The fit to every `COARSE_STEP`th pixel rejects most other changes in a tenth of
-    # the time.
-    if not _is_weighted_sum(
-        after[::COARSE_STEP, ::COARSE_STEP],
-        harmonic_basis[:, ::COARSE_STEP, ::COARSE_STEP],
-    ):
-        return _Change.OTHER
-    if _is_weighted_sum(after, harmonic_basis):
+    if n_coordinates != 1 and _has_added_harmonics(before, after):
         return _Change.HARMONICS
     return _Change.OTHER
+
+
+def _has_added_harmonics(before: Tensor, after: Tensor) -> bool:
+    """Return whether a map (H, W, 3) is a multiple of one before, plus harmonics.
+
+    The fit to every `COARSE_STEP`th pixel rejects most other changes in a tenth of the
+    time.
+    """
+    harmonic_basis = torch.cat([before[None], _make_harmonic_maps(before)])
+    coarse_map = after[::COARSE_STEP, ::COARSE_STEP]
+    coarse_basis = harmonic_basis[:, ::COARSE_STEP, ::COARSE_STEP]
+    if not _is_weighted_sum(coarse_map, coarse_basis):
+        return False
+    return _is_weighted_sum(after, harmonic_basis)
 
 
 def _is_weighted_sum(target: Tensor, basis: Tensor) -> bool:
@@ -389,21 +429,11 @@ class LightBasis:
             lighting: groups of coordinates that change light.
             inputs: scene inputs whose light is split.
         """
-        patterns = {
-            name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
-        }
+        patterns = _find_patterns(renderer)
         values = _get_values(renderer, find_light_inputs(renderer) | patterns, inputs)
         dark_values = {name: torch.zeros_like(value) for name, value in values.items()}
         changed_names = lighting.changed_inputs
-
-        # The first light: all that does not change, and the patterns of projectors. A
-        # pattern that changes has a matrix of its own under this light.
-        fixed_values = {
-            name: value
-            for name, value in values.items()
-            if name in patterns
-            or (name not in changed_names and bool((value > 0.0).any()))
-        }
+        fixed_values = _select_fixed_values(values, patterns, changed_names)
         changed_lights = changed_names & values.keys()
         # A scene without any light still gets one, which is dark, so that there is an
         # image.
@@ -424,9 +454,8 @@ class LightBasis:
             maps = _make_basis_maps(renderer, lighting, values[ENVIRONMENT_INPUT])
             self._basis_maps = BasisMaps(maps)
             for basis_map in maps:
-                self.inputs_of_light.append(
-                    {**dark_values, ENVIRONMENT_INPUT: basis_map}
-                )
+                inputs_of_map = {**dark_values, ENVIRONMENT_INPUT: basis_map}
+                self.inputs_of_light.append(inputs_of_map)
 
     def compute_weights(self, inputs: Inputs) -> Tensor:
         """Return the factor (lights, 3) of each light, differentiable in the inputs.
@@ -438,6 +467,13 @@ class LightBasis:
         if self._basis_maps is not None:
             weights.append(self._basis_maps.fit_weights(inputs[ENVIRONMENT_INPUT]))
         return torch.cat(weights)
+
+
+def _find_patterns(renderer: Renderer) -> set[str]:
+    """Return the names of a scene's inputs that are patterns of projectors."""
+    return {
+        name for name in renderer.scene.input_names if name.endswith(PATTERN_SUFFIX)
+    }
 
 
 def _get_values(
@@ -484,6 +520,37 @@ def _make_basis_maps(
     return torch.cat([first[None], harmonics])
 
 
+def _set_brightest(u: Tensor, lighting: LightGroups) -> Tensor:
+    """Return a configuration (d,) with the environment at its brightest.
+
+    It gives the first basis map. Others are predicted by scaling its image, which fails
+    if a channel of it is black.
+    """
+    brightest = u.detach().clone()
+    for coordinates, values in lighting.brightest_values:
+        brightest[coordinates] = values
+    return brightest
+
+
+def _select_fixed_values(
+    values: Inputs, patterns: Collection[str], changed_names: Collection[str]
+) -> dict[str, Tensor]:
+    """Return the values of the first light: all that does not change, and projectors.
+
+    A pattern of a projector that changes has a matrix of its own under this light.
+
+    Args:
+        values: values of all lights and patterns, by the names of the inputs.
+        patterns: names of the patterns.
+        changed_names: names of the inputs that change.
+    """
+    return {
+        name: value
+        for name, value in values.items()
+        if name in patterns or (name not in changed_names and bool((value > 0.0).any()))
+    }
+
+
 class BasisRenderer(Predictor):
     """Compose images from one basis image for each light.
 
@@ -520,11 +587,7 @@ class BasisRenderer(Predictor):
         super().__init__(traced)
         with torch.no_grad():
             changing = changing or find_light_groups(traced)
-            # The first basis map is the environment at its brightest. Others are
-            # predicted by scaling its image, which fails if a channel of it is black.
-            brightest = u.detach().clone()
-            for coordinates, values in changing.brightest_values:
-                brightest[coordinates] = values
+            brightest = _set_brightest(u, changing)
             inputs = traced.scene.input_assembler(traced.space.inputs(brightest))
             self._lights = LightBasis(traced, changing, inputs)
             # Everything but light is traced at u: each light's inputs are replaced by
@@ -557,15 +620,11 @@ class BasisRenderer(Predictor):
         for index, light_inputs in enumerate(self._lights.inputs_of_light):
             # All projectors are in the first light of `LightBasis`, so that only there
             # their patterns have an effect, and need a matrix.
-            has_projectors = index == 0
+            names = linear_names if index == 0 else base_colors
+            light_seed = seeds.derive_seed(seed, "light", index)
             renderers.append(
                 LinearRenderer(
-                    traced,
-                    u,
-                    seeds.derive_seed(seed, "light", index),
-                    tick,
-                    names=linear_names if has_projectors else base_colors,
-                    light=light_inputs,
+                    traced, u, light_seed, tick, names=names, light=light_inputs
                 )
             )
         return renderers
@@ -652,12 +711,7 @@ def _find_group_refusal(
     if group.is_forced and group.estimator not in ("none", "image"):
         return Refusal(f"the estimator of {group.name} is forced")
     changed_inputs = renderer.inputs_by_group.get(group.name, frozenset())
-    parts = renderer.scene.description_and_filter[0].parts
-    haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
-    # whether it changes haze and nothing else
-    is_haze = bool(changed_inputs) and all(
-        name.startswith(haze_prefixes) for name in changed_inputs
-    )
+    is_haze = _are_all_of_haze(renderer, changed_inputs)
     needs_matrix = not (group.estimator == "image" or is_light or is_haze)
     if not needs_matrix:
         return None
@@ -670,6 +724,13 @@ def _find_group_refusal(
         allowed = "base colors" if has_varying else "base colors and light"
         return Refusal(f"{group.name} changes more than {allowed}")
     return None
+
+
+def _are_all_of_haze(renderer: Renderer, names: Collection[str]) -> bool:
+    """Return whether there are inputs, and all of them are those of haze."""
+    parts = renderer.scene.description_and_filter[0].parts
+    haze_prefixes = tuple(f"{part.name}." for part in parts if part.volumetric)
+    return bool(names) and all(name.startswith(haze_prefixes) for name in names)
 
 
 def _find_general_refusal(

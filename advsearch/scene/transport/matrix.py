@@ -23,6 +23,7 @@ import math
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -170,28 +171,38 @@ class ColoredRows:
         """
         if not len(rows):
             return
-        # Rows are ascending, so that the entries are in the order of compressed rows
-        # already. Only the first entry of each row has to be found.
-        first_samples = np.searchsorted(rows, np.arange(self._shape[0] + 1))
-        first_entries = first_samples * columns.shape[1]
         # A color may be negative, as a derivative; its magnitude counts.
         brightness = np.abs(colors).mean(axis=1, keepdims=True)
-        # scipy takes the values, their columns, and the first entry of each row.
-        added_matrix = scipy.sparse.csr_matrix(
-            (
-                (fractions * brightness).ravel(),
-                columns.ravel().astype(np.int32),
-                first_entries.astype(np.int32),
-            ),
-            self._shape,
-        )
-        added_matrix.sum_duplicates()
+        added_matrix = self._make_matrix(rows, columns, fractions * brightness)
         self._sum = self._sum + added_matrix if self._sum.nnz else added_matrix
         self.entries = int(self._sum.nnz)
         for channel in range(3):
             self._colors[:, channel] += np.bincount(
                 rows, colors[:, channel], minlength=self._shape[0]
             )
+
+    def _make_matrix(
+        self, rows: IntArray, columns: IntArray, values: Float32Array
+    ) -> scipy.sparse.csr_matrix:
+        """Return a matrix of values (n, k) at ascending rows (n,) and columns (n, k).
+
+        Values at the same row and column are added up.
+        """
+        # Rows are ascending, so that the entries are in the order of compressed rows
+        # already. Only the first entry of each row has to be found.
+        first_samples = np.searchsorted(rows, np.arange(self._shape[0] + 1))
+        first_entries = first_samples * columns.shape[1]
+        # scipy takes the values, their columns, and the first entry of each row.
+        matrix = scipy.sparse.csr_matrix(
+            (
+                values.ravel(),
+                columns.ravel().astype(np.int32),
+                first_entries.astype(np.int32),
+            ),
+            self._shape,
+        )
+        matrix.sum_duplicates()
+        return matrix
 
     def finish(self, image_shape: tuple[int, int], smooth: Smooth | None) -> None:
         """Store the matrix in the form in which it is multiplied.
@@ -309,11 +320,7 @@ class TextureTransport:
             math.ceil(texture_shape[0] / CELL_SIZE),
             math.ceil(texture_shape[1] / CELL_SIZE),
         )
-        cell_heights = _compute_cell_sizes(texture_shape[0], self._cell_shape[0])
-        cell_widths = _compute_cell_sizes(texture_shape[1], self._cell_shape[1])
-        self._texels_in_cell = (cell_heights[:, None] * cell_widths[None, :])[
-            :, :, None
-        ]
+        self._texels_in_cell = _count_texels_in_cells(texture_shape, self._cell_shape)
         n_pixels = image_shape[0] * image_shape[1]
         n_texels = texture_shape[0] * texture_shape[1]
         n_cells = self._cell_shape[0] * self._cell_shape[1]
@@ -342,31 +349,35 @@ class TextureTransport:
             vertices: the first vertices of all paths, then the second ones, and so on.
             pass_weight: weight of this pass in the mean over all passes.
         """
-        n_rows, n_columns = self._cell_shape
         for vertex in vertices:
-            sharp = vertex.select(vertex.is_sharp)
-            texels, fractions = find_bilinear_weights(
-                sharp.uv.numpy(), self._texture_shape
-            )
-            self._sharp.add(
-                sharp.pixel.numpy(),
-                texels.astype(np.int64),
-                fractions,
-                colors=sharp.weight.numpy() * np.float32(pass_weight),
-            )
-            scattered = vertex.select(~vertex.is_sharp)
-            uv = scattered.uv.numpy() % 1.0  # the texture repeats
-            # Rounding may make a coordinate 1, whose cell would be outside.
-            column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
-            column = column.clip(0, n_columns - 1)
-            row = np.floor(uv[:, 1] * n_rows).astype(np.int64).clip(0, n_rows - 1)
-            cell = (row * n_columns + column)[:, None]  # (n, 1): one for each vertex
-            self._scattered.add(
-                scattered.pixel.numpy(),
-                cell,
-                np.ones_like(cell, dtype=np.float32),
-                colors=scattered.weight.numpy() * np.float32(pass_weight),
-            )
+            self._add_sharp(vertex.select(vertex.is_sharp), pass_weight)
+            self._add_scattered(vertex.select(~vertex.is_sharp), pass_weight)
+
+    def _add_sharp(self, sharp: PathVertices, pass_weight: float) -> None:
+        """Add vertices that pixels see sharply, with the weight of their pass."""
+        texels, fractions = find_bilinear_weights(sharp.uv.numpy(), self._texture_shape)
+        self._sharp.add(
+            sharp.pixel.numpy(),
+            texels.astype(np.int64),
+            fractions,
+            colors=sharp.weight.numpy() * np.float32(pass_weight),
+        )
+
+    def _add_scattered(self, scattered: PathVertices, pass_weight: float) -> None:
+        """Add vertices that pixels see by scattered light, with their pass's weight."""
+        n_rows, n_columns = self._cell_shape
+        uv = scattered.uv.numpy() % 1.0  # the texture repeats
+        # Rounding may make a coordinate 1, whose cell would be outside.
+        column = np.floor(uv[:, 0] * n_columns).astype(np.int64)
+        column = column.clip(0, n_columns - 1)
+        row = np.floor(uv[:, 1] * n_rows).astype(np.int64).clip(0, n_rows - 1)
+        cell = (row * n_columns + column)[:, None]  # (n, 1): one for each vertex
+        self._scattered.add(
+            scattered.pixel.numpy(),
+            cell,
+            np.ones_like(cell, dtype=np.float32),
+            colors=scattered.weight.numpy() * np.float32(pass_weight),
+        )
 
     def finish(self, smooth: Smooth | None = None) -> None:
         """Store both matrices for products; nothing may be added afterwards.
@@ -438,21 +449,32 @@ class TextureTransport:
         cell_values = self._scattered.multiply_transposed(pixel_cotangent).reshape(
             *self._cell_shape, 3
         )
-        cell_values = cell_values / self._texels_in_cell
-        # each cell's value in all of its texels
+        return texel_values + self._spread_cells(cell_values / self._texels_in_cell)
+
+    def _spread_cells(self, cell_values: Tensor) -> Tensor:
+        """Return the value of each cell (rows, columns, 3) in its texels, (h, w, 3)."""
         spread_cells = cell_values[:, None, :, None].expand(
             -1, CELL_SIZE, -1, CELL_SIZE, -1
         )
         spread_cells = spread_cells.reshape(self._cell_shape[0] * CELL_SIZE, -1, 3)
         # The last cells may reach beyond the texture: that part is cut off.
         n_rows, n_columns = self._texture_shape
-        return texel_values + spread_cells[:n_rows, :n_columns]
+        return spread_cells[:n_rows, :n_columns]
 
 
 def _compute_cell_sizes(n_texels: int, n_cells: int) -> Tensor:
     """Return how many texels each cell has along one axis; the last may have fewer."""
     first_texels = CELL_SIZE * torch.arange(n_cells)
     return (n_texels - first_texels).clamp(max=CELL_SIZE).float()
+
+
+def _count_texels_in_cells(
+    texture_shape: tuple[int, int], cell_shape: tuple[int, int]
+) -> Tensor:
+    """Return the number of texels of each cell, (rows, columns, 1)."""
+    cell_heights = _compute_cell_sizes(texture_shape[0], cell_shape[0])
+    cell_widths = _compute_cell_sizes(texture_shape[1], cell_shape[1])
+    return (cell_heights[:, None] * cell_widths[None, :])[:, :, None]
 
 
 def to_torch_csr(matrix: scipy.sparse.csr_matrix) -> Tensor:
@@ -712,28 +734,9 @@ def _collect(
     """
     # The renderer counts the values of all calls; those of this call are the increase.
     non_finite_before = renderer.n_non_finite
-    # This also replaces the depth of a photograph by what is in front of the object.
-    inputs = renderer.replace_photograph_depth(
-        renderer.scene.input_assembler(renderer.space.inputs(u))
-    )
-    # inputs of the finished image, and inputs of the scene
-    image_inputs = {
-        name: value for name, value in inputs.items() if name in IMAGE_INPUTS
-    }
-    scene_inputs = {
-        name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
-    }
-    scene_inputs |= dict(light)
-    if names is None:
-        names = find_linear_inputs(renderer)
-    linearized_at = {
-        name: value.clone() for name, value in scene_inputs.items() if name in names
-    }
-    size = _get_traced_size(renderer)
-    transports = {
-        name: TextureTransport(size, (value.shape[0], value.shape[1]), small=quick)
-        for name, value in linearized_at.items()
-    }
+    image_inputs, scene_inputs = _assemble_inputs(renderer, u, light)
+    linearized_at = _copy_linear_inputs(renderer, scene_inputs, names)
+    transports = _make_transports(_get_traced_size(renderer), linearized_at, quick)
     has_backdrop = "backdrop.color" in image_inputs
     if transports:
         base = _trace_matrices(
@@ -756,6 +759,53 @@ def _collect(
         base_image=PackedImage(base, is_small=quick),
         n_non_finite=renderer.n_non_finite - non_finite_before,
     )
+
+
+def _assemble_inputs(
+    renderer: Renderer, u: Tensor, light: Inputs
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Return the inputs of the finished image, and those of the scene.
+
+    They are those of a configuration (d,), but `light` replaces inputs of the scene.
+    """
+    # This also replaces the depth of a photograph by what is in front of the object.
+    inputs = renderer.replace_photograph_depth(
+        renderer.scene.input_assembler(renderer.space.inputs(u))
+    )
+    image_inputs = {
+        name: value for name, value in inputs.items() if name in IMAGE_INPUTS
+    }
+    scene_inputs = {
+        name: value for name, value in inputs.items() if name not in IMAGE_INPUTS
+    }
+    return image_inputs, scene_inputs | dict(light)
+
+
+def _copy_linear_inputs(
+    renderer: Renderer, scene_inputs: Inputs, names: OptionalNames
+) -> dict[str, Tensor]:
+    """Return copies of the scene inputs that get a matrix; None for all base colors."""
+    if names is None:
+        names = find_linear_inputs(renderer)
+    return {
+        name: value.clone() for name, value in scene_inputs.items() if name in names
+    }
+
+
+def _make_transports(
+    size: tuple[int, int], linearized_at: Inputs, quick: bool
+) -> dict[str, TextureTransport]:
+    """Return an empty matrix for each input, by its name.
+
+    Args:
+        size: height and width of the traced image.
+        linearized_at: values of the inputs.
+        quick: whether to store the matrices in 16 bits.
+    """
+    return {
+        name: TextureTransport(size, (value.shape[0], value.shape[1]), small=quick)
+        for name, value in linearized_at.items()
+    }
 
 
 def _trace_matrices(
@@ -791,21 +841,57 @@ def _trace_matrices(
     """
     with renderer.scene.limit_window(renderer.window):
         paths = _fill_transports(renderer, transports, scene_inputs, seed, tick, spp)
-    # The environment behind the object is subtracted before denoising, which would mix
-    # it with the object at its outline.
-    radiance = paths.radiance
+    base = _finish_transports(
+        renderer, transports.values(), paths, quick=quick, has_backdrop=has_backdrop
+    )
     if has_backdrop:
-        radiance = radiance - paths.background
-    radiance = renderer.replace_non_finite(radiance)
-    base, smooth = _denoise_base(renderer, radiance, paths, quick)
-    for transport in transports.values():
-        transport.finish(smooth)
-    if has_backdrop:
-        base = torch.cat([base, paths.coverage], dim=-1)
         base = _append_plane_change(renderer, base, scene_inputs, seed, spp)
     if renderer.crop is not None:
         base = renderer.crop.window.paste(base, renderer.crop.surrounding_image)
     return base
+
+
+def _finish_transports(
+    renderer: Renderer,
+    transports: Collection[TextureTransport],
+    paths: TracedPaths,
+    *,
+    quick: bool,
+    has_backdrop: bool,
+) -> Tensor:
+    """Denoise and finish filled matrices, and return the denoised image of their paths.
+
+    Args:
+        renderer: renderer of the scene.
+        transports: the matrices.
+        paths: mean of the images of all paths that filled them.
+        quick: denoise the matrices by a cheaper method.
+        has_backdrop: whether the image leaves out the environment.
+
+    Returns:
+        (H, W, 3) linear radiance; with a backdrop, coverage is a fourth channel.
+    """
+    radiance = _compute_noisy_radiance(renderer, paths, has_backdrop)
+    base, smooth = _denoise_base(renderer, radiance, paths, quick)
+    for transport in transports:
+        transport.finish(smooth)
+    if has_backdrop:
+        base = torch.cat([base, paths.coverage], dim=-1)
+    return base
+
+
+def _compute_noisy_radiance(
+    renderer: Renderer, paths: TracedPaths, has_backdrop: bool
+) -> Tensor:
+    """Return the mean radiance (H, W, 3) of paths, finite and with its noise.
+
+    With a backdrop the environment behind the object is subtracted. It is subtracted
+    before denoising, which would mix it with the object at its outline.
+    """
+    radiance = paths.radiance
+    if has_backdrop:
+        radiance = radiance - paths.background
+    return renderer.replace_non_finite(radiance)
 
 
 def _append_plane_change(
@@ -853,8 +939,6 @@ def _fill_transports(
         TransportTooLargeError: all matrices together take more than `MAX_BYTES`.
     """
     samples_per_pass, n_passes = plan_passes(renderer, spp)
-    height, width = _get_traced_size(renderer)
-    base_image_bytes = 2 * 4 * height * width  # up to four channels of 16 bits
     images: list[TracedPaths] = []
     for name, transport in transports.items():
         for index in range(n_passes):
@@ -863,14 +947,23 @@ def _fill_transports(
                 scene_inputs, name, noise_seed, samples_per_pass
             )
             transport.add_pass(paths.vertices, pass_weight=1.0 / n_passes)
-            matrix_bytes = sum(filled.n_bytes for filled in transports.values())
-            if matrix_bytes + base_image_bytes > scale_limit(MAX_BYTES):
-                raise TransportTooLargeError(
-                    f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
-                )
+            _check_memory(transports.values(), _get_traced_size(renderer))
             images.append(replace(paths, vertices=[]))
             tick(samples_per_pass)
     return average_passes(images)
+
+
+def _check_memory(
+    transports: Collection[TextureTransport], image_shape: tuple[int, int]
+) -> None:
+    """Raise TransportTooLargeError if matrices and base image are over `MAX_BYTES`."""
+    height, width = image_shape
+    base_image_bytes = 2 * 4 * height * width  # up to four channels of 16 bits
+    matrix_bytes = sum(transport.n_bytes for transport in transports)
+    if matrix_bytes + base_image_bytes > scale_limit(MAX_BYTES):
+        raise TransportTooLargeError(
+            f"{TOO_LARGE} {scale_limit(MAX_BYTES) / 2**30:g} GiB"
+        )
 
 
 def _denoise_base(
@@ -892,24 +985,34 @@ def _denoise_base(
     if renderer.formation.denoiser != "oidn":
         return radiance, None
     clean = denoise(radiance, paths.albedo.clamp(0.0, 1.0), paths.normal)
-    # The paths of a matrix are those of the base image, so that both have about the
-    # same noise: this ratio removes it from the matrix too.
-    ratio = (clean / radiance.clamp_min(1e-12)).clamp(
-        1.0 / MAX_CORRECTION, MAX_CORRECTION
-    )
+    if quick:
+        return clean, partial(_scale_colors, _compute_correction(clean, radiance))
     # The denoiser retains the edges of its guides, one of which is usually the base
     # color. The pattern of the base color is not in the colors of a matrix. So here the
     # guide is the same on all surfaces: 1.
     is_surface = paths.albedo.sum(dim=-1, keepdim=True) > 0.0
     even_albedo = is_surface.to(torch.float32).expand(-1, -1, 3).contiguous()
+    return clean, partial(_denoise_colors, even_albedo, paths.normal)
 
-    def smooth(image: Tensor) -> Tensor:
-        """Remove the noise from the colors (H, W, 3) of a matrix."""
-        if quick:
-            return image * ratio
-        return denoise(image.contiguous(), even_albedo, paths.normal)
 
-    return clean, smooth
+def _compute_correction(clean: Tensor, noisy: Tensor) -> Tensor:
+    """Return the ratio (H, W, 3) of a denoised base image to the noisy one, clamped.
+
+    The paths of a matrix are those of the base image, so that both have about the same
+    noise: this ratio removes it from the matrix too.
+    """
+    ratio = clean / noisy.clamp_min(1e-12)
+    return ratio.clamp(1.0 / MAX_CORRECTION, MAX_CORRECTION)
+
+
+def _scale_colors(ratio: Tensor, image: Tensor) -> Tensor:
+    """Remove the noise from the colors (H, W, 3) of a matrix, by a ratio (H, W, 3)."""
+    return image * ratio
+
+
+def _denoise_colors(albedo: Tensor, normal: Tensor, image: Tensor) -> Tensor:
+    """Remove the noise from the colors (H, W, 3) of a matrix, by guides (H, W, 3)."""
+    return denoise(image.contiguous(), albedo, normal)
 
 
 def find_linear_inputs(renderer: Renderer) -> frozenset[str]:

@@ -56,6 +56,18 @@ def convert_usd(path: Path, data: bytes) -> bytes:
         FileFormatError: it is no OpenUSD file, names files outside its folder, is too
             large, or `usd-core` is not installed.
     """
+    _check_convertible(path, data)
+    with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
+        target = Path(folder) / "scene.glb"
+        process = _run_conversion(path, target)
+        if process.returncode or not target.is_file():
+            raise _make_conversion_error(path, process.stderr, process.returncode)
+        _record_files_read(process.stdout)
+        return stored_files.read_bytes(target, "a glTF file", MAX_RESULT_SIZE)
+
+
+def _check_convertible(path: Path, data: bytes) -> None:
+    """Raise FileFormatError for a file of another kind, or if usd-core is missing."""
     if not data.startswith(USD_MAGIC_BYTES):
         raise reading.damaged(path, "an OpenUSD file", reading.describe_content(data))
     if not is_installed():
@@ -64,16 +76,14 @@ def convert_usd(path: Path, data: bytes) -> bytes:
             "install 'advsearch[usd]'; or export glTF (.glb) from the program that "
             "made it"
         )
-    with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
-        target = Path(folder) / "scene.glb"
-        process = _run_conversion(path, target)
-        if process.returncode or not target.is_file():
-            raise _make_conversion_error(path, process.stderr, process.returncode)
-        # The last line is the list of files; usd-core may print lines before it.
-        files_read = json.loads(process.stdout.splitlines()[-1])
-        for name in files_read:
-            stored_files.record_opened(name)
-        return stored_files.read_bytes(target, "a glTF file", MAX_RESULT_SIZE)
+
+
+def _record_files_read(stdout: str) -> None:
+    """Record the files in the output of a conversion as opened."""
+    # The last line is the list of files; usd-core may print lines before it.
+    files_read = json.loads(stdout.splitlines()[-1])
+    for name in files_read:
+        stored_files.record_opened(name)
 
 
 def _run_conversion(path: Path, target: Path) -> subprocess.CompletedProcess[str]:

@@ -47,9 +47,21 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
         FileFormatError: it is corrupt or too large, has compressed entries or names
             that lead outside, or its first entry is no layer.
     """
+    archive = _open_archive(name, content)
+    first_name = find_first_layer(archive)
+    if Path(first_name).suffix.lower() not in LAYER_SUFFIXES:
+        raise errors.FileFormatError(
+            f"{name}: expected a USD layer first in it, got {first_name[:80]!r}"
+        )
+    return archive
+
+
+def _open_archive(name: str, content: bytes) -> zipfile.ZipFile:
+    """Open a package and check its entries, with one kind of error."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
         _check_entries(name, archive)
+        return archive
     except (
         zipfile.BadZipFile,
         OSError,
@@ -60,12 +72,6 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
         raise errors.FileFormatError(
             f"{name}: expected a .usdz archive, got one that is damaged ({error})"
         ) from None
-    first_name = find_first_layer(archive)
-    if Path(first_name).suffix.lower() not in LAYER_SUFFIXES:
-        raise errors.FileFormatError(
-            f"{name}: expected a USD layer first in it, got {first_name[:80]!r}"
-        )
-    return archive
 
 
 def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
@@ -83,6 +89,15 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
         BadZipFile: the header of an entry is corrupt.
     """
     entries = archive.infolist()
+    _check_entry_totals(name, entries)
+    for entry in entries:
+        _check_entry(name, entry)
+    for entry in entries:
+        archive.open(entry).close()  # this checks local headers
+
+
+def _check_entry_totals(name: str, entries: list[zipfile.ZipInfo]) -> None:
+    """Raise FileFormatError if the entries of a package are too many or too large."""
     size = sum(entry.file_size for entry in entries)
     got = f"{len(entries):,} of {size:,}"
     # `check_most` scales a limit itself. It is scaled here only for the message, which
@@ -92,20 +107,21 @@ def _check_entries(name: str, archive: zipfile.ZipFile) -> None:
     expected = f"at most {max_files:,} files of {max_bytes:,} bytes in all"
     stored_files.check_most(name, len(entries), MAX_ENTRIES, expected, got)
     stored_files.check_most(name, size, stored_files.LARGEST_FILE, expected, got)
-    for entry in entries:
-        path = PurePosixPath(entry.filename)
-        is_outside = path.is_absolute() or ".." in path.parts
-        has_special_characters = re.search(r"[\\:\[\]]", entry.filename)
-        is_compressed = entry.compress_type != zipfile.ZIP_STORED
-        is_encrypted = bool(entry.flag_bits & 1)
-        if is_outside or has_special_characters or is_compressed or is_encrypted:
-            raise errors.FileFormatError(
-                f"{name}: expected uncompressed files inside of it, got "
-                f"{entry.filename[:80]!r}, which is compressed, encrypted or outside; "
-                "make it again with usdzip"
-            )
-    for entry in entries:
-        archive.open(entry).close()  # this checks local headers
+
+
+def _check_entry(name: str, entry: zipfile.ZipInfo) -> None:
+    """Raise FileFormatError for an entry that `_check_entries` forbids."""
+    path = PurePosixPath(entry.filename)
+    is_outside = path.is_absolute() or ".." in path.parts
+    has_special_characters = re.search(r"[\\:\[\]]", entry.filename)
+    is_compressed = entry.compress_type != zipfile.ZIP_STORED
+    is_encrypted = bool(entry.flag_bits & 1)
+    if is_outside or has_special_characters or is_compressed or is_encrypted:
+        raise errors.FileFormatError(
+            f"{name}: expected uncompressed files inside of it, got "
+            f"{entry.filename[:80]!r}, which is compressed, encrypted or outside; "
+            "make it again with usdzip"
+        )
 
 
 def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> None:
@@ -200,16 +216,22 @@ class _LayerCheck:
             if path in checked_files:
                 continue
             checked_files[path] = None
-            self._count_layer(path.stat().st_size)
-            if path.suffix.lower() == PACKAGE_SUFFIX:
-                content = stored_files.read_bytes(
-                    path, "a package", stored_files.LARGEST_FILE
-                )
-                self._check_package(path.name, str(path), content, depth=1)
-                continue
-            for name in self._iterate_named_layers(str(path), path.name):
-                pending.append(self._find_layer(path, name))
+            pending.extend(self._check_file(path))
         return list(checked_files)
+
+    def _check_file(self, path: Path) -> list[Path]:
+        """Check a layer, or a package with all in it, and return what a layer refers to."""
+        self._count_layer(path.stat().st_size)
+        if path.suffix.lower() == PACKAGE_SUFFIX:
+            content = stored_files.read_bytes(
+                path, "a package", stored_files.LARGEST_FILE
+            )
+            self._check_package(path.name, str(path), content, depth=1)
+            return []
+        return [
+            self._find_layer(path, name)
+            for name in self._iterate_named_layers(str(path), path.name)
+        ]
 
     def _count_layer(self, size: int) -> None:
         """Add a layer or package to the totals, and check their limits.
@@ -242,35 +264,40 @@ class _LayerCheck:
             FileFormatError: it is missing, or not in the folder.
         """
         outer, inner = Ar.SplitPackageRelativePathOuter(name)
-        suffix = Path(outer).suffix.lower()
-        # In USD's paths a backtick begins an expression, brackets enclose a path in a
-        # package, and a colon follows a scheme or precedes arguments.
-        has_special_characters = any(character in outer for character in "`[]:\0")
-        is_layer = suffix == PACKAGE_SUFFIX or (suffix in LAYER_SUFFIXES and not inner)
         layer_file = None
-        if is_layer and not has_special_characters:
+        if _is_layer_name(outer, inner):
             layer_file = Path(os.path.realpath(path.parent / outer))
         if layer_file is None or not reading.is_inside(layer_file, self._folder):
-            raise errors.FileFormatError(
-                f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
-                "file in its folder and is not read; put it there, or make one file of "
-                "all with usdcat --flatten"
-            )
+            raise self._make_unread_layer_error(name)
         if not layer_file.is_file():
             raise errors.FileFormatError(
                 f"{self.file.name}: needs {name[:100]!r}, which is missing; put that "
                 "file beside it"
             )
         if inner:
-            try:
-                # only to check that it exists
-                read_packaged(Ar.JoinPackageRelativePath(str(layer_file), inner))
-            except KeyError:
-                raise errors.FileFormatError(
-                    f"{self.file.name}: needs {name[:100]!r}, which is not in "
-                    f"{layer_file.name}; make the package again"
-                ) from None
+            self._check_packaged_file(layer_file, inner, name)
         return layer_file
+
+    def _make_unread_layer_error(self, name: str) -> errors.FileFormatError:
+        """Return the error for a named layer that is no USD file in the folder."""
+        return errors.FileFormatError(
+            f"{self.file.name}: names the layer {name[:100]!r}, which is no USD "
+            "file in its folder and is not read; put it there, or make one file of "
+            "all with usdcat --flatten"
+        )
+
+    def _check_packaged_file(self, package: Path, inner: str, name: str) -> None:
+        """Raise FileFormatError if a package does not have the file `inner`.
+
+        `name` is the name of both in the layer that refers to them.
+        """
+        try:
+            read_packaged(Ar.JoinPackageRelativePath(str(package), inner))
+        except KeyError:
+            raise errors.FileFormatError(
+                f"{self.file.name}: needs {name[:100]!r}, which is not in "
+                f"{package.name}; make the package again"
+            ) from None
 
     def _check_package(self, name: str, path: str, content: bytes, depth: int) -> None:
         """Check all layers in a package.
@@ -281,13 +308,7 @@ class _LayerCheck:
             content: its bytes.
             depth: 1 for a package in a folder, 2 for a package in a package, and so on.
         """
-        stored_files.check_most(
-            self.file.name,
-            depth,
-            MAX_PACKAGE_DEPTH,
-            "packages nested at most {} deep",
-            "more",
-        )
+        self._check_depth(depth)
         with open_package(name, content) as archive:
             _check_without_gaps(name, archive, content)
             entries = {
@@ -299,14 +320,37 @@ class _LayerCheck:
                 # The bytes of an entry were counted with the outermost package.
                 if suffix == PACKAGE_SUFFIX:
                     self._count_layer(size=0)
-                    self._check_package(
-                        f"{name}[{entry}]", inner_path, archive.read(entry), depth + 1
-                    )
+                    label = f"{name}[{entry}]"
+                    inner_content = archive.read(entry)
+                    self._check_package(label, inner_path, inner_content, depth + 1)
                 elif suffix in LAYER_SUFFIXES:
                     self._count_layer(size=0)
-                    label = f"{name}[{reading.format_name(entry, quoted=False)}]"
-                    for layer in self._iterate_named_layers(inner_path, label):
-                        self._check_packaged(name, entry, layer, entries)
+                    self._check_packaged_layer(name, inner_path, entry, entries)
+
+    def _check_depth(self, depth: int) -> None:
+        """Raise FileFormatError if packages are nested more than `MAX_PACKAGE_DEPTH`."""
+        stored_files.check_most(
+            self.file.name,
+            depth,
+            MAX_PACKAGE_DEPTH,
+            "packages nested at most {} deep",
+            "more",
+        )
+
+    def _check_packaged_layer(
+        self, package: str, path: str, entry: str, entries: set[str]
+    ) -> None:
+        """Check a layer in a package, and the layers to which it refers.
+
+        Args:
+            package: name of the package, for messages.
+            path: the layer as USD writes it, with the package.
+            entry: path of the layer in the package.
+            entries: all paths in the package.
+        """
+        label = f"{package}[{reading.format_name(entry, quoted=False)}]"
+        for layer in self._iterate_named_layers(path, label):
+            self._check_packaged(package, entry, layer, entries)
 
     def _check_packaged(
         self, package: str, entry: str, layer: str, entries: set[str]
@@ -323,9 +367,8 @@ class _LayerCheck:
         from_entry = os.path.normpath(PurePosixPath(entry).parent / outer)
         # A path that does not begin with a dot may be relative to the package.
         from_root = os.path.normpath(outer)
-        is_inside = from_entry in entries or (
-            not outer.startswith(".") and from_root in entries
-        )
+        may_be_from_root = not outer.startswith(".")
+        is_inside = from_entry in entries or (may_be_from_root and from_root in entries)
         suffix = Path(outer).suffix.lower()
         if not is_inside or suffix not in (*LAYER_SUFFIXES, PACKAGE_SUFFIX):
             raise errors.FileFormatError(
@@ -340,30 +383,53 @@ class _LayerCheck:
         After the last one, value clips (animation in other files, to which
         `GetCompositionAssetDependencies` does not refer) are rejected.
         """
-        try:
-            layer = Sdf.Layer.FindOrOpen(path)
-        except Exception as error:  # Tf.ErrorException, of which there are many kinds
-            raise errors.FileFormatError(
-                f"{name}: expected a USD layer, got {format_error(error)}"
-            ) from None
-        if layer is None:
-            raise errors.FileFormatError(
-                f"{name}: expected a USD layer, got none that can be read"
-            )
+        layer = _open_layer(path, name)
         yield from filter(None, layer.GetCompositionAssetDependencies())
+        layer.Traverse(
+            Sdf.Path.absoluteRootPath,
+            lambda spec_path: self._check_clips(layer, spec_path),
+        )
 
-        def check_clips(spec_path: Any) -> None:
-            """Raise FileFormatError if a prim has value clips."""
-            if not spec_path.IsPrimPath():
-                return
-            spec = layer.GetObjectAtPath(spec_path)
-            if spec is not None and "clips" in spec.ListInfoKeys():
-                raise errors.FileFormatError(
-                    f"{self.file.name}: has value clips ({spec_path}), which are not "
-                    "read; make one file of all with usdcat --flatten"
-                )
+    def _check_clips(self, layer: Any, spec_path: Any) -> None:
+        """Raise FileFormatError if a prim of a layer has value clips."""
+        if not spec_path.IsPrimPath():
+            return
+        spec = layer.GetObjectAtPath(spec_path)
+        if spec is not None and "clips" in spec.ListInfoKeys():
+            raise errors.FileFormatError(
+                f"{self.file.name}: has value clips ({spec_path}), which are not "
+                "read; make one file of all with usdcat --flatten"
+            )
 
-        layer.Traverse(Sdf.Path.absoluteRootPath, check_clips)
+
+def _is_layer_name(outer: str, inner: str) -> bool:
+    """Return whether a layer may have a name: a file, and a path in it if a package.
+
+    In USD's paths a backtick begins an expression, brackets enclose a path in a
+    package, and a colon follows a scheme or precedes arguments.
+    """
+    suffix = Path(outer).suffix.lower()
+    has_special_characters = any(character in outer for character in "`[]:\0")
+    is_layer = suffix == PACKAGE_SUFFIX or (suffix in LAYER_SUFFIXES and not inner)
+    return is_layer and not has_special_characters
+
+
+def _open_layer(path: str, name: str) -> Any:
+    """Return the `Sdf.Layer` of a path; raise FileFormatError, with a name, if none is.
+
+    The path may be that of a file in a package.
+    """
+    try:
+        layer = Sdf.Layer.FindOrOpen(path)
+    except Exception as error:  # Tf.ErrorException, of which there are many kinds
+        raise errors.FileFormatError(
+            f"{name}: expected a USD layer, got {format_error(error)}"
+        ) from None
+    if layer is None:
+        raise errors.FileFormatError(
+            f"{name}: expected a USD layer, got none that can be read"
+        )
+    return layer
 
 
 def format_error(error: Exception) -> str:

@@ -83,6 +83,11 @@ def decode_image(data: bytes, path: str, *, is_srgb: bool) -> Array:
     if is_srgb:
         linear = color.srgb_to_linear(texels[:, :, :3])
         texels = np.concatenate([linear, texels[:, :, 3:]], axis=2)
+    return _limit_size(texels)
+
+
+def _limit_size(texels: Array) -> Array:
+    """Return texels (H, W, C) as float32, averaged down to `MAX_SIDE` if larger."""
     height, width = texels.shape[:2]
     scale = MAX_SIDE / max(height, width)
     if scale >= 1.0:
@@ -108,13 +113,8 @@ def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
     with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
         reading.check_decodable(image, path)
         # Pillow opens an image of 16-bit grey as "I;16" or "I", and of floats as "F".
-        is_float = image.mode == "F"
-        is_integer = image.mode.startswith("I")
-        if is_float or is_integer:
-            grey = np.nan_to_num(np.asarray(image, np.float32))
-            if is_integer:
-                grey = grey / np.float32(65535.0)
-            return np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
+        if image.mode == "F" or image.mode.startswith("I"):
+            return _decode_grey(image)
         if _is_png_of_16_bits(data):
             return _decode_png_of_16_bits(data, image.size)
         # Colors are averaged down here, since this needs less memory. `decode_image`
@@ -123,6 +123,14 @@ def _decode_image(data: bytes, path: str, is_srgb: bool) -> Array:
         return reading.pictures.load_display_image(
             image, limit, path, keep_alpha=True, is_raw=not is_srgb
         )
+
+
+def _decode_grey(image: Image.Image) -> Array:
+    """Return the values (H, W, 4) of an image of grey floats, or of 16-bit integers."""
+    grey = np.nan_to_num(np.asarray(image, np.float32))
+    if image.mode.startswith("I"):
+        grey = grey / np.float32(65535.0)
+    return np.stack([grey, grey, grey, np.ones_like(grey)], axis=2)
 
 
 def _decode_radiance(data: bytes, path: str) -> Array:
@@ -167,18 +175,27 @@ def _decode_png_of_16_bits(data: bytes, size: tuple[int, int]) -> Array:
         raise ValueError("an interlaced PNG of 16 bits; save it without interlacing")
     pixel_size = 2 * channels
     row_size = 1 + width * pixel_size
-    compressed = _join_png_data(data)
-    try:
-        row_bytes = zlib.decompressobj().decompress(compressed, height * row_size)
-    except zlib.error as error:
-        raise ValueError(f"a damaged PNG ({error})") from None
-    if len(row_bytes) != height * row_size:
-        raise ValueError("a PNG that is cut short")
+    row_bytes = _decompress(_join_png_data(data), height * row_size)
     rows = np.frombuffer(row_bytes, np.uint8).reshape(height, row_size)
     filtered = rows[:, 1:].reshape(height, width, pixel_size)
     unfiltered = np.ascontiguousarray(_unfilter(rows[:, 0], filtered))
     values = unfiltered.view(">u2").astype(np.float32) / np.float32(65535.0)
     return _expand_to_rgba(values)
+
+
+def _decompress(compressed: bytes, size: int) -> bytes:
+    """Return the first `size` bytes of the data of a PNG file.
+
+    Raises:
+        ValueError: it is corrupt, or has fewer bytes.
+    """
+    try:
+        content = zlib.decompressobj().decompress(compressed, size)
+    except zlib.error as error:
+        raise ValueError(f"a damaged PNG ({error})") from None
+    if len(content) != size:
+        raise ValueError("a PNG that is cut short")
+    return content
 
 
 def _expand_to_rgba(values: Array) -> Array:
@@ -244,14 +261,21 @@ def _unfilter(filters: Array, filtered: Array) -> Array:
         above = padded[padded_row - 1, padded_column]
         above_left = padded[padded_row - 1, padded_column - 1]
         row_filter = filters[padded_row - 1][:, None]
-        # A filter of 0 predicts 0.
-        predicted = np.select(
-            [row_filter == 1, row_filter == 2, row_filter == 3, row_filter == 4],
-            [left, above, (left + above) // 2, _paeth(left, above, above_left)],
-        )
+        predicted = _predict(row_filter, left, above, above_left)
         stored = filtered[padded_row - 1, padded_column - 1]
         padded[padded_row, padded_column] = (stored + predicted) & 255  # modulo 256
     return padded[1:, 1:].astype(np.uint8)
+
+
+def _predict(row_filter: Array, left: Array, above: Array, above_left: Array) -> Array:
+    """Return what the filters (N, 1) of pixels predict from their neighbors (N, bytes).
+
+    A filter of 0 predicts 0.
+    """
+    return np.select(
+        [row_filter == 1, row_filter == 2, row_filter == 3, row_filter == 4],
+        [left, above, (left + above) // 2, _paeth(left, above, above_left)],
+    )
 
 
 def _paeth(left: Array, above: Array, corner: Array) -> Array:

@@ -136,31 +136,40 @@ class Conversion:
         self._surfaces = GltfMaterialWriter(
             self.folder, self.header, self.buffer, self.note_counts, self.files_read
         )
-        self._skins = UsdSkel.Cache()
+        self._skins = self._find_skins()
+
+    def _find_skins(self) -> Any:
+        """Return the `UsdSkel.Cache` of all skeletons of the stage."""
+        skins = UsdSkel.Cache()
         for prim in self._iterate_prims():
             if prim.IsA(UsdSkel.Root):
-                self._skins.Populate(UsdSkel.Root(prim), Usd.TraverseInstanceProxies())
+                skins.Populate(UsdSkel.Root(prim), Usd.TraverseInstanceProxies())
+        return skins
 
     def _iterate_prims(self) -> Iterator[Any]:
         """Yield the prims of the stage, within limits on their number and depth."""
         prims = Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
         for index, prim in enumerate(prims):
-            stored_files.check_most(
-                self.source,
-                index,
-                reading.LARGEST_TREE,
-                "USD of at most {} prims",
-                "more",
-            )
-            depth = prim.GetPath().pathElementCount
-            stored_files.check_most(
-                self.source,
-                depth,
-                reading.DEEPEST_TREE,
-                "prims of at most {} levels",
-                "more",
-            )
+            self._check_prim(index, prim)
             yield prim
+
+    def _check_prim(self, index: int, prim: Any) -> None:
+        """Raise FileFormatError if a prim is one too many, or too deep in the tree."""
+        stored_files.check_most(
+            self.source,
+            index,
+            reading.LARGEST_TREE,
+            "USD of at most {} prims",
+            "more",
+        )
+        depth = prim.GetPath().pathElementCount
+        stored_files.check_most(
+            self.source,
+            depth,
+            reading.DEEPEST_TREE,
+            "prims of at most {} levels",
+            "more",
+        )
 
     def convert(self) -> bytes:
         """Return the stage as a binary glTF file.
@@ -181,17 +190,25 @@ class Conversion:
         has_splats = any(map(_is_splats, self._iterate_prims()))
         header["scenes"] = [{"nodes": [0]}]
         if has_splats and not header["meshes"]:
-            raise errors.FileFormatError(
-                f"{self.source}: expected a mesh with faces, got Gaussian splats: "
-                f"{reading.SPLATS_ADVICE}"
-            )
-        if self.lights:
-            header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
-        notes = self._format_notes(has_splats)
-        header["asset"]["extras"] = {"left_out": notes}
+            raise self._make_splats_error()
+        self._add_lights_and_notes(has_splats)
         # glTF has no empty lists.
-        return self.buffer.to_bytes(
-            {key: value for key, value in header.items() if value}
+        filled_header = {key: value for key, value in header.items() if value}
+        return self.buffer.to_bytes(filled_header)
+
+    def _add_lights_and_notes(self, has_splats: bool) -> None:
+        """Add the lights, and the notes on what is left out, to the header."""
+        if self.lights:
+            extensions = {"KHR_lights_punctual": {"lights": self.lights}}
+            self.header["extensions"] = extensions
+        notes = self._format_notes(has_splats)
+        self.header["asset"]["extras"] = {"left_out": notes}
+
+    def _make_splats_error(self) -> errors.FileFormatError:
+        """Return the error for a stage that has Gaussian splats and no mesh."""
+        return errors.FileFormatError(
+            f"{self.source}: expected a mesh with faces, got Gaussian splats: "
+            f"{reading.SPLATS_ADVICE}"
         )
 
     def _add_nodes(self) -> None:
@@ -263,21 +280,10 @@ class Conversion:
         path = prim.GetPath()
         name = prim.GetName() if is_unique else str(path).lstrip("/")
         node: dict[str, Any] = {"name": name, "children": []}
-        parent = 0  # the stage's node
         xformable = UsdGeom.Xformable(prim)
         if xformable:
-            # USD's rows are glTF's columns.
-            local_matrix = np.array(xformable.GetLocalTransformation(FIRST_TIME))
-            if not np.isfinite(local_matrix).all():
-                raise errors.FileFormatError(
-                    f"{self.source}: expected finite transforms, got others at {path}"
-                )
-            node["matrix"] = local_matrix.ravel().tolist()
-        if not (xformable and xformable.GetResetXformStack()):
-            ancestors = path.GetAncestorsRange()
-            parent = next(
-                (node_of_path[at] for at in ancestors if at in node_of_path), 0
-            )
+            node["matrix"] = self._read_local_matrix(xformable, path)
+        parent = _find_parent(path, xformable, node_of_path)
         skeleton_matrix = self._add_content(prim, node)
         if skeleton_matrix is not None:  # a skeleton poses the mesh in the world
             node["matrix"] = skeleton_matrix.ravel().tolist()
@@ -285,6 +291,20 @@ class Conversion:
         node_of_path[path] = len(nodes)
         nodes[parent]["children"].append(len(nodes))
         nodes.append(node)
+
+    def _read_local_matrix(self, xformable: Any, path: Any) -> list[float]:
+        """Return the transform of a prim as glTF stores it, column by column.
+
+        Raises FileFormatError, which names its path, if numbers are not finite.
+        """
+        # USD's rows are glTF's columns.
+        local_matrix = np.array(xformable.GetLocalTransformation(FIRST_TIME))
+        if not np.isfinite(local_matrix).all():
+            raise errors.FileFormatError(
+                f"{self.source}: expected finite transforms, got others at {path}"
+            )
+        matrix: list[float] = local_matrix.ravel().tolist()
+        return matrix
 
     def _format_notes(self, has_splats: bool) -> list[str]:
         """Return at most 100 notes on what is left out, whose subject is the file."""
@@ -316,21 +336,29 @@ class Conversion:
         is_camera = prim.IsA(UsdGeom.Camera)
         if not (is_mesh or is_camera or prim.HasAPI(UsdLux.LightAPI)):
             return None
-        imageable = UsdGeom.Imageable(prim)
-        if imageable.ComputeVisibility(FIRST_TIME) == UsdGeom.Tokens.invisible:
-            self._note("has invisible prims, which are left out")
-        elif imageable.ComputePurpose() not in PURPOSES:
-            self._note(
-                f"has prims with the purpose {imageable.ComputePurpose()!r}, which are "
-                "left out"
-            )
-        elif is_mesh:
+        if not self._is_rendered(prim):
+            return None
+        if is_mesh:
             return self._add_mesh(prim, node)
-        elif is_camera:
+        if is_camera:
             self._add_camera(UsdGeom.Camera(prim), node)
         else:
             self._add_light(prim, node)
         return None
+
+    def _is_rendered(self, prim: Any) -> bool:
+        """Return whether a prim is visible and no guide or proxy; note it if not."""
+        imageable = UsdGeom.Imageable(prim)
+        if imageable.ComputeVisibility(FIRST_TIME) == UsdGeom.Tokens.invisible:
+            self._note("has invisible prims, which are left out")
+            return False
+        if imageable.ComputePurpose() not in PURPOSES:
+            self._note(
+                f"has prims with the purpose {imageable.ComputePurpose()!r}, which are "
+                "left out"
+            )
+            return False
+        return True
 
     # ---- Cameras and lights ----
 
@@ -344,30 +372,20 @@ class Conversion:
             camera: USD's camera.
             node: entry of its node, to which the index of the camera is added.
         """
-        # lengths in the same unit
-        width = _get_first(camera, "HorizontalAperture")
-        height = _get_first(camera, "VerticalAperture")
-        focal_length = _get_first(camera, "FocalLength")
-        is_perspective = (
-            _get_first(camera, "Projection") == UsdGeom.Tokens.perspective
-            and min(width, height, focal_length) > 0.0
-        )
         entry: dict[str, Any] = {"name": node["name"], "type": "orthographic"}
-        if is_perspective:
-            if _get_first(camera, "HorizontalApertureOffset") or _get_first(
-                camera, "VerticalApertureOffset"
-            ):
-                self._note(
-                    "has a camera whose aperture is shifted; the shift is left out"
-                )
-            perspective = {
-                "yfov": 2.0 * math.atan(height / (2.0 * focal_length)),
-                "aspectRatio": width / height,
-                "znear": 0.01,
-            }
+        perspective = _read_perspective(camera)
+        if perspective is not None:
+            self._note_shift(camera)
             entry |= {"type": "perspective", "perspective": perspective}
         node["camera"] = len(self.header["cameras"])
         self.header["cameras"].append(entry)
+
+    def _note_shift(self, camera: Any) -> None:
+        """Note a shift of a camera's aperture."""
+        if _get_first(camera, "HorizontalApertureOffset") or _get_first(
+            camera, "VerticalApertureOffset"
+        ):
+            self._note("has a camera whose aperture is shifted; the shift is left out")
 
     def _add_light(self, prim: Any, node: dict[str, Any]) -> None:
         """Add a distant or a spherical light to a node; others are noted.
@@ -380,38 +398,50 @@ class Conversion:
             node: entry of its node, to which the index of the light is added.
         """
         light = UsdLux.LightAPI(prim)
-        kind = prim.GetTypeName()
         stops = _get_first(light, "Exposure")  # each doubles the radiance
         radiance = _get_first(light, "Intensity") * 2.0**stops
         color = _read_light_color(light)
+        converted = self._convert_light(prim, radiance)
+        if converted is None:
+            return
+        entry, intensity = converted
+        self._check_power(node["name"], np.array([*color, intensity]))
+        node["extensions"] = {"KHR_lights_punctual": {"light": len(self.lights)}}
+        entry |= {"name": node["name"], "color": color.tolist(), "intensity": intensity}
+        self.lights.append(entry)
+
+    def _check_power(self, name: str, powers: Array) -> None:
+        """Raise FileFormatError if the color or the intensity of a light is invalid.
+
+        `powers` are the numbers of both, (N,).
+        """
+        if not _is_valid_power(powers):
+            raise errors.FileFormatError(
+                f"{self.source}: expected the light {name} to have a power of "
+                "at least 0"
+            )
+
+    def _convert_light(
+        self, prim: Any, radiance: float
+    ) -> tuple[dict[str, Any], float] | None:
+        """Return the entry of a light without name and color, and its intensity.
+
+        Lights that are neither distant nor spherical are noted, and return None.
+        """
+        kind = prim.GetTypeName()
         if kind == "DistantLight":
-            entry: dict[str, Any] = {"type": "directional"}
-            intensity = _compute_illuminance(prim, radiance)
-        elif kind == "SphereLight":
+            return {"type": "directional"}, _compute_illuminance(prim, radiance)
+        if kind == "SphereLight":
             entry = _make_point_light(prim)
             # The area of the disk is in squared units of the stage, and becomes m^2.
             intensity = _integrate_over_sphere(prim, radiance) * self.unit**2
             self._note("has a SphereLight, which is a point light at its center here")
-        else:
-            self._note(
-                f"has a {kind}, which is left out; light the scene with `environment` "
-                "or `controls=light`"
-            )
-            return
-        if not _is_valid_power(np.array([*color, intensity])):
-            raise errors.FileFormatError(
-                f"{self.source}: expected the light {node['name']} to have a power of "
-                "at least 0"
-            )
-        node["extensions"] = {"KHR_lights_punctual": {"light": len(self.lights)}}
-        self.lights.append(
-            {
-                **entry,
-                "name": node["name"],
-                "color": color.tolist(),
-                "intensity": intensity,
-            }
+            return entry, intensity
+        self._note(
+            f"has a {kind}, which is left out; light the scene with `environment` "
+            "or `controls=light`"
         )
+        return None
 
     # ---- Meshes ----
 
@@ -435,14 +465,12 @@ class Conversion:
         self._check_corners(prim, len(points), counts, corners)
         skeleton_matrix, points = self._pose_at_rest(prim, points)
         triangles, face = self._triangulate(mesh, points, counts, corners)
-        primitives = self._make_primitives(
-            prim, mesh, MeshFaces(points, counts, corners, triangles, face)
-        )
+        mesh_faces = MeshFaces(points, counts, corners, triangles, face)
+        primitives = self._make_primitives(prim, mesh, mesh_faces)
         if primitives:
             node["mesh"] = len(self.header["meshes"])
-            self.header["meshes"].append(
-                {"name": node["name"], "primitives": primitives}
-            )
+            entry = {"name": node["name"], "primitives": primitives}
+            self.header["meshes"].append(entry)
         return skeleton_matrix
 
     def _make_primitives(
@@ -458,29 +486,47 @@ class Conversion:
             mesh: the same as USD's mesh.
             mesh_faces: its points and faces.
         """
-        primvars = UsdGeom.PrimvarsAPI(prim)
+        triangle_points = mesh_faces.point_of_corner[mesh_faces.triangles]
         normals = self._read_normals(
-            mesh,
-            primvars,
-            mesh_faces.points,
-            mesh_faces.point_of_corner[mesh_faces.triangles],
+            mesh, UsdGeom.PrimvarsAPI(prim), mesh_faces.points, triangle_points
         )
-        primitives = []
+        primitives = list[dict[str, Any]]()
         n_faces = len(mesh_faces.corner_counts)
         for bound, faces in self._iterate_materials(prim, mesh, n_faces):
-            # The faces of a material are divided further by their tint.
-            for material, colors, tinted_faces in self._split_by_tint(
-                bound, primvars, faces, mesh_faces
-            ):
-                is_selected = np.isin(mesh_faces.face_of_triangle, tinted_faces)
-                if not is_selected.any():
-                    continue  # all are holes, or have fewer than 3 corners
-                uvs_by_name = self._read_layouts(primvars, bound.layouts)
-                attributes = {"NORMAL": normals, "COLOR_0": colors, **uvs_by_name}
-                entry = self._make_primitive(
-                    str(prim.GetPath()), mesh_faces, is_selected, attributes
-                )
-                primitives.append({**entry, "material": material})
+            primitives += self._make_material_primitives(
+                prim, bound, faces, normals, mesh_faces
+            )
+        return primitives
+
+    def _make_material_primitives(
+        self,
+        prim: Any,
+        bound: BoundMaterial,
+        faces: Array,
+        normals: MeshValues | None,
+        mesh_faces: MeshFaces,
+    ) -> list[dict[str, Any]]:
+        """Return one glTF primitive for each tint of the faces with a material.
+
+        Args:
+            prim: prim of the mesh.
+            bound: the material.
+            faces: (F,) the faces.
+            normals: normals of the mesh, or None.
+            mesh_faces: all points and faces of the mesh.
+        """
+        path = str(prim.GetPath())
+        primvars = UsdGeom.PrimvarsAPI(prim)
+        primitives = []
+        tints = self._split_by_tint(bound, primvars, faces, mesh_faces)
+        for material, colors, tinted_faces in tints:
+            is_selected = np.isin(mesh_faces.face_of_triangle, tinted_faces)
+            if not is_selected.any():
+                continue  # all are holes, or have fewer than 3 corners
+            uvs_by_name = self._read_layouts(primvars, bound.layouts)
+            attributes = {"NORMAL": normals, "COLOR_0": colors, **uvs_by_name}
+            entry = self._make_primitive(path, mesh_faces, is_selected, attributes)
+            primitives.append({**entry, "material": material})
         return primitives
 
     def _check_corners(
@@ -543,11 +589,7 @@ class Conversion:
             points: (P, 3) its points.
             triangles: (T, 3) points of its triangles.
         """
-        normals = _flatten_primvar(primvars.GetPrimvar("normals"), 3)
-        if normals is None:
-            values = _to_array(_get_first(mesh, "Normals"), np.float64, 3)
-            if len(values):
-                normals = MeshValues(values, str(mesh.GetNormalsInterpolation()))
+        normals = _read_mesh_normals(mesh, primvars)
         if _get_first(mesh, "SubdivisionScheme") != UsdGeom.Tokens.none:
             self._note(
                 "has a mesh with a subdivision scheme, which is not subdivided, but "
@@ -584,26 +626,41 @@ class Conversion:
         vertex_indices, vertex_of_corner = np.unique(
             corner_indices, axis=0, return_inverse=True
         )
-        positions = mesh_faces.points[vertex_indices[:, 0]].astype(np.float32)
-        accessors = {
-            "POSITION": self.buffer.add_accessor(positions, "VEC3", bounds=True)
-        }
-        # The columns after the first are those of all attributes, also of missing ones.
-        for column, (name, attribute) in enumerate(attributes.items(), start=1):
-            if attribute is not None:
-                value_index = vertex_indices[:, column]
-                values = attribute.values[value_index].astype(np.float32)
-                accessor_type = f"VEC{values.shape[1]}"
-                accessors[name] = self.buffer.add_accessor(values, accessor_type)
-        index_accessor = self.buffer.add_accessor(
-            vertex_of_corner.reshape(-1).astype(np.uint32), "SCALAR"
-        )
+        accessors = self._add_vertices(mesh_faces.points, vertex_indices, attributes)
+        indices = vertex_of_corner.reshape(-1).astype(np.uint32)
+        index_accessor = self.buffer.add_accessor(indices, "SCALAR")
         triangles_mode = 4  # of glTF
         return {
             "attributes": accessors,
             "mode": triangles_mode,
             "indices": index_accessor,
         }
+
+    def _add_vertices(
+        self,
+        points: Array,
+        vertex_indices: Array,
+        attributes: dict[str, MeshValues | None],
+    ) -> dict[str, int]:
+        """Add the attributes of vertices to the buffer, and return their accessors.
+
+        Args:
+            points: (P, 3) points of the mesh.
+            vertex_indices: (V, columns) for each vertex the index of its point, and of
+                its value in each attribute, also of missing ones.
+            attributes: attributes by the names of glTF; None if the mesh lacks one.
+        """
+        positions = points[vertex_indices[:, 0]].astype(np.float32)
+        accessors = {
+            "POSITION": self.buffer.add_accessor(positions, "VEC3", bounds=True)
+        }
+        for column, (name, attribute) in enumerate(attributes.items(), start=1):
+            if attribute is not None:
+                value_index = vertex_indices[:, column]
+                values = attribute.values[value_index].astype(np.float32)
+                accessor_type = f"VEC{values.shape[1]}"
+                accessors[name] = self.buffer.add_accessor(values, accessor_type)
+        return accessors
 
     def _index_values(
         self,
@@ -627,29 +684,34 @@ class Conversion:
         Raises:
             FileFormatError: an attribute has fewer values than the mesh needs.
         """
-        corner_rows = mesh_faces.triangles[is_selected].reshape(-1)
-        corner_points = mesh_faces.point_of_corner[corner_rows]
-        index_by_interpolation = {
-            "vertex": corner_points,
-            "varying": corner_points,
-            "faceVarying": corner_rows,
-            "uniform": mesh_faces.face_of_triangle[is_selected].repeat(3),
-        }
-        constant_index = np.zeros(len(corner_rows), np.int64)
+        index_by_interpolation = _index_corners(mesh_faces, is_selected)
+        corner_points = index_by_interpolation["vertex"]
+        constant_index = np.zeros(len(corner_points), np.int64)
         columns = [corner_points]
         for attribute in attributes.values():
             index = constant_index
             if attribute is not None:
-                index = index_by_interpolation.get(
-                    attribute.interpolation, constant_index
-                )
-                if index.max() >= len(attribute.values):
-                    raise errors.FileFormatError(
-                        f"{self.source}: expected as many values "
-                        f"as corners on {path}, got fewer"
-                    )
+                kind = attribute.interpolation
+                index = index_by_interpolation.get(kind, constant_index)
+                self._check_value_count(path, attribute, index)
             columns.append(index)
         return np.stack(columns, axis=1)
+
+    def _check_value_count(
+        self, path: str, attribute: MeshValues, index: Array
+    ) -> None:
+        """Raise FileFormatError if an attribute of a prim has too few values.
+
+        Args:
+            path: path of the prim.
+            attribute: the attribute.
+            index: indices of the values that are used.
+        """
+        if index.max() >= len(attribute.values):
+            raise errors.FileFormatError(
+                f"{self.source}: expected as many values "
+                f"as corners on {path}, got fewer"
+            )
 
     def _read_uvs(self, primvars: Any, layout: TextureLayout) -> MeshValues | None:
         """Return texture coordinates (N, 2) as glTF has them, v down, or None.
@@ -668,18 +730,27 @@ class Conversion:
                 primvars.FindPrimvarWithInheritance(layout.primvar), 2
             )
         if values is None:
-            if layout.fallback is None:
-                return None
-            if layout.primvar:
-                name = layout.primvar[:50]
-                self._note(
-                    f"has a mesh without the primvar {name!r} of a texture, which has "
-                    "the color of one texel"
-                )
-            values = MeshValues(np.array([layout.fallback]), "constant")
+            values = self._make_fallback_uvs(layout)
+        if values is None:
+            return None
         transformed = layout.transform(values.values)
         uvs = np.stack([transformed[:, 0], 1.0 - transformed[:, 1]], axis=1)
         return MeshValues(uvs, values.interpolation)
+
+    def _make_fallback_uvs(self, layout: TextureLayout) -> MeshValues | None:
+        """Return the fallback of a layout, whose primvar a mesh lacks, or None.
+
+        That the mesh lacks a primvar is noted.
+        """
+        if layout.fallback is None:
+            return None
+        if layout.primvar:
+            name = layout.primvar[:50]
+            self._note(
+                f"has a mesh without the primvar {name!r} of a texture, which has "
+                "the color of one texel"
+            )
+        return MeshValues(np.array([layout.fallback]), "constant")
 
     def _read_layouts(
         self, primvars: Any, layouts: Iterable[TextureLayout]
@@ -721,14 +792,31 @@ class Conversion:
             self._note_default_material(primvars)
         colors = _read_primvar(primvars, bound.color)
         opacities = _read_primvar(primvars, bound.opacity)
-        # (F, 3) and (F, 1), or full of `NO_TINT`
+        yield from self._make_tints(bound, colors, opacities, faces, mesh_faces)
+
+    def _make_tints(
+        self,
+        bound: BoundMaterial,
+        colors: MeshValues | None,
+        opacities: MeshValues | None,
+        faces: Array,
+        mesh_faces: MeshFaces,
+    ) -> Iterator[tuple[int, MeshValues | None, Array]]:
+        """Make a copy of a material for each tint of faces; see `_split_by_tint`.
+
+        Args:
+            bound: the material.
+            colors: colors of the mesh that replace that of the material, or None.
+            opacities: opacities of the mesh that replace that of the material, or None.
+            faces: (F,) faces with the material.
+            mesh_faces: all faces of the mesh.
+
+        Yields:
+            Index of a glTF material, vertex colors or None, and faces.
+        """
         face_colors = _find_face_colors(colors, faces, mesh_faces)
-        face_opacities = self._compute_face_opacities(opacities, faces, mesh_faces)
-        vertex_colors = None
-        if face_colors is None:
-            vertex_colors = colors
-            face_colors = np.full((len(faces), 3), NO_TINT)
-        face_tints = np.concatenate([face_colors, face_opacities], axis=1)
+        vertex_colors = colors if face_colors is None else None
+        face_tints = self._compute_face_tints(face_colors, opacities, faces, mesh_faces)
         for tint in np.unique(face_tints, axis=0):
             material = self._surfaces.make_tinted(
                 bound,
@@ -737,6 +825,26 @@ class Conversion:
             )
             has_tint = (face_tints == tint).all(axis=1)
             yield material, vertex_colors, faces[has_tint]
+
+    def _compute_face_tints(
+        self,
+        face_colors: Array | None,
+        opacities: MeshValues | None,
+        faces: Array,
+        mesh_faces: MeshFaces,
+    ) -> Array:
+        """Return the color and opacity (F, 4) of faces; `NO_TINT` where there is none.
+
+        Args:
+            face_colors: (F, 3) colors of the faces, or None.
+            opacities: opacities of the primvar, or None.
+            faces: (F,) the faces.
+            mesh_faces: all faces of the mesh.
+        """
+        face_opacities = self._compute_face_opacities(opacities, faces, mesh_faces)
+        if face_colors is None:
+            face_colors = np.full((len(faces), 3), NO_TINT)
+        return np.concatenate([face_colors, face_opacities], axis=1)
 
     def _note_default_material(self, primvars: Any) -> None:
         """Note that a mesh has no material, and the color that it has instead."""
@@ -769,13 +877,17 @@ class Conversion:
         is_of_vertices = opacities.interpolation not in ("constant", "uniform")
         if is_of_vertices and len(np.unique(opacities.values)) > 1:
             self._note("has an opacity of vertices; faces have its mean")
-        if len(np.unique(opacity)) > MAX_TINTS:
-            self._note(
-                f"has more than {MAX_TINTS} opacities of faces, which are replaced by "
-                "their mean"
-            )
-            opacity = np.full_like(opacity, opacity.mean())
-        return opacity
+        return self._limit_opacities(opacity)
+
+    def _limit_opacities(self, opacity: Array) -> Array:
+        """Return opacities (F, 1), or their mean, with a note, if too many are different."""
+        if len(np.unique(opacity)) <= MAX_TINTS:
+            return opacity
+        self._note(
+            f"has more than {MAX_TINTS} opacities of faces, which are replaced by "
+            "their mean"
+        )
+        return np.full_like(opacity, opacity.mean())
 
     def _iterate_materials(
         self, prim: Any, mesh: Any, faces: int
@@ -820,16 +932,89 @@ class Conversion:
         skeleton_query = self._skins.GetSkelQuery(skeleton) if skeleton else None
         if not skeleton_query:
             return None, points
-        transforms = _compute_joint_transforms(skinning, skeleton_query)
-        if transforms is None:
-            return None, points
-        skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
-        matrices = Vt.Matrix4dArray(transforms)
-        if not skinning.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
+        skinned = _skin_points(skinning, skeleton_query, points)
+        if skinned is None:
             return None, points
         xformable = UsdGeom.Xformable(skeleton.GetPrim())
         to_world = xformable.ComputeLocalToWorldTransform(FIRST_TIME)
-        return np.array(to_world), _to_array(skinned, np.float64, 3)
+        return np.array(to_world), skinned
+
+
+def _index_corners(mesh_faces: MeshFaces, is_selected: Array) -> dict[str, Array]:
+    """Return the indices (3 T,) of values at selected triangles' corners.
+
+    They are by the interpolation of the values, for those that are not constant.
+
+    Args:
+        mesh_faces: the faces of the mesh.
+        is_selected: which of its triangles are selected.
+    """
+    corner_rows = mesh_faces.triangles[is_selected].reshape(-1)
+    corner_points = mesh_faces.point_of_corner[corner_rows]
+    return {
+        "vertex": corner_points,
+        "varying": corner_points,
+        "faceVarying": corner_rows,
+        "uniform": mesh_faces.face_of_triangle[is_selected].repeat(3),
+    }
+
+
+def _read_mesh_normals(mesh: Any, primvars: Any) -> MeshValues | None:
+    """Return the normals (N, 3) that a mesh states, as a primvar or an attribute, or None."""
+    normals = _flatten_primvar(primvars.GetPrimvar("normals"), 3)
+    if normals is not None:
+        return normals
+    values = _to_array(_get_first(mesh, "Normals"), np.float64, 3)
+    if not len(values):
+        return None
+    return MeshValues(values, str(mesh.GetNormalsInterpolation()))
+
+
+def _find_parent(path: Any, xformable: Any, node_of_path: dict[Any, int]) -> int:
+    """Return the node of the nearest ancestor of a path, or 0, the stage's node.
+
+    It is 0 also if the prim resets its transform.
+    """
+    if xformable and xformable.GetResetXformStack():
+        return 0
+    ancestors = path.GetAncestorsRange()
+    return next((node_of_path[at] for at in ancestors if at in node_of_path), 0)
+
+
+def _read_perspective(camera: Any) -> dict[str, float] | None:
+    """Return the perspective of a camera as glTF's entry; None for another projection."""
+    # lengths in the same unit
+    width = _get_first(camera, "HorizontalAperture")
+    height = _get_first(camera, "VerticalAperture")
+    focal_length = _get_first(camera, "FocalLength")
+    is_perspective = _get_first(camera, "Projection") == UsdGeom.Tokens.perspective
+    if not is_perspective or not min(width, height, focal_length) > 0.0:
+        return None
+    return {
+        "yfov": 2.0 * math.atan(height / (2.0 * focal_length)),
+        "aspectRatio": width / height,
+        "znear": 0.01,
+    }
+
+
+def _skin_points(skinning: Any, skeleton_query: Any, points: Array) -> Array | None:
+    """Return points (P, 3) moved by the joints of a skin at rest.
+
+    The result is None if the skeleton lacks transforms, or if USD cannot move them.
+
+    Args:
+        skinning: query of the skin.
+        skeleton_query: query of the skeleton.
+        points: the points.
+    """
+    transforms = _compute_joint_transforms(skinning, skeleton_query)
+    if transforms is None:
+        return None
+    skinned = Vt.Vec3fArray([Gf.Vec3f(*map(float, point)) for point in points])
+    matrices = Vt.Matrix4dArray(transforms)
+    if not skinning.ComputeSkinnedPoints(matrices, skinned, FIRST_TIME):
+        return None
+    return _to_array(skinned, np.float64, 3)
 
 
 def _compute_joint_transforms(skinning: Any, skeleton_query: Any) -> list[Any] | None:
@@ -956,15 +1141,27 @@ def _compute_face_values(
     if primvar.interpolation in ("vertex", "varying"):
         corner_index = mesh_faces.point_of_corner
     corner_values = values[np.minimum(corner_index, last_index)]
+    means = _average_corners(corner_values, mesh_faces.corner_counts)
+    return np.asarray(means[faces])
+
+
+def _average_corners(values: Array, counts: Array) -> Array:
+    """Return the mean (F, C) of values (corners, C) over the corners of each face.
+
+    Faces without corners get a wrong value, but have no triangles.
+
+    Args:
+        values: values of the corners of all faces, one face after the other.
+        counts: (F,) number of corners of each face.
+    """
     # `reduceat` sums the rows from the start of a face to that of the next one. A row
     # of zeros is appended, since faces without corners at the end begin after the last
-    # row. Other faces without corners get a wrong value, but have no triangles.
-    padded_values = np.concatenate([corner_values, np.zeros((1, values.shape[1]))])
-    counts = mesh_faces.corner_counts
+    # row.
+    padded_values = np.concatenate([values, np.zeros((1, values.shape[1]))])
     starts = np.cumsum(counts) - counts
     sums = np.add.reduceat(padded_values, starts)
-    means = sums / np.maximum(counts, 1)[:, None]
-    return np.asarray(means[faces])
+    means: Array = sums / np.maximum(counts, 1)[:, None]
+    return means
 
 
 def _compute_illuminance(prim: Any, radiance: float) -> float:

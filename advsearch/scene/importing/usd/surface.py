@@ -13,6 +13,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -259,14 +260,7 @@ class GltfMaterialWriter:
         The display color is a primvar of each mesh, so it is not known here: faces are
         tinted when the mesh is converted.
         """
-        surface = {
-            "baseColorFactor": [*DEFAULT_COLOR, 1.0],
-            "metallicFactor": 0.0,
-            "roughnessFactor": DEFAULT_ROUGHNESS,
-        }
-        index = self.add_material(
-            {"name": "displayColor", "pbrMetallicRoughness": surface}
-        )
+        index = self._add_plain_material("displayColor", [*DEFAULT_COLOR, 1.0])
         color = PrimvarUse("displayColor", DEFAULT_COLOR)
         return BoundMaterial(
             index,
@@ -316,16 +310,27 @@ class GltfMaterialWriter:
         shader = material.ComputeSurfaceSource()[0]
         if not shader or shader.GetIdAttr().Get() != PREVIEW_SURFACE:
             self.note("has a material that is no UsdPreviewSurface, which is grey here")
-            grey = [0.2140, 0.2140, 0.2140, 1.0]  # linear: 0.5 in sRGB; and opaque
-            surface = {
-                "baseColorFactor": grey,
-                "metallicFactor": 0.0,
-                "roughnessFactor": DEFAULT_ROUGHNESS,
-            }
-            return BoundMaterial(
-                self.add_material({"name": name, "pbrMetallicRoughness": surface})
-            )
+            return self._make_grey_material(name)
         return PreviewSurface(self, Shader.from_prim(shader), name).convert()
+
+    def _make_grey_material(self, name: str) -> BoundMaterial:
+        """Add a grey material of a name."""
+        grey = [0.2140, 0.2140, 0.2140, 1.0]  # linear: 0.5 in sRGB; and opaque
+        return BoundMaterial(self._add_plain_material(name, grey))
+
+    def _add_plain_material(self, name: str, factor: list[float]) -> int:
+        """Add a material without metal and textures, and return its index.
+
+        Args:
+            name: name of the material.
+            factor: (4,) its linear color and its opacity.
+        """
+        surface = {
+            "baseColorFactor": factor,
+            "metallicFactor": 0.0,
+            "roughnessFactor": DEFAULT_ROUGHNESS,
+        }
+        return self.add_material({"name": name, "pbrMetallicRoughness": surface})
 
     # ---- Images ----
 
@@ -344,16 +349,7 @@ class GltfMaterialWriter:
         outer, inner = Ar.SplitPackageRelativePathOuter(resolved)
         outer = os.path.realpath(outer)
         is_in_folder = reading.is_inside(outer, self.folder)
-        data = None
-        if is_in_folder and os.path.isfile(outer):
-            if inner:
-                packaged = Ar.JoinPackageRelativePath(outer, inner)
-                with contextlib.suppress(KeyError):  # it is not in the package
-                    data = read_packaged(packaged)
-            else:
-                data = stored_files.read_bytes(
-                    Path(outer), "a picture", stored_files.LARGEST_FILE
-                )
+        data = _read_picture(outer, inner) if is_in_folder else None
         if data is None:
             reason = reading.MISSING if is_in_folder else reading.OUTSIDE
             self.note(f"the texture {path[:100]!r} of {name} {reason}")
@@ -370,26 +366,35 @@ class GltfMaterialWriter:
         """
         key = (use.data, use.is_srgb)
         if key not in self._texels:
-            try:
-                self._texels[key] = decode_image(
-                    use.data, use.path, is_srgb=use.is_srgb
-                )
-            except (
-                OSError,
-                ValueError,
-                SyntaxError,
-                EOFError,
-                errors.FileFormatError,
-            ) as error:
-                self.note(
-                    f"the texture {use.path[:100]!r} cannot be read "
-                    f"({format_error(error)})"
-                )
+            texels = self._decode_texture(use)
+            if texels is None:
                 return None
+            self._texels[key] = texels
         return self._texels[key]
 
-    def compute_values(self, use: UsdTextureUse) -> Array | None:
-        """Return the values (H, W, C) of an image after scale and bias, or None."""
+    def _decode_texture(self, use: UsdTextureUse) -> Array | None:
+        """Return the linear values (H, W, 4) of an image; None, with a note, if wrong."""
+        try:
+            return decode_image(use.data, use.path, is_srgb=use.is_srgb)
+        except (
+            OSError,
+            ValueError,
+            SyntaxError,
+            EOFError,
+            errors.FileFormatError,
+        ) as error:
+            self.note(
+                f"the texture {use.path[:100]!r} cannot be read ({format_error(error)})"
+            )
+            return None
+
+    def compute_values(self, use: UsdTextureUse | None) -> Array | None:
+        """Return the values (H, W, C) of an image after scale and bias.
+
+        The result is None for no image, and, with a note, if it cannot be decoded.
+        """
+        if use is None:
+            return None
         texels = self.load_texels(use)
         if texels is None:
             return None
@@ -427,6 +432,24 @@ class GltfMaterialWriter:
         return entries.index(entry)
 
 
+def _read_picture(path: str, inner: str) -> bytes | None:
+    """Return the bytes of an image file, or None if there is none.
+
+    Args:
+        path: the file.
+        inner: path of the image in that file if it is a package, otherwise "".
+    """
+    if not os.path.isfile(path):
+        return None
+    if not inner:
+        return stored_files.read_bytes(
+            Path(path), "a picture", stored_files.LARGEST_FILE
+        )
+    with contextlib.suppress(KeyError):  # it is not in the package
+        return read_packaged(Ar.JoinPackageRelativePath(path, inner))
+    return None
+
+
 class _TextureInputs(NamedTuple):
     """The inputs of the shader of a texture.
 
@@ -456,6 +479,45 @@ def _read_fallback(node: Shader) -> tuple[float, ...] | None:
     return node.get_numbers("fallback", NO_SCALE)
 
 
+class _BaseInputs(NamedTuple):
+    """The base color and the opacity of a surface.
+
+    Attributes:
+        color: (3,) linear color if there is no texture of it.
+        opacity: opacity if there is no texture of it.
+        color_use: the texture of the color, or None.
+        opacity_use: the texture of the opacity, or None.
+    """
+
+    color: tuple[float, ...]
+    opacity: float
+    color_use: UsdTextureUse | None
+    opacity_use: UsdTextureUse | None
+
+
+def _select_fallback(
+    inputs: _TextureInputs, channels: Sequence[int]
+) -> tuple[float, ...] | None:
+    """Return the numbers, one for each channel, that replace a missing image, or None."""
+    if inputs.fallback is None:
+        return None
+    return tuple(inputs.fallback[channel] for channel in channels)
+
+
+def _is_input_without_effect(is_specular: bool, name: str, shader_input: Any) -> bool:
+    """Return whether an input of a surface changes nothing.
+
+    `is_specular` is whether the surface has a specular workflow.
+    """
+    if name == "specularColor" and not is_specular:
+        return True  # only a specular workflow uses it
+    producers = UsdShade.Utils.GetValueProducingAttributes(shader_input)
+    if name not in NEUTRAL_VALUES:
+        return len(producers) == 0  # it has no value
+    neutral = NEUTRAL_VALUES[name]
+    return all(_is_neutral(attribute, neutral) for attribute in producers)
+
+
 @dataclass
 class PreviewSurface:
     """Converts one preview surface to a glTF material.
@@ -479,27 +541,14 @@ class PreviewSurface:
 
         A specular workflow is read as a metallic one without metal.
         """
-        shader = self.shader
-        is_specular = bool(shader.get_number("useSpecularWorkflow", 0.0))
+        is_specular = bool(self.shader.get_number("useSpecularWorkflow", 0.0))
         surface: dict[str, Any] = {}
         entry: dict[str, Any] = {"name": self.name, "pbrMetallicRoughness": surface}
         color_primvar, opacity_primvar = self._add_base(entry, surface)
         self._add_roughness_and_metallic(surface, is_specular=is_specular)
         self._add_normal(entry)
         self._add_emission(entry)
-        if is_specular:
-            self.surfaces.note(
-                "has materials with a specular workflow, of which only the diffuse "
-                "colour is read"
-            )
-        # The note about a clearcoat that is left out includes its roughness.
-        shader.inputs.mark_read("clearcoatRoughness")
-        opacity_mode = str(shader.get_value("opacityMode") or "presence")
-        if opacity_mode != "presence" and entry.get("alphaMode") == "BLEND":
-            self.surfaces.note(
-                "has materials with opacityMode transparent; here the opacity also "
-                "reduces highlights"
-            )
+        self._note_simplifications(entry, is_specular=is_specular)
         self._note_unread(is_specular=is_specular)
         index = self.surfaces.add_material(entry)
         # `_make_slot` has added the layouts of all textures.
@@ -508,23 +557,34 @@ class PreviewSurface:
             index, layouts=layouts, color=color_primvar, opacity=opacity_primvar
         )
 
+    def _note_simplifications(
+        self, entry: dict[str, Any], *, is_specular: bool
+    ) -> None:
+        """Note a specular workflow, and an opacity that means transmission.
+
+        `entry` is the complete glTF material.
+        """
+        if is_specular:
+            self.surfaces.note(
+                "has materials with a specular workflow, of which only the diffuse "
+                "colour is read"
+            )
+        # The note about a clearcoat that is left out includes its roughness.
+        self.shader.inputs.mark_read("clearcoatRoughness")
+        opacity_mode = str(self.shader.get_value("opacityMode") or "presence")
+        if opacity_mode != "presence" and entry.get("alphaMode") == "BLEND":
+            self.surfaces.note(
+                "has materials with opacityMode transparent; here the opacity also "
+                "reduces highlights"
+            )
+
     def _note_unread(self, *, is_specular: bool) -> None:
         """Note the inputs that are not read, of the surface and of its shaders.
 
         Inputs of the surface need no note if they have no value, or one that changes
         nothing.
         """
-
-        def is_without_effect(name: str, shader_input: Any) -> bool:
-            """Return whether an input changes nothing."""
-            if name == "specularColor" and not is_specular:
-                return True  # only a specular workflow uses it
-            producers = UsdShade.Utils.GetValueProducingAttributes(shader_input)
-            if name not in NEUTRAL_VALUES:
-                return len(producers) == 0  # it has no value
-            neutral = NEUTRAL_VALUES[name]
-            return all(_is_neutral(attribute, neutral) for attribute in producers)
-
+        is_without_effect = partial(_is_input_without_effect, is_specular)
         for name in self.shader.inputs.find_unread(is_without_effect):
             label = "an ior other than 1.5" if name == "ior" else name
             self.surfaces.note(f"has materials with {label[:100]}, which is left out")
@@ -600,7 +660,18 @@ class PreviewSurface:
             return None
         # Inputs are read even if the texture is left out below, which has a note of its
         # own. Otherwise they would be noted as unread inputs, too.
-        inputs = _TextureInputs(
+        inputs = self._read_texture_inputs(node)
+        if output not in CHANNELS:
+            self.surfaces.note(
+                f"has a {name} of the output {output[:50]!r} of a picture, which is "
+                "left out"
+            )
+            return None
+        return self._load_texture(name, inputs, CHANNELS[output])
+
+    def _read_texture_inputs(self, node: Shader) -> _TextureInputs:
+        """Return the inputs of the shader of a texture, which are marked as read."""
+        return _TextureInputs(
             asset=node.get_value("file"),
             color_space=str(node.get_value("sourceColorSpace") or "auto"),
             scale=node.get_numbers("scale", NO_SCALE),
@@ -609,13 +680,6 @@ class PreviewSurface:
             wraps=self._read_wraps(node),
             fallback=_read_fallback(node),
         )
-        if output not in CHANNELS:
-            self.surfaces.note(
-                f"has a {name} of the output {output[:50]!r} of a picture, which is "
-                "left out"
-            )
-            return None
-        return self._load_texture(name, inputs, CHANNELS[output])
 
     def _load_texture(
         self, name: str, inputs: _TextureInputs, channels: Sequence[int]
@@ -634,9 +698,7 @@ class PreviewSurface:
         path = "" if inputs.asset is None else str(inputs.asset.path)
         data = self._load_image(inputs.asset, path, name)
         if data is None:  # `_load_image` has noted why
-            if inputs.fallback is None:
-                return None
-            return tuple(inputs.fallback[channel] for channel in channels)
+            return _select_fallback(inputs, channels)
         if channels == CHANNELS["a"] and data.startswith(EXR):
             self.surfaces.note(
                 f"has a {name} of the alpha of an .exr picture, which is left out"
@@ -718,24 +780,33 @@ class PreviewSurface:
                 return self._make_constant_layout(node, input_name, matrix)
             source_shader, _output = source
             node = self._track_shader(source_shader)
-            if node.kind == TRANSFORM:
-                matrix = matrix @ _compute_transform(node)
-                input_name = "in"
-                continue
-            matrix_rows = tuple(map(float, matrix[:2].ravel()))
-            if node.kind in READERS_OF_COORDINATES:
-                primvar = str(node.get_value("varname") or "st")
-                s, t = node.get_numbers("fallback", (0.0, 0.0))
-                return TextureLayout(primvar, fallback=(s, t), matrix=matrix_rows)
-            self.surfaces.note(
-                f"has a texture whose coordinates are from {node.kind[:100]}; st is "
-                "used instead"
-            )
-            return TextureLayout("st", fallback=None, matrix=matrix_rows)
+            if node.kind != TRANSFORM:
+                return self._make_primvar_layout(node, matrix)
+            matrix = matrix @ _compute_transform(node)
+            input_name = "in"
         raise errors.FileFormatError(
             f"the material {self.name}: expected at most {MAX_SHADERS} shaders in a "
             "row, got more"
         )
+
+    def _make_primvar_layout(self, node: Shader, matrix: Array) -> TextureLayout:
+        """Return the layout of a texture with coordinates of a primvar.
+
+        Args:
+            node: the shader that reads the primvar; one of another kind is replaced by
+                a reader of "st", with a note.
+            matrix: (3, 3) the transforms after it.
+        """
+        matrix_rows = tuple(map(float, matrix[:2].ravel()))
+        if node.kind in READERS_OF_COORDINATES:
+            primvar = str(node.get_value("varname") or "st")
+            s, t = node.get_numbers("fallback", (0.0, 0.0))
+            return TextureLayout(primvar, fallback=(s, t), matrix=matrix_rows)
+        self.surfaces.note(
+            f"has a texture whose coordinates are from {node.kind[:100]}; st is "
+            "used instead"
+        )
+        return TextureLayout("st", fallback=None, matrix=matrix_rows)
 
     def _make_constant_layout(
         self, node: Shader, input_name: str, matrix: Array
@@ -792,11 +863,48 @@ class PreviewSurface:
             "diffuseColor", READERS_OF_COLORS, DEFAULT_COLOR
         )
         opacity_primvar = self._find_primvar("opacity", (READER_OF_NUMBERS,), (1.0,))
+        base = self._read_base(color_primvar, opacity_primvar)
+        threshold = self.shader.get_number("opacityThreshold", 0.0)
+        has_opacity_map = self._fill_base_color(base, surface)
+        opacity_factor = surface["baseColorFactor"][3]
+        if has_opacity_map or opacity_factor < 1.0 or opacity_primvar is not None:
+            _set_alpha_mode(entry, threshold)
+        return color_primvar, opacity_primvar
+
+    def _fill_base_color(self, base: _BaseInputs, surface: dict[str, Any]) -> bool:
+        """Fill in the texture of color and opacity, and the factor (4,) of both.
+
+        Args:
+            base: the color and the opacity.
+            surface: pbrMetallicRoughness of the glTF material.
+
+        Returns:
+            Whether the texture has the opacity.
+        """
+        texture, color_factor = self._add_base_texture(
+            base.color_use, base.opacity_use, list(base.color)
+        )
+        if texture is not None:
+            first_use = base.color_use or base.opacity_use
+            assert first_use is not None
+            surface["baseColorTexture"] = self._make_slot(texture, first_use.layout)
+        has_opacity_map = texture is not None and base.opacity_use is not None
+        opacity_factor = 1.0 if has_opacity_map else base.opacity
+        factor = [min(max(part, 0.0), 1.0) for part in (*color_factor, opacity_factor)]
+        surface["baseColorFactor"] = factor
+        return has_opacity_map
+
+    def _read_base(
+        self, color_primvar: PrimvarUse | None, opacity_primvar: PrimvarUse | None
+    ) -> _BaseInputs:
+        """Return the values and textures of color and opacity.
+
+        An input that a primvar replaces, if it is not None, has no texture.
+        """
         color_use = None
         opacity_use = None
         color = self.shader.get_numbers("diffuseColor", DEFAULT_COLOR)
         opacity = self.shader.get_numbers("opacity", (1.0,))
-        threshold = self.shader.get_number("opacityThreshold", 0.0)
         if color_primvar is None:
             color_use, color = self._find_texture_or_value("diffuseColor", color)
         if opacity_primvar is None:
@@ -805,20 +913,7 @@ class PreviewSurface:
         # If the color is connected to one channel of a missing image, the fallback has
         # one number, a grey.
         color = tuple(map(float, np.broadcast_to(color, 3)))
-        texture, color_factor = self._add_base_texture(
-            color_use, opacity_use, list(color)
-        )
-        if texture is not None:
-            first_use = color_use or opacity_use
-            assert first_use is not None
-            surface["baseColorTexture"] = self._make_slot(texture, first_use.layout)
-        has_opacity_map = texture is not None and opacity_use is not None
-        opacity_factor = 1.0 if has_opacity_map else opacity[0]
-        factor = [min(max(part, 0.0), 1.0) for part in (*color_factor, opacity_factor)]
-        surface["baseColorFactor"] = factor
-        if has_opacity_map or factor[3] < 1.0 or opacity_primvar is not None:
-            _set_alpha_mode(entry, threshold)
-        return color_primvar, opacity_primvar
+        return _BaseInputs(color, opacity[0], color_use, opacity_use)
 
     def _drop_other_layout(
         self, opacity_use: UsdTextureUse | None, color_use: UsdTextureUse | None
@@ -888,27 +983,19 @@ class PreviewSurface:
             opacity_use: the texture of the opacity, or None.
             factor: (3,) linear color, used if there is no image of it.
         """
-        colors = None if color_use is None else self.surfaces.compute_values(color_use)
-        opacities = (
-            None if opacity_use is None else self.surfaces.compute_values(opacity_use)
-        )
+        colors = self.surfaces.compute_values(color_use)
+        opacities = self.surfaces.compute_values(opacity_use)
         if colors is None:
             if opacities is None:
                 return None
-            colors = np.broadcast_to(
-                np.array(factor, np.float32), (*opacities.shape[:2], 3)
-            )
+            shape = (*opacities.shape[:2], 3)
+            colors = np.broadcast_to(np.array(factor, np.float32), shape)
         display_colors = color.linear_to_srgb(
             np.broadcast_to(colors, (*colors.shape[:2], 3)).astype(np.float32)
         )
         if opacities is None:
             return display_colors
-        if opacities.shape[:2] != display_colors.shape[:2]:
-            width = max(opacities.shape[1], display_colors.shape[1])
-            height = max(opacities.shape[0], display_colors.shape[0])
-            opacities = _resize(opacities, (width, height))
-            display_colors = _resize(display_colors, (width, height))
-        return np.concatenate([display_colors, opacities[:, :, :1]], axis=2)
+        return _join_color_and_opacity(display_colors, opacities)
 
     def _add_roughness_and_metallic(
         self, surface: dict[str, Any], *, is_specular: bool
@@ -930,15 +1017,13 @@ class PreviewSurface:
             surface["metallicFactor"] = factor_by_name["metallic"]
             surface["roughnessFactor"] = factor_by_name["roughness"]
             return
-        texture = self.surfaces.add_image(
-            _pack_planes(plane_by_name, factor_by_name), texture_use.sampler
-        )
+        packed = _pack_planes(plane_by_name, factor_by_name)
+        texture = self.surfaces.add_image(packed, texture_use.sampler)
         # Factors multiply the image, which has the numbers already.
         surface["metallicFactor"] = 1.0
         surface["roughnessFactor"] = 1.0
-        surface["metallicRoughnessTexture"] = self._make_slot(
-            texture, texture_use.layout
-        )
+        slot = self._make_slot(texture, texture_use.layout)
+        surface["metallicRoughnessTexture"] = slot
 
     def _find_planes(
         self,
@@ -962,16 +1047,20 @@ class PreviewSurface:
             if image is None:
                 continue
             use, plane = image
-            if texture_use is not None and use.layout != texture_use.layout:
-                factor_by_name[name] = float(plane.mean())
-                self.surfaces.note(
-                    f"has a {name} with other texture coordinates, which is replaced by "
-                    "its mean"
-                )
-            else:
+            if texture_use is None or use.layout == texture_use.layout:
                 plane_by_name[name] = plane
                 texture_use = use
+            else:
+                factor_by_name[name] = float(plane.mean())
+                self._note_mean(name)
         return factor_by_name, plane_by_name, texture_use
+
+    def _note_mean(self, name: str) -> None:
+        """Note that an image is replaced by its mean, since its coordinates differ."""
+        self.surfaces.note(
+            f"has a {name} with other texture coordinates, which is replaced by "
+            "its mean"
+        )
 
     def _read_number_or_image(
         self, name: str, default: float
@@ -990,19 +1079,23 @@ class PreviewSurface:
         number = self.shader.get_number(name, default)
         primvar = self._find_primvar(name, (READER_OF_NUMBERS,), (0.0,))
         if primvar is not None:
-            self.surfaces.note(
-                f"has a {name} of the primvar {primvar.name[:50]!r}, which is replaced "
-                "by its fallback"
-            )
+            self._note_fallback(name, primvar)
             return primvar.fallback[0], None
         use = self._find_texture(name)
         if isinstance(use, tuple):  # the number that replaces a missing image
             return use[0], None
-        values = None if use is None else self.surfaces.compute_values(use)
+        values = self.surfaces.compute_values(use)
         if use is None or values is None:
             return number, None
         self._note_srgb(name, use)
         return number, (use, np.clip(values[:, :, 0], 0.0, 1.0))
+
+    def _note_fallback(self, name: str, primvar: PrimvarUse) -> None:
+        """Note that an input has the fallback of a primvar, which is not read."""
+        self.surfaces.note(
+            f"has a {name} of the primvar {primvar.name[:50]!r}, which is replaced "
+            "by its fallback"
+        )
 
     def _note_srgb(self, name: str, use: UsdTextureUse) -> None:
         """Note that numbers are decoded from sRGB, unless they are an alpha."""
@@ -1030,24 +1123,11 @@ class PreviewSurface:
         Args:
             entry: the glTF material.
         """
-        if self.shader.find_source("normal") is None:
-            self._note_constant_normal()
-            return
-        use = self._find_texture("normal")
-        if isinstance(use, tuple) or use is None:
-            return
-        if len(use.channels) != 3:
-            self.surfaces.note(
-                "has a normal of one channel of a picture, which is left out"
-            )
+        use = self._find_normal_texture()
+        if use is None:
             return
         use = self._complete_normal_scale(use)
-        has_implied_scale = (
-            not use.is_srgb
-            and use.scale[:3] == NORMAL_SCALE[:3]
-            and use.bias[:3] == NORMAL_BIAS[:3]
-        )
-        if has_implied_scale and is_of_8_bits(use.data):
+        if _has_implied_normal_scale(use) and is_of_8_bits(use.data):
             texture = self.surfaces.add_texture(use.data, use.sampler)
             entry["normalTexture"] = self._make_slot(texture, use.layout)
             return
@@ -1057,6 +1137,21 @@ class PreviewSurface:
             # glTF stores a component n in [-1, 1] as (n + 1) / 2.
             texture = self.surfaces.add_image(normals * 0.5 + 0.5, use.sampler)
             entry["normalTexture"] = self._make_slot(texture, use.layout)
+
+    def _find_normal_texture(self) -> UsdTextureUse | None:
+        """Return the texture of the normals, or None; a normal left out is noted."""
+        if self.shader.find_source("normal") is None:
+            self._note_constant_normal()
+            return None
+        use = self._find_texture("normal")
+        if isinstance(use, tuple) or use is None:
+            return None
+        if len(use.channels) != 3:
+            self.surfaces.note(
+                "has a normal of one channel of a picture, which is left out"
+            )
+            return None
+        return use
 
     def _complete_normal_scale(self, use: UsdTextureUse) -> UsdTextureUse:
         """Return a normal map with the scale and bias that texels of 8 bits need.
@@ -1092,24 +1187,65 @@ class PreviewSurface:
         # Without a texture the factor is the color. If a missing image is replaced by
         # the fallback of one of its channels, the color is a grey.
         factor: Sequence[float] = list(map(float, np.broadcast_to(plain_color, 3)))
-        if use is not None and _is_scaled_texel(use, max_scale=math.inf):
-            texture = self.surfaces.add_texture(use.data, use.sampler)
-            entry["emissiveTexture"] = self._make_slot(texture, use.layout)
-            factor = use.scale[:3]
-        elif use is not None:
-            values = self.surfaces.compute_values(use)
-            if values is None:
+        if use is not None:
+            texture_and_factor = self._add_emission_texture(use)
+            if texture_and_factor is None:
                 return
-            values = np.broadcast_to(
-                np.maximum(np.nan_to_num(values), 0.0), (*values.shape[:2], 3)
-            )
-            # The image is divided by its largest value, which becomes the factor.
-            largest = max(float(values.max()), 1e-6)
-            levels = color.linear_to_srgb((values / largest).astype(np.float32))
-            texture = self.surfaces.add_image(levels, use.sampler)
+            texture, factor = texture_and_factor
             entry["emissiveTexture"] = self._make_slot(texture, use.layout)
-            factor = [largest] * 3
         _write_emission_factor(entry, [max(channel, 0.0) for channel in factor])
+
+    def _add_emission_texture(
+        self, use: UsdTextureUse
+    ) -> tuple[int, Sequence[float]] | None:
+        """Add the image of the emission; see `_add_emission`.
+
+        Returns:
+            The index of its texture, and the factor (3,) of its colors; None if it
+            cannot be decoded.
+        """
+        if _is_scaled_texel(use, max_scale=math.inf):
+            texture = self.surfaces.add_texture(use.data, use.sampler)
+            return texture, use.scale[:3]
+        values = self.surfaces.compute_values(use)
+        if values is None:
+            return None
+        # The image is divided by its largest value, which becomes the factor.
+        largest = max(float(np.maximum(np.nan_to_num(values), 0.0).max()), 1e-6)
+        levels = _normalize_emission(values, largest)
+        return self.surfaces.add_image(levels, use.sampler), [largest] * 3
+
+
+def _has_implied_normal_scale(use: UsdTextureUse) -> bool:
+    """Return whether a normal map has raw texels, and the scale 2 and bias -1 of glTF."""
+    return (
+        not use.is_srgb
+        and use.scale[:3] == NORMAL_SCALE[:3]
+        and use.bias[:3] == NORMAL_BIAS[:3]
+    )
+
+
+def _normalize_emission(values: Array, largest: float) -> Array:
+    """Return emission (H, W, C), divided by a number, as display-referred colors.
+
+    The result is (H, W, 3). Numbers below 0 and NaN are black.
+    """
+    radiance = np.maximum(np.nan_to_num(values), 0.0)
+    rgb = np.broadcast_to(radiance, (*values.shape[:2], 3))
+    return color.linear_to_srgb((rgb / largest).astype(np.float32))
+
+
+def _join_color_and_opacity(colors: Array, opacities: Array) -> Array:
+    """Return colors (H, W, 3) with opacities (h, w, C), the first channel, as a fourth.
+
+    Images of two sizes are both resized to the larger width and the larger height.
+    """
+    if opacities.shape[:2] != colors.shape[:2]:
+        width = max(opacities.shape[1], colors.shape[1])
+        height = max(opacities.shape[0], colors.shape[0])
+        opacities = _resize(opacities, (width, height))
+        colors = _resize(colors, (width, height))
+    return np.concatenate([colors, opacities[:, :, :1]], axis=2)
 
 
 def _set_alpha_mode(entry: dict[str, Any], threshold: float) -> None:
