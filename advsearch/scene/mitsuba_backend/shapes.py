@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -113,39 +113,51 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
         InputError: the shape has no triangles, or vertices that are not finite.
     """
     buffers = _load_any_buffers(shape, name)
+    _check_vertices(buffers, name)
+    has_uvs = buffers.uvs is not None
+    if shape.get("face_normals"):
+        buffers = buffers._replace(normals=None)
+    if buffers.uvs is None or buffers.normals is None:
+        # Default values belong to the corners of a face. So each corner becomes a
+        # vertex, with default values for what is missing.
+        buffers = _separate_faces(buffers)
+    normal_sign = -1.0 if shape.get("flip_normals") else 1.0
+    return _make_used_mesh(buffers, normal_sign), has_uvs
+
+
+def _check_vertices(buffers: Buffers, name: str) -> None:
+    """Raise InputError if a mesh has vertices that are not finite."""
     if not np.isfinite(buffers.vertices).all():
         raise InputError(
             f"object {name}: expected finite vertices, got NaN or infinite ones; "
             "repair the mesh"
         )
-    has_uvs = buffers.uvs is not None
-    if shape.get("face_normals"):
-        buffers = buffers._replace(normals=None)
-    vertices, faces, normals, uvs, attributes = buffers  # in the order of its fields
-    if uvs is None or normals is None:
-        # Default values belong to the corners of a face. So each corner becomes a
-        # vertex, with default values for what is missing.
-        vertices, faces, normals, uvs, attributes = _separate_faces(buffers)
 
-    # Leave out vertices that no face has.
+
+def _make_used_mesh(buffers: Buffers, normal_sign: float) -> Mesh:
+    """Return the mesh of buffers, without vertices that no face has.
+
+    The buffers have normals, which are multiplied by `normal_sign`, and texture
+    coordinates.
+    """
+    vertices, faces, normals, uvs, attributes = buffers  # in the order of its fields
+    assert normals is not None and uvs is not None
     used_vertices, vertex_index = np.unique(faces, return_inverse=True)
     faces = vertex_index.reshape(-1, 3)
     vertices = vertices[used_vertices]
     # v points up in our meshes and down in Mitsuba's, so that it becomes 1 - v.
     uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
-    normal_sign = -1.0 if shape.get("flip_normals") else 1.0
     # The normals of a face without area are NaN.
     normals = np.nan_to_num(normals)[used_vertices] * normal_sign
     if _has_opposite_winding(vertices, faces, normals):
         faces = faces[:, ::-1]
-    mesh = Mesh(
+    return Mesh(
         vertices.astype(np.float32),
         np.ascontiguousarray(faces, np.uint32),
         normals.astype(np.float32),
         uvs.astype(np.float32),
         _select_vertices(attributes, used_vertices),
     )
-    return mesh, has_uvs
 
 
 def _has_opposite_winding(
@@ -180,17 +192,11 @@ def _select_vertices(
     }
 
 
-def _separate_faces(
-    buffers: Buffers,
-) -> tuple[Float64Array, IntArray, Float64Array, Float64Array, dict[str, Float32Array]]:
+def _separate_faces(buffers: Buffers) -> Buffers:
     """Return buffers in which every corner of a face is a vertex of its own.
 
     Missing normals are replaced by those of the faces, and missing texture coordinates
     by `DEFAULT_FACE_UVS`.
-
-    Returns:
-        Vertices (3 F, 3), faces (F, 3), normals (3 F, 3), texture coordinates (3 F, 2),
-        and attributes by name.
     """
     corners = buffers.faces.reshape(-1)
     vertices = buffers.vertices[corners]
@@ -205,7 +211,7 @@ def _separate_faces(
     else:
         uvs = buffers.uvs[corners]
     attributes = _select_vertices(buffers.attributes, corners)
-    return vertices, faces, normals, uvs, attributes
+    return Buffers(vertices, faces, normals, uvs, attributes)
 
 
 def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
@@ -221,6 +227,31 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
     Raises:
         InputError: Mitsuba refuses the mesh, or it has no faces.
     """
+    mesh = _load_geometry(shape, name)
+    parameters = mi.traverse(mesh)
+    vertices = _read_buffer_rows(parameters, POSITIONS, 3)
+    faces = np.array(parameters[FACES], np.int64).reshape(-1, 3)
+    if not len(faces):
+        raise InputError(
+            f"object {name}: expected a mesh with faces, got none; export triangles"
+        )
+    normals = (
+        _read_buffer_rows(parameters, NORMALS, 3) if mesh.has_vertex_normals() else None
+    )
+    uvs = (
+        _read_buffer_rows(parameters, TEXCOORDS, 2)
+        if mesh.has_vertex_texcoords()
+        else None
+    )
+    attributes = _read_attributes(parameters, len(vertices), len(faces))
+    return Buffers(vertices, faces, normals, uvs, attributes)
+
+
+def _load_geometry(shape: Mapping[str, object], name: str) -> Any:
+    """Return Mitsuba's mesh of a shape, without surface and light.
+
+    If Mitsuba refuses it, an InputError says so.
+    """
     entries = {key: value for key, value in shape.items() if key in MESH_ENTRIES}
     try:
         with suppress_warnings():
@@ -229,21 +260,12 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
         raise InputError(
             f"object {name}: Mitsuba refuses the shape: {error}; change it there"
         ) from error
-    parameters = mi.traverse(mesh)
+    return mesh
 
-    def get_rows(key: str, width: int) -> Float64Array:
-        return np.array(parameters[key], np.float64).reshape(-1, width)
 
-    vertices = get_rows(POSITIONS, 3)
-    faces = np.array(parameters[FACES], np.int64).reshape(-1, 3)
-    if not len(faces):
-        raise InputError(
-            f"object {name}: expected a mesh with faces, got none; export triangles"
-        )
-    normals = get_rows(NORMALS, 3) if mesh.has_vertex_normals() else None
-    uvs = get_rows(TEXCOORDS, 2) if mesh.has_vertex_texcoords() else None
-    attributes = _read_attributes(parameters, len(vertices), len(faces))
-    return Buffers(vertices, faces, normals, uvs, attributes)
+def _read_buffer_rows(parameters: Any, key: str, width: int) -> Float64Array:
+    """Return a flat buffer of a mesh as rows (n, width)."""
+    return np.array(parameters[key], np.float64).reshape(-1, width)
 
 
 def _read_attributes(
@@ -289,12 +311,7 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         InputError: its pose has a determinant of 0, so that it has no extent.
     """
     vertices, faces, normals, uvs = _make_unit_shape(kind)
-    shape_pose = np.eye(4)
-    if kind == "sphere":
-        shape_pose[:3, :3] *= _get_radius(shape)
-        shape_pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
-    elif kind == "cylinder":
-        shape_pose = _compute_cylinder_pose(shape)
+    shape_pose = _compute_shape_pose(kind, shape)
     # without faces that have no area, such as those at a pole
     areas = np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1)
     faces = faces[areas > 1e-9]
@@ -309,6 +326,17 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     # are multiplied by the inverse itself.
     posed_normals = _normalize(normals @ np.linalg.inv(matrix[:3, :3]))
     return Buffers(posed_vertices, faces, posed_normals, uvs, attributes={})
+
+
+def _compute_shape_pose(kind: str, shape: Mapping[str, object]) -> Float64Array:
+    """Return the pose (4, 4) of a unit shape by the shape's own numbers."""
+    if kind == "cylinder":
+        return _compute_cylinder_pose(shape)
+    pose = np.eye(4)
+    if kind == "sphere":
+        pose[:3, :3] *= _get_radius(shape)
+        pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
+    return pose
 
 
 def _make_unit_shape(
@@ -364,19 +392,29 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     radius = _get_radius(shape)
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / max(length, 1e-30)  # not by 0
-    x, y, z = axis
-    # Two axes perpendicular to it, as in Mitsuba's `coordinate_system` (Duff et al.
-    # 2017), which is not called because it computes in float32. The sign keeps the
-    # divisor away from 0.
-    sign = np.copysign(1.0, z)
-    factor = -1.0 / (sign + z)
-    x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
-    y_axis = np.array([x * y * factor, sign + y * y * factor, -y])
+    x_axis, y_axis = _compute_perpendicular_axes(axis)
     pose = np.eye(4)
     pose[:3] = np.stack(
         [x_axis * radius, y_axis * radius, axis * length, start], axis=1
     )
     return pose
+
+
+def _compute_perpendicular_axes(
+    axis: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
+    """Return two unit vectors (3,) perpendicular to an axis and to each other.
+
+    They are those of Mitsuba's `coordinate_system` (Duff et al. 2017), which is not
+    called because it computes in float32.
+    """
+    x, y, z = axis
+    # The sign keeps the divisor away from 0.
+    sign = np.copysign(1.0, z)
+    factor = -1.0 / (sign + z)
+    x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
+    y_axis = np.array([x * y * factor, sign + y * y * factor, -y])
+    return x_axis, y_axis
 
 
 def _make_grid(u: Float64Array, v: Float64Array) -> tuple[Float64Array, IntArray]:
@@ -416,6 +454,7 @@ MIN_ALBEDO = 1e-3  # smallest albedo of a haze
 MAX_CENTER_OFFSET = 0.05
 _OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
 _OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
+_UNIFORM_OR_GRID_MEDIA = ("homogeneous", "heterogeneous")
 
 
 def find_haze(
@@ -442,7 +481,29 @@ def find_haze(
     if names is None:
         return None
     ball_name, medium_name = names
-    ball = named[ball_name]
+    radius = _measure_haze_ball(named[ball_name], matrix)
+    if radius is None:
+        return None
+    coefficients = _read_haze_medium(named[medium_name], matrix)
+    if coefficients is None:
+        return None
+    extinction, albedo = coefficients
+    haze = HazePart(ball_name, radius, extinction, albedo)
+    return haze, frozenset((ball_name, medium_name))
+
+
+def _measure_haze_ball(
+    ball: Mapping[str, object], matrix: Float64Array
+) -> float | None:
+    """Return the radius of a haze's ball, in object sizes.
+
+    The result is None if the ball's center is not near the object's.
+
+    Args:
+        ball: the ball's dictionary.
+        matrix: (4, 4) from the scene to the object's coordinates, with one scale for
+            all directions.
+    """
     pose = matrix @ get_pose(ball)
     # Numbers that are not understood are NaN here, for which the comparisons below are
     # false.
@@ -453,15 +514,7 @@ def find_haze(
     radius = scene_radius * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
     # Our haze is a ball around the object, which is at the origin of these coordinates.
     is_centered = float(np.linalg.norm(center[:3])) <= MAX_CENTER_OFFSET * radius
-    if not (radius > 0.0 and is_centered):
-        return None
-
-    coefficients = _read_haze_medium(named[medium_name], matrix)
-    if coefficients is None:
-        return None
-    extinction, albedo = coefficients
-    haze = HazePart(ball_name, radius, extinction, albedo)
-    return haze, frozenset((ball_name, medium_name))
+    return radius if radius > 0.0 and is_centered else None
 
 
 def _read_haze_medium(
@@ -506,35 +559,46 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     # Of all plugins only cameras have an entry "medium", the one that they stand in.
     camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
     camera_media.discard(None)
-    # spheres that are filled with it
-    ball_names = [
-        name
-        for name, plugin in named.items()
-        if plugin["type"] == "sphere"
-        and _get_reference(plugin.get("interior")) in camera_media
-    ]
+    ball_names = _find_filled_balls(named, camera_media)
     medium_names = [
         name
         for name, plugin in named.items()
-        if plugin["type"] in ("homogeneous", "heterogeneous")
+        if plugin["type"] in _UNIFORM_OR_GRID_MEDIA
     ]
     is_single_haze = len(camera_media) == len(ball_names) == len(medium_names) == 1
     if not is_single_haze:
         return None
     (ball_name,) = ball_names
     (medium_name,) = medium_names
-    ball = named[ball_name]
-    medium = named[medium_name]
+    is_plain = _is_plain_ball(named[ball_name]) and _is_plain_medium(named[medium_name])
+    if not (is_plain and camera_media == {medium_name}):
+        return None
+    return ball_name, medium_name
+
+
+def _find_filled_balls(named: Plugins, media: Collection[str | None]) -> list[str]:
+    """Return the names of spheres that are filled with one of some media."""
+    return [
+        name
+        for name, plugin in named.items()
+        if plugin["type"] == "sphere"
+        and _get_reference(plugin.get("interior")) in media
+    ]
+
+
+def _is_plain_ball(ball: Mapping[str, object]) -> bool:
+    """Return whether a ball has no surface, and no entry that a haze has not."""
+    return set(ball) <= _OF_BALL and ball.get("bsdf") == {"type": "null"}
+
+
+def _is_plain_medium(medium: Mapping[str, object]) -> bool:
+    """Return whether a medium is homogeneous and isotropic, and has no other entry."""
     isotropic_phase = {"type": "isotropic"}
-    is_plain_ball = set(ball) <= _OF_BALL and ball.get("bsdf") == {"type": "null"}
-    is_plain_medium = (
+    return (
         set(medium) <= _OF_MEDIUM
         and medium["type"] == "homogeneous"
         and medium.get("phase", isotropic_phase) == isotropic_phase
     )
-    if not (is_plain_ball and is_plain_medium and camera_media == {medium_name}):
-        return None
-    return ball_name, medium_name
 
 
 def _get_reference(plugin: object) -> str | None:
@@ -635,31 +699,47 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     the result's notes say so.
     """
     surface, color = _take_base_color(bsdf)
-    if color is None:
-        grey = np.full(
-            (CONSTANT_SIZE, CONSTANT_SIZE, 3), DEFAULT_REFLECTANCE, np.float32
-        )
-        color = _Color(linear=grey, options={})
-    linear = color.linear
-    # `_parse_base_color` gives a constant color this size. A larger image is a texture,
-    # even if all its texels are equal.
-    has_constant_size = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE)
-    varies = bool(np.ptp(linear, axis=(0, 1)).any())
-    is_constant = has_constant_size and not varies
-    # to the mesh's own texture coordinates or attributes
-    is_bound = any(
-        plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
-        for plugin in iterate_plugins(surface)
-    )
+    linear = _make_default_color() if color is None else color.linear
+    transform = None if color is None else color.to_uv
+    is_bound = _is_mesh_bound(surface)
     notes = _describe_surface(surface, linear)
-    surface, to_uv = _apply_uv_transform(surface, color.to_uv)
+    surface, to_uv = _apply_uv_transform(surface, transform)
     return ShapeSurface(
         plugin=surface,
         base_color=linear_to_srgb(np.clip(linear, 0.0, 1.0)),
-        is_textured=not is_constant,
+        is_textured=not _is_constant_color(linear),
         to_uv=to_uv,
         is_bound=is_bound,
         notes=tuple(notes),
+    )
+
+
+def _make_default_color() -> Float32Array:
+    """Return the base color (H, W, 3) of a surface that has none: grey."""
+    size = (CONSTANT_SIZE, CONSTANT_SIZE, 3)
+    return np.full(size, DEFAULT_REFLECTANCE, np.float32)
+
+
+def _is_constant_color(linear: Float32Array) -> bool:
+    """Return whether a base color (H, W, 3) is a constant and no texture.
+
+    `_parse_base_color` gives a constant color one size. A larger image is a texture,
+    even if all its texels are equal.
+    """
+    has_constant_size = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE)
+    varies = bool(np.ptp(linear, axis=(0, 1)).any())
+    return has_constant_size and not varies
+
+
+def _is_mesh_bound(surface: Plugin) -> bool:
+    """Return whether a surface depends on texture coordinates or attributes of the
+    mesh.
+
+    The base color is not counted.
+    """
+    return any(
+        plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
+        for plugin in iterate_plugins(surface)
     )
 
 
@@ -732,10 +812,7 @@ def _apply_uv_transform(
         texture coordinates.
     """
     to_uv = np.eye(3) if transform is None else to_uv_matrix(transform)
-    uses_tangents = any(
-        plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
-        for plugin in iterate_plugins(surface)
-    )
+    uses_tangents = _has_tangents(surface)
     # A step along u must remain one along u, in the same direction: it must not change
     # v, and the new u must grow with the old one.
     keeps_tangents = to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0
@@ -747,6 +824,14 @@ def _apply_uv_transform(
         # all textures but the base color, whose placeholder is none of these types
         surface = _with_transform(surface, inverse, *UV_TEXTURES)
     return surface, to_uv
+
+
+def _has_tangents(surface: Plugin) -> bool:
+    """Return whether a surface looks different with other tangents along u."""
+    return any(
+        plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
+        for plugin in iterate_plugins(surface)
+    )
 
 
 def _with_transform(
@@ -852,11 +937,7 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
     """
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):
-        if image.ndim == 2:  # grey
-            image = image[:, :, None]
-        # without alpha, the second or the fourth channel
-        image = image[:, :, :1] if image.shape[2] == 2 else image[:, :, :3]
-        return np.broadcast_to(image, (*image.shape[:2], 3)).astype(np.float32)
+        return _expand_to_rgb(image)
     if image is None and "filename" not in value:
         return None
     try:
@@ -869,6 +950,15 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
         bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False),
         dtype=np.float32,
     )
+
+
+def _expand_to_rgb(image: np.ndarray[Any, Any]) -> Float32Array:
+    """Return an image (H, W) or (H, W, channels) as (H, W, 3), without its alpha."""
+    if image.ndim == 2:  # grey
+        image = image[:, :, None]
+    # without alpha, the second or the fourth channel
+    image = image[:, :, :1] if image.shape[2] == 2 else image[:, :, :3]
+    return np.broadcast_to(image, (*image.shape[:2], 3)).astype(np.float32)
 
 
 def parse_constant_color(value: object) -> Float32Array | None:
