@@ -209,25 +209,7 @@ class ViewTracer:
             camera_rows = np.stack(
                 [_make_camera_numbers(inputs, height, width) for inputs in cameras]
             ).astype(np.float32)
-
-            # Maps are arguments of the recorded function, so that the recording also
-            # works for other light whose maps have the same sizes.
-            def trace(
-                mitsuba_scene: Any,
-                lane: Any,
-                tables: Any,
-                camera_numbers: Any,
-                lens: Any,
-                texels: Any,
-                sky: Any,
-                blurred: Any,
-            ) -> Any:
-                """Trace all rays; arguments are Dr.Jit arrays, see `_trace`."""
-                light_maps = replace(lit, texels=texels, sky=sky, blurred=blurred)
-                return self._trace(
-                    mitsuba_scene, lane, tables, camera_numbers, lens, light_maps
-                )
-
+            trace = self._make_ray_tracer(lit)
             recording = self._recordings.get_or_record(
                 (count, lit.sky_shape, lit.blurred_shape), trace, media=[]
             )
@@ -249,6 +231,31 @@ class ViewTracer:
                 lit.blurred,
             )
         return lambda: _fetch(channels, (count, height, width))
+
+    def _make_ray_tracer(self, lit: LightMaps) -> Callable[..., Any]:
+        """Return the function that traces all rays, which Dr.Jit records.
+
+        Maps are arguments of the recorded function, so that the recording also works
+        for other light whose maps have the same sizes.
+        """
+
+        def trace(
+            mitsuba_scene: Any,
+            lane: Any,
+            tables: Any,
+            camera_numbers: Any,
+            lens: Any,
+            texels: Any,
+            sky: Any,
+            blurred: Any,
+        ) -> Any:
+            """Trace all rays; arguments are Dr.Jit arrays, see `_trace`."""
+            light_maps = replace(lit, texels=texels, sky=sky, blurred=blurred)
+            return self._trace(
+                mitsuba_scene, lane, tables, camera_numbers, lens, light_maps
+            )
+
+        return trace
 
     def _trace(
         self,
@@ -296,9 +303,8 @@ class ViewTracer:
                 ray, ray_flags, coherent=layer == 0, active=active
             )
             is_hit = active & si.is_valid()
-            # The last layer stops all light that is left.
             stopped_fraction = transmittance
-            if layer < n_layers:
+            if layer < n_layers:  # the last layer stops all light that is left
                 opacity = 1.0 - texel_rays.eval_transmittance(si, is_hit)
                 stopped_fraction = transmittance * opacity
             surface_radiance, diffuse, side = self._shade(
@@ -311,13 +317,9 @@ class ViewTracer:
             sky_radiance = _look_up_sky(lit, direction, to_local)
             radiance += dr.select(escapes, transmittance * sky_radiance, 0.0)
             coverage += dr.select(is_hit, stopped_fraction / RAYS_PER_PIXEL, 0.0)
-            # The diffuse radiance of a base color c under an irradiance E is
-            # diffuse c E / pi. `side` is 0 where the texture is not hit, so that u and
-            # v there do not matter.
-            texture_weight = (
-                side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL)
+            texture_channels += _list_texture_channels(
+                si, side, stopped_fraction, diffuse
             )
-            texture_channels += [si.uv.x, si.uv.y, texture_weight]
             transmittance = transmittance - stopped_fraction
             active = is_hit & (transmittance > MIN_TRANSMITTANCE)
             ray = si.spawn_ray(direction)
@@ -355,16 +357,28 @@ class ViewTracer:
             x, y, z = self._compute_pinhole_direction(lane, camera[12:])
             active = mi.Bool(True)
         else:
-            # The table, four numbers for each ray, is the same for all cameras.
-            entry = 4 * (lane % (height * width * RAYS_PER_PIXEL))
-            x = dr.gather(mi.Float, lens, entry)
-            y = dr.gather(mi.Float, lens, entry + 1)
-            z = dr.gather(mi.Float, lens, entry + 2)
-            active = dr.gather(mi.Float, lens, entry + 3) > 0.0
+            x, y, z, active = self._look_up_lens_direction(lane, lens)
         direction = mi.Vector3f(
             *(left[axis] * x + up[axis] * y + forward[axis] * z for axis in range(3))
         )
         return mi.Ray3f(mi.Point3f(*position), dr.normalize(direction)), active
+
+    def _look_up_lens_direction(
+        self, lane: Any, lens: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """Return the direction of each ray of a lens in the camera's axes.
+
+        The fourth value is whether the lens has a ray there. The arguments are those of
+        `_make_rays`.
+        """
+        height, width = self._scene.resolution
+        # The table, four numbers for each ray, is the same for all cameras.
+        entry = 4 * (lane % (height * width * RAYS_PER_PIXEL))
+        x = dr.gather(mi.Float, lens, entry)
+        y = dr.gather(mi.Float, lens, entry + 1)
+        z = dr.gather(mi.Float, lens, entry + 2)
+        active = dr.gather(mi.Float, lens, entry + 3) > 0.0
+        return x, y, z, active
 
     def _compute_pinhole_direction(
         self, lane: Any, film_numbers: Sequence[Any]
@@ -471,10 +485,7 @@ class ViewTracer:
             One value for each of `LOBE_TABLES`.
         """
         n_tables = len(texel_rays.LOBE_TABLES)
-        surface_start = mi.UInt32(0)  # first entry of the tables of the surface
-        for index, mask in enumerate(masks):
-            first_entry = mi.UInt32(index * n_tables * texel_rays.N_ANGLES)
-            surface_start = dr.select(mask, first_entry, surface_start)
+        surface_start = _find_lobe_tables(masks)  # first entry of the surface's tables
         # entry i is for the cosine (i + 0.5) / N_ANGLES
         position = dr.clip(
             cosine * texel_rays.N_ANGLES - 0.5, 0.0, texel_rays.N_ANGLES - 1.0
@@ -518,11 +529,7 @@ class ViewTracer:
             lit: the light.
         """
         up, along, core, tail = lobe_shape
-        cosine = -dr.dot(normal, view_direction)
-        # The part of the direction along the surface. A ray along the normal has none,
-        # and without the 1e-8 its zeros would be normalized to NaN.
-        tangent = dr.normalize(view_direction + normal * cosine + 1e-8)
-        direction = dr.normalize(normal * up + tangent * along)
+        direction = _compute_lobe_direction(view_direction, normal, up, along)
         hit = texel_rays.find_opaque_hits(
             mitsuba_scene,
             mi.Ray3f(si.p + normal * texel_rays.RAY_OFFSET, direction),
@@ -532,13 +539,18 @@ class ViewTracer:
         masks = texel_rays.find_hit_grids(mitsuba_scene, self._grids, hit, direction)
         blurred = self._look_up_lobe(si, direction, core, tail, lit)
         texel = self._look_up_texel(hit, masks, lit)
-        is_ground = mi.Bool(False)
-        for grid, mask in zip(self._grids, masks, strict=True):
-            is_ground |= mask & grid.is_ground
+        is_ground = self._is_on_ground(masks)
         # `texel` is one of the ground where `is_ground`; elsewhere this is not used.
         ground = self._blend_ground(hit, masks, texel, blurred, (core, tail), lit)
         surface = dr.select(is_ground, ground, texel)
         return dr.select(hit.is_valid(), surface, blurred)
+
+    def _is_on_ground(self, masks: Sequence[Any]) -> Any:
+        """Return whether a hit is on a ground, by the masks of hits on all grids."""
+        is_ground = mi.Bool(False)
+        for grid, mask in zip(self._grids, masks, strict=True):
+            is_ground |= mask & grid.is_ground
+        return is_ground
 
     def _look_up_lobe(
         self, si: Any, direction: Any, core: Any, tail: Any, lit: LightMaps
@@ -670,6 +682,53 @@ class ViewTracer:
         return dr.select(on_any_grid, radiance, 0.0)
 
 
+def _list_texture_channels(
+    si: Any, side: Any, stopped_fraction: Any, diffuse: Any
+) -> list[Any]:
+    """Return u, v and weight of the searched texture for one layer of all rays.
+
+    Args:
+        si: surface interactions of the rays.
+        side: 1 on the texture's front, -1 on its back, 0 elsewhere, so that u and v
+            there do not matter.
+        stopped_fraction: fraction of a ray's light that the surface stops.
+        diffuse: diffuse fraction of its reflection.
+    """
+    # The diffuse radiance of a base color c under an irradiance E is diffuse c E / pi.
+    weight = side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL)
+    return [si.uv.x, si.uv.y, weight]
+
+
+def _find_lobe_tables(masks: Sequence[Any]) -> Any:
+    """Return the index of the first entry of the tables of the surface that was hit.
+
+    `masks` are for each surface whether it was hit. The tables are those of
+    `LOBE_TABLES`, one surface after the other.
+    """
+    n_entries = len(texel_rays.LOBE_TABLES) * texel_rays.N_ANGLES
+    surface_start = mi.UInt32(0)
+    for index, mask in enumerate(masks):
+        surface_start = dr.select(mask, mi.UInt32(index * n_entries), surface_start)
+    return surface_start
+
+
+def _compute_lobe_direction(
+    view_direction: Any, normal: Any, up: Any, along: Any
+) -> Any:
+    """Return the mean direction of a lobe by its components, see `Lobes`.
+
+    Args:
+        view_direction: unit directions from the viewer to the surface.
+        normal: unit shading normals, towards the viewer.
+        up, along: components of the mean direction along normal and tangent.
+    """
+    cosine = -dr.dot(normal, view_direction)
+    # The part of the direction along the surface. A ray along the normal has none,
+    # and without the 1e-8 its zeros would be normalized to NaN.
+    tangent = dr.normalize(view_direction + normal * cosine + 1e-8)
+    return dr.normalize(normal * up + tangent * along)
+
+
 def _turn_to_viewer(normal: Any, direction: Any) -> Any:
     """Return normals turned over where a ray in a direction comes from behind."""
     is_from_behind = dr.dot(normal, direction) > 0.0
@@ -724,14 +783,8 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
         # A copy, since `numpy` may return memory that belongs to Dr.Jit.
         coverage = channels[3].numpy().copy()
-        # after the four channels of the image: u, v and weight of the first layer, then
-        # those of the next one
-        layer_channels = [channel.numpy() for channel in channels[N_IMAGE_CHANNELS:]]
-        n_layers = len(layer_channels) // 3
-        # each (rays x layers,), all layers of a ray side by side
-        u, v, weight = (
-            np.stack(layer_channels[index::3], axis=1).ravel() for index in range(3)
-        )
+        n_layers = (len(channels) - N_IMAGE_CHANNELS) // 3
+        u, v, weight = _stack_layers(channels[N_IMAGE_CHANNELS:])
         (hits,) = np.nonzero(weight)
         # A hit is an index into these: ray * n_layers + layer.
         ray = hits // n_layers
@@ -743,6 +796,16 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
             diffuse_weight=torch.from_numpy(np.abs(weight[hits])),
             is_back=torch.from_numpy(weight[hits] < 0.0),
         )
+
+
+def _stack_layers(channels: Sequence[Any]) -> list[Float32Array]:
+    """Return u, v and weight of all rays and layers, each (rays x layers,).
+
+    The channels are u, v and weight of the first layer, then those of the next one. In
+    the result all layers of a ray are side by side.
+    """
+    layer_channels = [channel.numpy() for channel in channels]
+    return [np.stack(layer_channels[index::3], axis=1).ravel() for index in range(3)]
 
 
 def _look_up_bilinear(
@@ -770,17 +833,7 @@ def _look_up_bilinear(
     upper = mi.UInt32(y)
     y_fraction = y - dr.floor(y)
     lower = dr.minimum(upper + 1, n_rows - 1)
-    if wraps:
-        x = dr.select(x < 0.0, x + mi.Float(n_columns), x)
-    else:
-        x = dr.clip(x, 0.0, mi.Float(n_columns) - 1.0)
-    left = mi.UInt32(x)
-    x_fraction = x - dr.floor(x)
-    if wraps:
-        right = (left + 1) % n_columns
-        left = left % n_columns
-    else:
-        right = dr.minimum(left + 1, n_columns - 1)
+    left, right, x_fraction = _find_neighbor_columns(x, n_columns, wraps)
 
     def look_up_row(row: Any) -> Any:
         row_start = first_cell + row * n_columns
@@ -790,6 +843,21 @@ def _look_up_bilinear(
         )
 
     return look_up_row(upper) * (1.0 - y_fraction) + look_up_row(lower) * y_fraction
+
+
+def _find_neighbor_columns(x: Any, n_columns: Any, wraps: bool) -> tuple[Any, Any, Any]:
+    """Return the columns to the left and right of positions, and the fraction between.
+
+    The arguments are those of `_look_up_bilinear`.
+    """
+    if wraps:
+        x = dr.select(x < 0.0, x + mi.Float(n_columns), x)
+        left = mi.UInt32(x)
+        return left % n_columns, (left + 1) % n_columns, x - dr.floor(x)
+    # beyond the border the cells at the border count
+    x = dr.clip(x, 0.0, mi.Float(n_columns) - 1.0)
+    left = mi.UInt32(x)
+    return left, dr.minimum(left + 1, n_columns - 1), x - dr.floor(x)
 
 
 def _compute_wideness(core: Any, tail: Any) -> Any:
@@ -854,9 +922,7 @@ def _look_up_blurred(
         widths: root mean square angles of the maps, radians.
     """
     n_rows, n_columns = lit.blurred_shape
-    level = dr.clip(
-        dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0
-    )
+    level = _compute_blur_level(spread, widths)
     # at most the last but one, so that there is a next map
     lower_level = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
     x, y = texel_rays.compute_map_position(direction, to_local)
@@ -878,3 +944,12 @@ def _look_up_blurred(
     narrow = look_up_level(lower_level)
     wide = look_up_level(lower_level + 1)  # if there is one width, it counts 0
     return narrow + (level - mi.Float(lower_level)) * (wide - narrow)
+
+
+def _compute_blur_level(spread: Any, widths: Sequence[float]) -> Any:
+    """Return the index of the blurred map for a spread, with a fraction between maps.
+
+    The arguments are those of `_look_up_blurred`.
+    """
+    level = dr.log2(dr.maximum(spread, 1e-4) / widths[0])
+    return dr.clip(level, 0.0, len(widths) - 1.0)

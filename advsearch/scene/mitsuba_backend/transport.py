@@ -296,9 +296,7 @@ def _fetch_paths(
     n_samples = size[0] * size[1] * spp
     has_weight = _find_weighted_samples(vertices, n_samples)
     dr.eval(channels, vertices, has_weight)  # one kernel for the whole path
-    means = [dr.block_sum(channel, spp) / spp for channel in channels]
-    dr.eval(means)
-    image = torch.stack([mean.torch() for mean in means], dim=1).reshape(*size, -1)
+    image = _average_samples(channels, size, spp)
     radiance, coverage, background, albedo, normal = torch.split(
         image, [3, 1, 3, 3, 3], dim=-1
     )
@@ -313,6 +311,17 @@ def _fetch_paths(
             for vertex, mask in zip(vertices, has_weight, strict=True)
         ],
     )
+
+
+def _average_samples(channels: list[Any], size: tuple[int, int], spp: int) -> Tensor:
+    """Return the mean (H, W, channels) of each pixel's samples.
+
+    The arguments are those of `_fetch_paths`.
+    """
+    means = [dr.block_sum(channel, spp) / spp for channel in channels]
+    dr.eval(means)
+    stacked = torch.stack([mean.torch() for mean in means], dim=1)
+    return stacked.reshape(*size, -1)
 
 
 def _fetch_vertices(
@@ -331,10 +340,7 @@ def _fetch_vertices(
     """
     sample: Any = dr.compress(mask)
     if dr.width(sample) == 0:
-        empty = torch.zeros(0)
-        return PathVertices(
-            empty.long(), empty.reshape(0, 2), empty.reshape(0, 3), empty.bool()
-        )
+        return _make_no_vertices()
     uv = dr.gather(mi.Point2f, uv, sample)
     weight = dr.gather(mi.Color3f, weight, sample) / spp
     pixel = sample // spp  # the samples of a pixel follow one another
@@ -345,6 +351,14 @@ def _fetch_vertices(
         torch.stack([axis.torch() for axis in uv], dim=1),
         torch.stack([channel.torch() for channel in weight], dim=1),
         is_sharp.torch().bool(),
+    )
+
+
+def _make_no_vertices() -> PathVertices:
+    """Return vertices of no path."""
+    empty = torch.zeros(0)
+    return PathVertices(
+        empty.long(), empty.reshape(0, 2), empty.reshape(0, 3), empty.bool()
     )
 
 
@@ -517,10 +531,7 @@ def _trace_paths(
         # only one more segment.
         n_bounces = segment + 1
         if roulette_depth <= n_bounces < depth - 1:
-            survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
-            active &= noise.next_1d(active) < survival
-            bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
-            throughput = throughput * bounce.next_weight
+            active, throughput = _play_roulette(bounce, throughput, noise, active)
         is_sharp = is_sharp & is_delta
         prev_si = si
         prev_pdf = bounce.bsdf_sample.pdf
@@ -528,6 +539,27 @@ def _trace_paths(
         ray = si.spawn_ray(si.to_world(bounce.bsdf_sample.wo))
     images = [coverage, *background, *first_hit.albedo, *first_hit.normal]
     return images, emitted, bounces
+
+
+def _play_roulette(
+    bounce: Bounce, throughput: Any, noise: Any, active: Any
+) -> tuple[Any, Any]:
+    """Play Russian roulette after a bounce, and set the bounce's `next_weight`.
+
+    Args:
+        bounce: the bounce.
+        throughput: throughput of the path after it.
+        noise: the sampler.
+        active: lanes whose path goes on so far.
+
+    Returns:
+        The lanes whose path goes on, and the throughput.
+    """
+    survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
+    active &= noise.next_1d(active) < survival
+    bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
+    throughput = throughput * bounce.next_weight
+    return active, throughput
 
 
 def _eval_emission(
