@@ -123,19 +123,40 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     height, width = levels.shape[:2]
     crop = (0, 0, width, height)
     if part:
-        left, top, crop_width, crop_height = map(int, part["numbers"].split(","))
-        crop = (left, top, crop_width, crop_height)
-        if left + crop_width > width or top + crop_height > height:
-            raise InputError(
-                f"backdrop: {text} leaves the photograph, which has {width} x {height} "
-                "pixels (width x height); give a part inside it"
-            )
+        crop = _parse_crop(part["numbers"], text, (height, width))
+    _check_crop_size(crop, path)
+    return make_backdrop(levels, text, crop)
+
+
+def _parse_crop(
+    numbers: str, spec: str, size: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of the part of a photograph that is used.
+
+    Args:
+        numbers: these numbers, as the user gives them.
+        spec: the photograph with its part, for errors.
+        size: height and width of the photograph in pixels.
+
+    Raises InputError: the part leaves the photograph.
+    """
+    height, width = size
+    left, top, crop_width, crop_height = map(int, numbers.split(","))
+    if left + crop_width > width or top + crop_height > height:
+        raise InputError(
+            f"backdrop: {spec} leaves the photograph, which has {width} x {height} "
+            "pixels (width x height); give a part inside it"
+        )
+    return left, top, crop_width, crop_height
+
+
+def _check_crop_size(crop: tuple[int, int, int, int], path: Path) -> None:
+    """Raise InputError if the part of a photograph that is used is too small."""
     if min(crop[2:]) < MIN_SIDE:
         raise InputError(
             f"backdrop: expected at least {MIN_SIDE} x {MIN_SIDE} pixels of "
             f"{path}, got {crop[2]} x {crop[3]}; take another photograph"
         )
-    return make_backdrop(levels, text, crop)
 
 
 def find_photograph_file(photograph: object) -> Path | None:
@@ -241,20 +262,12 @@ def make_image_inputs(
     if photograph is None:
         return {}
     color = photograph.resample(resolution)
-    # Blur and noise are measured in the photograph, unless the user has set them.
-    blur = description.values.get("backdrop.blur")
-    if blur is None:
-        luminance = (color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32)
-        blur = measure_blur(luminance)
+    blur = _find_blur(description, color)
     noise_setting = description.values.get("backdrop.noise")
     noise = photograph.make_noise(resolution, noise_setting)
     depth = photograph.resample_depth(resolution)
-    if depth is not None and description.object.size_in_metres is None:
-        raise InputError(
-            f"occluder: {photograph.front_spec} is in metres, and the size of "
-            f"{description.object.name} is not known; give its longest side in "
-            "metres, such as `size=0.1`"
-        )
+    if depth is not None:
+        _check_has_size(description, photograph)
     inputs: dict[str, Tensor | None] = {
         "backdrop.color": color,
         "backdrop.plane": compute_plane_radiance(description),
@@ -264,6 +277,28 @@ def make_image_inputs(
         "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
     }
     return {name: value for name, value in inputs.items() if value is not None}
+
+
+def _find_blur(description: SceneData, color: Tensor) -> float:
+    """Return the blur of a photograph in pixels: as the user has set it, or measured.
+
+    `color` (H, W, 3) is the photograph at the size of the image.
+    """
+    blur = description.values.get("backdrop.blur")
+    if blur is None:
+        luminance = (color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32)
+        blur = measure_blur(luminance)
+    return blur
+
+
+def _check_has_size(description: SceneData, photograph: BackdropPhotograph) -> None:
+    """Raise InputError if the size of the object in meters is not known."""
+    if description.object.size_in_metres is None:
+        raise InputError(
+            f"occluder: {photograph.front_spec} is in metres, and the size of "
+            f"{description.object.name} is not known; give its longest side in "
+            "metres, such as `size=0.1`"
+        )
 
 
 def compose_over_photograph(
@@ -312,17 +347,27 @@ def compose_over_photograph(
     if not has_coat:
         return radiance + shade * behind
 
-    # The reflection of the environment in the coat was rendered for the fraction of the
-    # pixel that the object does not cover: the division makes it that of a full pixel.
-    environment_in_coat = rendered[..., channels.ENVIRONMENT_IN_COAT] / (
-        1.0 - rendered_coverage
-    ).clamp_min(1e-3)
-    # The photograph contains this reflection, at most all of its light.
-    reflection = torch.minimum(environment_in_coat, behind)
     # A shadow darkens only the matt ground. `shade` has also darkened the reflection,
-    # and what it has lost is added again.
-    lost_reflection = (uncovered - shade) * reflection
+    # and
+    # what it has lost is added again.
+    lost_reflection = (uncovered - shade) * _compute_coat_reflection(rendered, behind)
     return radiance + (shade * behind + lost_reflection + coat_change).clamp_min(0.0)
+
+
+def _compute_coat_reflection(rendered: Tensor, behind: Tensor) -> Tensor:
+    """Return the reflection (H, W, 3) of the environment that a photograph contains.
+
+    It was rendered for the fraction of the pixel that the object does not cover: the
+    division makes it that of a full pixel. It is at most all light of the photograph.
+
+    Args:
+        rendered: (H, W, 13) rendered image.
+        behind: (H, W, 3) radiance of the photograph.
+    """
+    uncovered = (1.0 - rendered[..., channels.COVERAGE]).clamp_min(1e-3)
+    return torch.minimum(
+        rendered[..., channels.ENVIRONMENT_IN_COAT] / uncovered, behind
+    )
 
 
 def compute_front(
@@ -345,11 +390,7 @@ def compute_front(
         (H, W, 2) float32 in [0, 1]: fraction of the object, and of the ground.
     """
     is_hidden = photograph_depth < surfaces.z_depth * (1.0 - DEPTH_TOLERANCE)
-    is_ground = torch.zeros_like(is_hidden)
-    if GROUND in surfaces.shape_names:
-        is_ground = surfaces.visible_mask(GROUND)
-    is_object = surfaces.z_depth.isfinite() & ~is_ground
-    is_covered = torch.stack([is_object, is_ground])  # (2, H n, W n)
+    is_covered = _find_covered_points(surfaces)
 
     # Fractions (2, H, W) of each pixel, for object and ground. Pooled once more they
     # are means of the pixels around; their padding cancels in the quotient below.
@@ -364,6 +405,15 @@ def compute_front(
     hidden_nearby = torch.where(is_in_pixel, hidden, hidden_around)
     front: Tensor = (hidden_nearby / covered_nearby.clamp_min(1e-12)).movedim(0, -1)
     return front
+
+
+def _find_covered_points(surfaces: Surfaces) -> Tensor:
+    """Return the points (2, H, W) of an image that object and ground cover."""
+    is_ground = torch.zeros_like(surfaces.z_depth, dtype=torch.bool)
+    if GROUND in surfaces.shape_names:
+        is_ground = surfaces.visible_mask(GROUND)
+    is_object = surfaces.z_depth.isfinite() & ~is_ground
+    return torch.stack([is_object, is_ground])
 
 
 def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
@@ -429,6 +479,16 @@ def compute_photograph_gain(
     irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
     if not irradiance > 0.0:
         return 1.0
+    mean_luminance = _measure_mean_luminance(photograph)
+    # a matt surface has the radiance reflectance * irradiance / pi
+    return mean_luminance * math.pi / (GREY_CARD * irradiance)
+
+
+def _measure_mean_luminance(photograph: BackdropPhotograph) -> float:
+    """Return the mean linear luminance of a photograph, at least 1e-3.
+
+    So a black photograph does not make a factor 0.
+    """
     # how many pixels have each of the 256 levels
     histograms = [
         np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
@@ -438,10 +498,7 @@ def compute_photograph_gain(
     channel_means = np.array(
         [np.average(decoded, weights=histogram) for histogram in histograms]
     )
-    # at least 1e-3, so that a black photograph does not make the factor 0
-    mean_luminance = max(float(channel_means @ LUMINANCE), 1e-3)
-    # a matt surface has the radiance reflectance * irradiance / pi
-    return mean_luminance * math.pi / (GREY_CARD * irradiance)
+    return max(float(channel_means @ LUMINANCE), 1e-3)
 
 
 def compute_level_irradiance(description: SceneData) -> Float64Array:
@@ -597,18 +654,7 @@ def make_matrix_camera(
         InputError: it is not of the form [[fx, skew, cx], [0, fy, cy], [0, 0, 1]].
     """
     matrix = np.asarray(camera_matrix, np.float64)
-    is_camera_matrix = (
-        matrix.shape == (3, 3)
-        and bool(np.isfinite(matrix).all())
-        and matrix[1, 0] == 0.0
-        and matrix[2].tolist() == [0.0, 0.0, 1.0]
-        and min(matrix[0, 0], matrix[1, 1]) > 0.0
-    )
-    if not is_camera_matrix:
-        raise InputError(
-            "camera_matrix: expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in "
-            f"pixels, got {matrix.tolist()}"
-        )
+    _check_camera_matrix(matrix)
     height, width = size
     # In the order of `LINEAR_PARAMETERS`: fx, fy, cx, cy and skew, lengths along x as
     # fractions of the width, those along y of the height. Half a pixel is added to the
@@ -624,6 +670,22 @@ def make_matrix_camera(
     n_coefficients = len(NUMBER_NAMES) - len(LINEAR_PARAMETERS)
     numbers = (*map(float, linear), *[0.0] * n_coefficients)
     return CameraModel(BROWN_CONRADY, numbers, PHOTOGRAPH_CAMERA, size)
+
+
+def _check_camera_matrix(matrix: Float64Array) -> None:
+    """Raise InputError if an array is no intrinsic matrix of OpenCV."""
+    is_camera_matrix = (
+        matrix.shape == (3, 3)
+        and bool(np.isfinite(matrix).all())
+        and matrix[1, 0] == 0.0
+        and matrix[2].tolist() == [0.0, 0.0, 1.0]
+        and min(matrix[0, 0], matrix[1, 1]) > 0.0
+    )
+    if not is_camera_matrix:
+        raise InputError(
+            "camera_matrix: expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in "
+            f"pixels, got {matrix.tolist()}"
+        )
 
 
 def fit_to_photograph(
@@ -654,18 +716,12 @@ def fit_to_photograph(
     full_aspect = full_width / full_height
     model = description.camera_model
     if model is not None:
-        # A bundled model, such as the fisheye, depends on the shape of the image: it is
-        # replaced by that for the full photograph. Other models stay.
-        bundled_models = make_bundled_models(full_aspect)
-        model = bundled_models.get(model.name, model)
+        model = _adapt_bundled_model(model, full_aspect)
         _check_camera_shape(photograph, model)
     uncropped = replace(description, camera_model=model)
     color_settings = measure_plane_color(uncropped, photograph, gain)
     if photograph.is_cropped:
-        if model is None:
-            fov = description.get_number("camera.fov")
-            model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
-        model = crop_camera(model, photograph)
+        model = _crop_camera_or_pinhole(description, photograph, model)
     film_height, film_width = resolution
     return replace(
         description,
@@ -673,6 +729,31 @@ def fit_to_photograph(
         camera_model=model,
         values={**description.values, **color_settings},
     )
+
+
+def _adapt_bundled_model(model: CameraModel, aspect: float) -> CameraModel:
+    """Return the model for the shape of a full photograph, width over height.
+
+    A bundled model, such as the fisheye, depends on the shape of the image: it is
+    replaced. Other models stay.
+    """
+    bundled_models = make_bundled_models(aspect)
+    return bundled_models.get(model.name, model)
+
+
+def _crop_camera_or_pinhole(
+    description: SceneData, photograph: BackdropPhotograph, model: CameraModel | None
+) -> CameraModel:
+    """Return the camera that sees the used part of a photograph.
+
+    `model` is the camera of the full photograph; None is for the scene's pinhole.
+    """
+    if model is None:
+        full_height, full_width = photograph.full_size
+        fov = description.get_number("camera.fov")
+        pinhole = make_pinhole(fov, full_width / full_height)
+        model = replace(pinhole, name=PHOTOGRAPH_CAMERA)
+    return crop_camera(model, photograph)
 
 
 def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
@@ -723,23 +804,42 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
-    # the largest part of the film's shape, in the middle of the used part
+    part = _suggest_part(photograph, resolution)
+    fitting = _suggest_resolution(photograph, resolution)
+    raise InputError(
+        f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
+        f"and the rendered picture {film_width} x {film_height}, which is another "
+        f"shape; give a part of the photograph, such as {part}, or another "
+        f"`resolution`, such as {fitting}"
+    )
+
+
+def _suggest_part(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> str:
+    """Return the largest part of a photograph with a film's shape, as users give it.
+
+    It is in the middle of the used part.
+    """
+    height, width = photograph.size
+    film_height, film_width = resolution
     scale = min(width / film_width, height / film_height)
     part_width = int(film_width * scale)
     part_height = int(film_height * scale)
     left = photograph.crop[0] + (width - part_width) // 2
     top = photograph.crop[1] + (height - part_height) // 2
     path = photograph.spec.partition("#")[0]
-    # the photograph's shape, with the larger side of the film; the setting `resolution`
-    # is height x width, while this message has width x height elsewhere
-    shrinking = max(film_width, film_height) / max(width, height)
-    fitting = f"{max(round(height * shrinking), 1)}x{max(round(width * shrinking), 1)}"
-    raise InputError(
-        f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
-        f"and the rendered picture {film_width} x {film_height}, which is another "
-        f"shape; give a part of the photograph, such as {path}#{left},{top},"
-        f"{part_width},{part_height}, or another `resolution`, such as {fitting}"
-    )
+    return f"{path}#{left},{top},{part_width},{part_height}"
+
+
+def _suggest_resolution(
+    photograph: BackdropPhotograph, resolution: tuple[int, int]
+) -> str:
+    """Return a resolution with a photograph's shape and the larger side of a film.
+
+    The setting `resolution` is height x width, while messages have width x height.
+    """
+    height, width = photograph.size
+    shrinking = max(resolution) / max(width, height)
+    return f"{max(round(height * shrinking), 1)}x{max(round(width * shrinking), 1)}"
 
 
 def _check_gloss(description: SceneData) -> None:
@@ -756,18 +856,21 @@ def _check_gloss(description: SceneData) -> None:
         )
     if not is_glossy or has_plane(description):
         return
-    # the first condition of `has_plane` that does not hold
-    is_lit = bool((compute_level_irradiance(description) > 0.0).all())
-    if description.get_number("ground.size") == 0.0:
-        reason = "ground.size is 0"
-    elif not is_lit:
-        reason = "no environment lights the scene"
-    else:
-        reason = "the camera is not above ground.level"
+    reason = _explain_missing_plane(description)
     raise InputError(
         f"`set` ground.gloss: {reason}, so that no plane reflects the object; change "
         "that, or leave ground.gloss out"
     )
+
+
+def _explain_missing_plane(description: SceneData) -> str:
+    """Return why a scene has no plane: the first condition that fails."""
+    is_lit = bool((compute_level_irradiance(description) > 0.0).all())
+    if description.get_number("ground.size") == 0.0:
+        return "ground.size is 0"
+    if not is_lit:
+        return "no environment lights the scene"
+    return "the camera is not above ground.level"
 
 
 def _check_camera_shape(photograph: BackdropPhotograph, model: CameraModel) -> None:
@@ -829,9 +932,8 @@ def compute_view_settings(
     if distance <= 0.0:
         raise InputError("object_to_camera: puts the object behind the camera")
     object_up = mesh_to_camera[:3, 2]  # z axis of the mesh in camera coordinates
-    world_axes = _make_world_axes(
-        object_up if up is None else np.asarray(up, np.float64)
-    )
+    world_up = object_up if up is None else np.asarray(up, np.float64)
+    world_axes = _make_world_axes(world_up)
     rotation = world_axes @ mesh_to_camera[:3, :3]
     # shift of the object's center from the point that the camera orbits, in the world
     orbit_center = np.array([0.0, 0.0, distance])
@@ -839,8 +941,7 @@ def compute_view_settings(
     # The orbited point is at the height `middle[2]`: the mesh stands on the height 0,
     # and that is the height of its center.
     center_height = float(offset[2] + middle[2])
-    rotated_vertices = (vertices - middle) @ rotation.T  # relative to the center
-    lowest = center_height + float(rotated_vertices[:, 2].min())
+    lowest = center_height + _measure_lowest(vertices - middle, rotation)
     return {
         **_compute_orbit(world_axes),
         # in meters; `_check_and_map` has checked that the size is known
@@ -853,6 +954,12 @@ def compute_view_settings(
         "pose.z": lowest,
         "ground.level": lowest,
     }
+
+
+def _measure_lowest(vertices: Float64Array, rotation: Float64Array) -> float:
+    """Return the smallest height of vertices (V, 3) under a rotation (3, 3)."""
+    rotated_vertices = vertices @ rotation.T
+    return float(rotated_vertices[:, 2].min())
 
 
 def _check_and_map(asset: ObjectAsset, object_to_camera: npt.ArrayLike) -> Float64Array:
@@ -911,23 +1018,36 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     right, _down, ahead = world_axes.T
     outwards = -ahead
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
+    _check_elevation(elevation)
+    return {
+        "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
+        "camera.elevation": elevation,
+        "camera.roll": _compute_roll(-right, outwards),
+    }
+
+
+def _check_elevation(elevation: float) -> None:
+    """Raise InputError if a camera looks straight up or down; degrees from level."""
     if abs(elevation) > MAX_ELEVATION:
         raise InputError(
             "object_to_camera: the camera looks straight up or down, more than "
             f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
             "the object; give another `up`"
         )
+
+
+def _compute_roll(left: Float64Array, outwards: Float64Array) -> float:
+    """Return the roll of a camera in degrees.
+
+    Args:
+        left: (3,) the camera's own left in the world's axes.
+        outwards: (3,) direction from the object to the camera.
+    """
     # directions to the left and up of a camera without roll, in the world's axes
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
     upright = np.cross(-outwards, level_left)
-    # The roll is the angle from there to the camera's own left.
-    left = -right
-    return {
-        "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
-        "camera.elevation": elevation,
-        "camera.roll": math.degrees(math.atan2(left @ upright, left @ level_left)),
-    }
+    return math.degrees(math.atan2(left @ upright, left @ level_left))
 
 
 def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
@@ -936,7 +1056,17 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
     Raises InputError: it is not rigid, that is a rotation and a translation alone.
     """
     matrix = np.asarray(pose, np.float64)
-    is_rigid = (
+    if not _is_rigid(matrix):
+        raise InputError(
+            "object_to_camera: expected a rotation and a translation as a (4, 4) "
+            f"matrix, got {matrix.tolist()}"
+        )
+    return matrix
+
+
+def _is_rigid(matrix: Float64Array) -> bool:
+    """Return whether a matrix is a pose (4, 4): a rotation and a translation alone."""
+    return bool(
         matrix.shape == (4, 4)
         and bool(np.isfinite(matrix).all())
         and matrix[3].tolist() == [0.0, 0.0, 0.0, 1.0]
@@ -944,12 +1074,6 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
         <= ROTATION_TOLERANCE
         and np.linalg.det(matrix[:3, :3]) > 0.0
     )
-    if not is_rigid:
-        raise InputError(
-            "object_to_camera: expected a rotation and a translation as a (4, 4) "
-            f"matrix, got {matrix.tolist()}"
-        )
-    return matrix
 
 
 def _make_world_axes(up: Float64Array) -> Float64Array:

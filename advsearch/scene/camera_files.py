@@ -15,7 +15,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
@@ -218,20 +218,37 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
         if isinstance(entry, dict) and "intrinsics" in entry
     }
     if cameras:
-        other_entries = {
-            name: entry for name, entry in data.items() if name not in cameras
-        }
-        camera = CameraEntries(path, select_camera(path, camera_name, cameras))
-        unread_outside = CameraEntries(path, other_entries).find_unread()
-        return _read_kalibr(spec, camera, unread_outside)
+        return _read_kalibr_chain(spec, data, cameras)
+    _check_no_camera_name(path, camera_name)
+    if "intrinsics" in data and "camera_model" in data:
+        return _read_kalibr(spec, CameraEntries(path, data))
+    return _read_opencv(spec, CameraEntries(path, _flatten_groups(data)))
+
+
+def _read_kalibr_chain(
+    spec: str, data: Mapping[str, Any], cameras: Mapping[str, Any]
+) -> CameraModel:
+    """Return the model of one of the cameras in a file of Kalibr.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        data: all entries of the file.
+        cameras: those of them that are cameras, by name.
+    """
+    path, _, camera_name = spec.partition("#")
+    other_entries = {name: entry for name, entry in data.items() if name not in cameras}
+    camera = CameraEntries(path, select_camera(path, camera_name, cameras))
+    unread_outside = CameraEntries(path, other_entries).find_unread()
+    return _read_kalibr(spec, camera, unread_outside)
+
+
+def _check_no_camera_name(path: str, camera_name: str) -> None:
+    """Raise FileFormatError if a user names a camera in a file of a single one."""
     if camera_name:
         raise FileFormatError(
             f"{path}: expected several cameras, as {camera_name!r} is requested, got "
             f"one; leave #{camera_name} out"
         )
-    if "intrinsics" in data and "camera_model" in data:
-        return _read_kalibr(spec, CameraEntries(path, data))
-    return _read_opencv(spec, CameraEntries(path, _flatten_groups(data)))
 
 
 def read_camera_entries(path: str) -> dict[str, Any]:
@@ -292,22 +309,34 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
     """
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
-    if path.lower().endswith(".json"):
-        data = parse_text(path, text, "JSON", parse_json)
-    else:
-        # OpenCV's YAML begins with a directive, and has tags, that are not standard.
-        text = re.sub(r"\A%YAML[^\n]*\n", "", text)
-        text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
-        # only the first document
-        text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
-        data = parse_text(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
+    is_json = path.lower().endswith(".json")
+    data = (
+        parse_text(path, text, "JSON", parse_json)
+        if is_json
+        else _parse_yaml(path, text)
+    )
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
-        got = "an empty file" if data is None else f"a {type(data).__name__}"
-        raise FileFormatError(
-            f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, "
-            f"got {got}; docs/cameras.md shows one of each"
-        )
+        _reject_content(path, data)
     return data
+
+
+def _parse_yaml(path: str, text: str) -> Any:
+    """Parse the first document of a YAML file, also of OpenCV's kind."""
+    # OpenCV's YAML begins with a directive, and has tags, that are not standard.
+    text = re.sub(r"\A%YAML[^\n]*\n", "", text)
+    text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
+    # only the first document
+    text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
+    return parse_text(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
+
+
+def _reject_content(path: str, data: object) -> NoReturn:
+    """Raise FileFormatError for a file that is no mapping of names."""
+    got = "an empty file" if data is None else f"a {type(data).__name__}"
+    raise FileFormatError(
+        f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, "
+        f"got {got}; docs/cameras.md shows one of each"
+    )
 
 
 def _parse_xml(path: str, text: str) -> dict[str, Any]:
@@ -319,6 +348,12 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
     Raises FileFormatError: it is no XML of these two, or declares entities, by which a
     small file could become very large.
     """
+    root = _parse_xml_root(path, text)
+    return {element.tag: _convert_element(element) for element in root}
+
+
+def _parse_xml_root(path: str, text: str) -> ElementTree.Element:
+    """Return the root of a camera in XML; the errors are those of `_parse_xml`."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise FileFormatError(
             f"{path}: declares a document type or entities, which no camera needs; "
@@ -331,15 +366,16 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
             f"{path}: expected a camera of OpenCV in <opencv_storage>, got "
             f"<{root.tag[:40]}>; docs/cameras.md has the formats that are read"
         )
-    entries = dict[str, Any]()
-    for element in root:
-        inner = {entry.tag: (entry.text or "").strip() for entry in element}
-        matrix = element.findtext("data")
-        if matrix is not None:
-            entries[element.tag] = matrix.split()
-        else:
-            entries[element.tag] = inner or (element.text or "").strip()
-    return entries
+    return root
+
+
+def _convert_element(element: ElementTree.Element) -> object:
+    """Return the words of a matrix, the entries of a group, or a text."""
+    inner = {entry.tag: (entry.text or "").strip() for entry in element}
+    matrix = element.findtext("data")
+    if matrix is not None:
+        return matrix.split()
+    return inner or (element.text or "").strip()
 
 
 # ---- Formats ----
@@ -360,36 +396,60 @@ def _read_colmap(
         lines: the lines of the file that are neither blank nor comments.
     """
     words_by_id = {line.split()[0]: line.split() for line in lines}
+    _check_lines_differ(path, words_by_id, lines)
+    _, name, *values = select_camera(path, camera_name, words_by_id)
+    _check_colmap_model(path, name)
+    kind, parameters = COLMAP_MODELS[name]
+    numbers = _parse_colmap_numbers(path, name, parameters, values)
+    size = (numbers.pop("height"), numbers.pop("width"))
+    if "f" in numbers:
+        numbers["fy"] = numbers["fx"] = numbers.pop("f")
+    # Without a pixel offset: COLMAP measures from the corner of the image.
+    return make_camera_model(spec, kind, size, numbers)
+
+
+def _check_lines_differ(
+    path: str, words_by_id: Mapping[str, list[str]], lines: Sequence[str]
+) -> None:
+    """Raise FileFormatError if two lines of COLMAP are of one camera."""
     if len(words_by_id) < len(lines):
         raise FileFormatError(
             f"{path}: expected each camera once, got one with the same number twice; "
             "correct the file"
         )
-    _, name, *values = select_camera(path, camera_name, words_by_id)
+
+
+def _check_colmap_model(path: str, name: str) -> None:
+    """Raise FileFormatError if a name is not that of a model of COLMAP that is read."""
     if name not in COLMAP_MODELS:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP_MODELS)}, got "
             f"{name[:40]}, which is another projection; calibrate with one of these "
             "(colmap model_converter cannot convert it), or undistort the pictures"
         )
-    kind, parameters = COLMAP_MODELS[name]
+
+
+def _parse_colmap_numbers(
+    path: str, name: str, parameters: str, values: Sequence[str]
+) -> dict[str, float]:
+    """Return the numbers of a line of COLMAP by name, with the width and the height.
+
+    Args:
+        path: the file, for messages.
+        name: name of the model.
+        parameters: names of the model's numbers, separated by blanks.
+        values: the numbers of the line.
+    """
     keys = ["width", "height", *parameters.split()]
     if len(values) != len(keys):
         raise FileFormatError(
             f"{path}: {name}: expected {' '.join(keys)}, got {len(values)} numbers; "
             "correct the line"
         )
-    numbers = {
+    return {
         key: parse_number(path, key, value)
         for key, value in zip(keys, values, strict=True)
     }
-    size = (numbers.pop("height"), numbers.pop("width"))
-    if "f" in numbers:
-        focal_length = numbers.pop("f")
-        numbers["fy"] = focal_length
-        numbers["fx"] = focal_length
-    # Without a pixel offset: COLMAP measures from the corner of the image.
-    return make_camera_model(spec, kind, size, numbers)
 
 
 def _read_nerfstudio(
@@ -417,10 +477,9 @@ def _read_nerfstudio(
     numbers = _read_focal_lengths(path, data, entries, width, height)
     numbers["cx"] = entries.get_number("cx", width / 2.0)
     numbers["cy"] = entries.get_number("cy", height / 2.0)
-    if kind == FISHEYE:
-        numbers |= _read_optional_numbers(entries, COEFFICIENTS[:4])
-    else:
-        numbers |= _read_optional_numbers(entries, ("k1", "k2", "k3", "p1", "p2"))
+    is_fisheye = kind == FISHEYE
+    names = COEFFICIENTS[:4] if is_fisheye else ("k1", "k2", "k3", "p1", "p2")
+    numbers |= _read_optional_numbers(entries, names)
     model = make_camera_model(spec, kind, (height, width), numbers)
     unread = entries.find_unread()
     frame_entries = CameraEntries(path, _select_other_entries(frames))
@@ -564,6 +623,20 @@ def _read_kalibr(
     """
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
+    _check_kalibr_model(path, model)
+    kind = _find_kind(path, entries.get("distortionmodel"))
+    intrinsics = entries.parse_numbers("intrinsics", entries.get("intrinsics"), (4,))
+    names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
+    resolution = entries.require("resolution")
+    width, height = entries.parse_numbers("resolution", resolution, (2,))
+    numbers = _read_distortion(entries, names, (0, 4))
+    numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
+    camera = make_camera_model(spec, kind, (height, width), numbers, FIRST_PIXEL_CENTER)
+    return add_notes(camera, [*unread, *entries.find_unread()])
+
+
+def _check_kalibr_model(path: str, model: str) -> None:
+    """Raise FileFormatError if a camera model of Kalibr is no pinhole."""
     if model != "pinhole":
         advice = (
             describe_projection(model)
@@ -573,16 +646,6 @@ def _read_kalibr(
             f"{path}: expected the camera_model pinhole of Kalibr, got {model[:40]}"
             f"{advice}"
         )
-    kind = _find_kind(path, entries.get("distortionmodel"))
-    intrinsics = entries.parse_numbers("intrinsics", entries.get("intrinsics"), (4,))
-    names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
-    width, height = entries.parse_numbers(
-        "resolution", entries.require("resolution"), (2,)
-    )
-    numbers = _read_distortion(entries, names, (0, 4))
-    numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
-    camera = make_camera_model(spec, kind, (height, width), numbers, FIRST_PIXEL_CENTER)
-    return add_notes(camera, [*unread, *entries.find_unread()])
 
 
 def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
@@ -652,19 +715,8 @@ def _read_camera_matrix(path: str, entries: CameraEntries) -> list[float]:
     Raises:
         FileFormatError: it is missing, all zeros, or no camera matrix.
     """
-    if entries.get(*CAMERA_MATRIX_KEYS) is None and entries.get("fx") is not None:
-        fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
-        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    else:
-        matrix = entries.parse_numbers(
-            "camera_matrix", entries.require("camera_matrix", CAMERA_MATRIX_KEYS), (9,)
-        )
-    if not any(matrix):
-        raise FileFormatError(
-            f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
-            "which ROS writes for a camera that is not calibrated; calibrate it, and "
-            "use the file that this writes"
-        )
+    matrix = _read_matrix_numbers(entries)
+    _check_is_calibrated(path, matrix)
     # A camera matrix is fx, skew, cx, 0, fy, cy, 0, 0, 1. Open3D and ARKit write it by
     # columns: fx, 0, 0, skew, fy, 0, cx, cy, 1.
     lacks_center_in_rows = not (matrix[1] or matrix[2] or matrix[5])
@@ -672,12 +724,36 @@ def _read_camera_matrix(path: str, entries: CameraEntries) -> list[float]:
     is_by_columns = lacks_center_in_rows and has_center_in_last_row
     if is_by_columns:
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
+    _check_matrix_zeros(path, matrix)
+    return matrix
+
+
+def _read_matrix_numbers(entries: CameraEntries) -> list[float]:
+    """Return the nine numbers of a camera matrix, in the order of the file."""
+    if entries.get(*CAMERA_MATRIX_KEYS) is None and entries.get("fx") is not None:
+        fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
+        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    matrix = entries.require("camera_matrix", CAMERA_MATRIX_KEYS)
+    return entries.parse_numbers("camera_matrix", matrix, (9,))
+
+
+def _check_is_calibrated(path: str, matrix: Sequence[float]) -> None:
+    """Raise FileFormatError for a camera matrix of zeros."""
+    if not any(matrix):
+        raise FileFormatError(
+            f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
+            "which ROS writes for a camera that is not calibrated; calibrate it, and "
+            "use the file that this writes"
+        )
+
+
+def _check_matrix_zeros(path: str, matrix: Sequence[float]) -> None:
+    """Raise FileFormatError if a matrix, row by row, is not that of a camera."""
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(
             f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got "
             "other numbers"
         )
-    return matrix
 
 
 def _name_matrix_entries(matrix: Sequence[float]) -> dict[str, float]:
@@ -710,6 +786,14 @@ def _read_distortion(
         values = entries.parse_numbers("distortion_coefficients", distortion, counts)
         # The list may have fewer coefficients than there are names.
         coefficients = dict(zip(names, values, strict=False))
+    _check_stated_distortion(entries, coefficients)
+    return coefficients
+
+
+def _check_stated_distortion(
+    entries: CameraEntries, coefficients: Mapping[str, float]
+) -> None:
+    """Raise FileFormatError for coefficients of a model that is "none"."""
     model = entries.get("distortionmodel")
     is_undistorted = isinstance(model, str) and model.strip().lower() == "none"
     if is_undistorted and any(coefficients.values()):
@@ -717,7 +801,6 @@ def _read_distortion(
             f"{entries.path}: expected no distortion, as its distortion_model is none, "
             "got coefficients"
         )
-    return coefficients
 
 
 def _read_opencv_distortion(entries: CameraEntries, kind: str) -> dict[str, float]:
@@ -767,12 +850,17 @@ def _find_rectified(entries: CameraEntries, matrix: Sequence[float]) -> list[str
         if has_no_effect(value):  # missing, or all zeros
             continue
         numbers = entries.parse_numbers(name, value, (len(expected),))
-        if any(
-            abs(a - b) > 1e-6 * max(1.0, abs(b))
-            for a, b in zip(numbers, expected, strict=True)
-        ):
+        if _differ(numbers, expected):
             differing_names.append(name)
     return differing_names
+
+
+def _differ(numbers: Sequence[float], expected: Sequence[float]) -> bool:
+    """Return whether numbers differ from expected ones by more than rounding."""
+    return any(
+        abs(a - b) > 1e-6 * max(1.0, abs(b))
+        for a, b in zip(numbers, expected, strict=True)
+    )
 
 
 def _check_roi(entries: CameraEntries, size: tuple[float, float]) -> list[str]:

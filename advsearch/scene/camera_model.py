@@ -264,16 +264,12 @@ class CameraModel:
             The solutions (N,), and which of them have converged.
         """
 
-        def distort_to_column(radii: Tensor) -> Tensor:
-            """Return distorted radii as (N, 1), for `_evaluate_with_jacobian`."""
-            return self._distort_radius(radii)[..., None]
-
         lower = torch.zeros_like(target)
         upper = torch.full_like(target, self._find_upper_bound(target, max_value))
         radius = torch.minimum(target, upper)
         for _ in range(MAX_STEPS):
             # one derivative (N,), since the values have one column
-            values, (slope,) = _evaluate_with_jacobian(distort_to_column, radius)
+            values, (slope,) = _evaluate_with_jacobian(self._distort_to_column, radius)
             residual = values[..., 0] - target
             is_solved = (residual.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
             if bool(is_solved.all()):
@@ -288,6 +284,10 @@ class CameraModel:
         # other. Its residual may be larger, hence the factor of 1e3. The tolerance is
         # absolute for small targets and relative for large ones.
         return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
+
+    def _distort_to_column(self, radii: Tensor) -> Tensor:
+        """Return distorted radii as (N, 1), for `_evaluate_with_jacobian`."""
+        return self._distort_radius(radii)[..., None]
 
     def _find_upper_bound(self, target: Tensor, max_value: float) -> float:
         """Return a common upper bound of the solutions of `_invert_radial`.
@@ -339,13 +339,7 @@ class CameraModel:
             )
             if bool(converged.all()):
                 break
-            updated = undistorted - step
-            radius = updated.norm(dim=-1, keepdim=True)
-            # 1 inside the circle, and less outside, so that points move onto the circle
-            shrinking = max_radius / radius.clamp_min(max_radius)
-            updated = torch.where(
-                torch.isfinite(radius), updated * shrinking, undistorted
-            )
+            updated = _step_within(undistorted, step, max_radius)
             undistorted = torch.where(converged[..., None], undistorted, updated)
         return undistorted, converged
 
@@ -443,23 +437,22 @@ class CameraModel:
         of the size remain.
         """
         edges = self._compute_edge_tangents()
-        # 17 points on each side of the rectangle
-        grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
-        ones = torch.ones_like(grid)
-        x = torch.cat([grid, grid, ones, -ones])
-        y = torch.cat([ones, -ones, grid, grid])
-        border = torch.stack([x, y], dim=-1) * torch.tensor(edges, dtype=torch.float64)
+        border = _make_rectangle_border(edges)
         for fraction in torch.linspace(1.0, 0.02, 50).tolist():  # 1, 0.98, ..., 0.02
             points = torch.cat(
                 [fraction * border, torch.ones_like(border[:, :1])], dim=-1
             )
-            coordinates, is_visible = self.project(points)
-            # a point on the image's border may be outside by rounding
-            is_in_image = (coordinates >= -1e-6) & (coordinates <= 1.0 + 1e-6)
-            if bool((is_visible & is_in_image.all(dim=-1)).all()):
+            if self._is_all_visible(points):
                 break
         # If no step has all of the border in the image, this is the last fraction.
         return fraction * edges[0], fraction * edges[1]
+
+    def _is_all_visible(self, points: Tensor) -> bool:
+        """Return whether all points (N, 3) are in the image."""
+        coordinates, is_visible = self.project(points)
+        # a point on the image's border may be outside by rounding
+        is_in_image = (coordinates >= -1e-6) & (coordinates <= 1.0 + 1e-6)
+        return bool((is_visible & is_in_image.all(dim=-1)).all())
 
     def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
@@ -557,6 +550,28 @@ class CameraModel:
             f"height): its focal lengths and its principal point are scaled to {width} "
             f"x {height}{stretch_text}.",
         )
+
+
+def _step_within(points: Tensor, step: Tensor, max_radius: float) -> Tensor:
+    """Return points (N, 2) minus steps, cut at a circle around 0.
+
+    A step that is not finite is not taken.
+    """
+    updated = points - step
+    radius = updated.norm(dim=-1, keepdim=True)
+    # 1 inside the circle, and less outside, so that points move onto the circle
+    shrinking = max_radius / radius.clamp_min(max_radius)
+    return torch.where(torch.isfinite(radius), updated * shrinking, points)
+
+
+def _make_rectangle_border(half_sides: list[float]) -> Tensor:
+    """Return points (N, 2) on the border of a rectangle around 0, 17 on each side."""
+    grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
+    ones = torch.ones_like(grid)
+    x = torch.cat([grid, grid, ones, -ones])
+    y = torch.cat([ones, -ones, grid, grid])
+    border = torch.stack([x, y], dim=-1)
+    return border * torch.tensor(half_sides, dtype=torch.float64)
 
 
 def make_pinhole(fov: float, aspect: float) -> CameraModel:

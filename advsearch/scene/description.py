@@ -6,7 +6,7 @@ It also has what there is to say of the scene. `load_description` reads one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -41,7 +41,7 @@ from advsearch.scene.camera_entries import (
     CameraPreset,
 )
 from advsearch.scene.camera_files import read_camera
-from advsearch.scene.camera_model import make_bundled_models
+from advsearch.scene.camera_model import CameraModel, make_bundled_models
 from advsearch.scene.formation import (
     CARD_DISPLAY_VALUE,
     CARD_REFLECTANCE,
@@ -73,7 +73,7 @@ from advsearch.scene.parts import (
 )
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
-from advsearch.scene.rig import AXES, PhotographCameras, read_rig
+from advsearch.scene.rig import AXES, PhotographCameras, RigCamera, read_rig
 from advsearch.scene.scene_data import NO_ENVIRONMENT as NO_ENVIRONMENT
 from advsearch.scene.scene_data import OBJECT as OBJECT
 from advsearch.scene.scene_data import SceneData
@@ -199,6 +199,21 @@ class SceneDescription(SceneData):
         Raises InputError: the user requests a ground other than the plane, several
         cameras (a rig), or drops on the lens.
         """
+        self._check_plane_settings(photograph)
+        if self.rig:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `camera={self.rig_spec}` contradict "
+                "each other: a photograph was taken by one camera; name one of them, "
+                f"{self.rig_spec}#NAME"
+            )
+        if self.get_number("camera.drops") > 0.0:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
+                "other: drops would show the photograph; leave one of the two out"
+            )
+
+    def _check_plane_settings(self, photograph: BackdropPhotograph) -> None:
+        """Raise InputError if the user requests another ground than a photograph's."""
         other_grounds = sorted(
             name
             for name in self.requested - PLANE_SETTINGS
@@ -210,17 +225,6 @@ class SceneDescription(SceneData):
                 "each other: the ground of a photograph is a plane that takes the "
                 f"shadow, with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the "
                 "two out"
-            )
-        if self.rig:
-            raise InputError(
-                f"`backdrop={photograph.spec}` and `camera={self.rig_spec}` contradict "
-                "each other: a photograph was taken by one camera; name one of them, "
-                f"{self.rig_spec}#NAME"
-            )
-        if self.get_number("camera.drops") > 0.0:
-            raise InputError(
-                f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
-                "other: drops would show the photograph; leave one of the two out"
             )
 
     def with_measured_view(
@@ -281,11 +285,7 @@ class SceneDescription(SceneData):
                 around the object was requested.
         """
         spec = photograph_cameras.path
-        if self.object.size_in_metres is None:
-            raise InputError(
-                f"`camera={spec}` is in metres, and the size of {self.object.name} is "
-                "not known; give its longest side in metres, such as `size=0.1`"
-            )
+        self._check_size_for_meters(spec)
         with track_opened_files(photograph):
             pose, model = photograph_cameras.find_pose_and_model(photograph)
         # The file's pose is for other camera axes. `AXES` maps ours (left, up, ahead)
@@ -294,18 +294,20 @@ class SceneDescription(SceneData):
         # from meters to object sizes
         to_world[:3, 3] /= self.object.size_in_metres
         model.check_no_fov(self.requested)  # the lens has a field of view of its own
-        # Focal lengths are in widths and heights of the image, so that half a side's
-        # angle has the tangent 0.5 / focal. The field of view is along the larger side.
-        tangents = (
-            0.5 / model.intrinsic_by_name["fx"],
-            0.5 / model.intrinsic_by_name["fy"],
-        )
-        fov = 2.0 * math.degrees(math.atan(max(tangents)))
+        fov = _compute_fov_of_lens(model)
         # The pose becomes a camera of the scene, and is selected; `with_camera` also
         # checks the settings. Then it gets its lens, which `with_camera` has removed.
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}
         scene = replace(self, cameras=cameras).with_camera(spec)
         return replace(scene, camera_model=replace(model, name=spec))
+
+    def _check_size_for_meters(self, spec: str) -> None:
+        """Raise InputError if the object has no size for a camera file in metres."""
+        if self.object.size_in_metres is None:
+            raise InputError(
+                f"`camera={spec}` is in metres, and the size of {self.object.name} is "
+                "not known; give its longest side in metres, such as `size=0.1`"
+            )
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
@@ -335,6 +337,12 @@ class SceneDescription(SceneData):
         is_lens = camera not in (ORBIT_CAMERA, *self.cameras)
         if is_lens:
             return scene._with_lens(camera)
+        if camera != ORBIT_CAMERA:
+            self._check_no_orbit_settings(camera)
+        return replace(scene, camera=camera)
+
+    def _check_no_orbit_settings(self, camera: str) -> None:
+        """Raise InputError if settings are requested that a camera has itself."""
         # The exposure is allowed with any camera. The others are those of the camera
         # around the object.
         camera_settings = sorted(
@@ -342,13 +350,12 @@ class SceneDescription(SceneData):
             for name in self.requested
             if name.startswith("camera.") and name != "camera.exposure"
         )
-        if camera != ORBIT_CAMERA and camera_settings:
+        if camera_settings:
             raise InputError(
                 f"`camera={camera}` and `set` {camera_settings[0]} contradict each "
                 "other: the camera of the file has a place and a field of view of its "
                 "own; leave one of the two out"
             )
-        return replace(scene, camera=camera)
 
     def _with_lens(self, camera: str) -> SceneDescription:
         """Return the scene with the lens of a camera file or a bundled camera model.
@@ -364,23 +371,13 @@ class SceneDescription(SceneData):
             InputError: a field of view was requested, and the lens has its own.
             UnknownNameError: there is no such model.
         """
-        if not is_path(camera) and camera not in make_bundled_models():
-            known = (ORBIT_CAMERA, *self.cameras, *make_bundled_models(), *PRESETS)
-            raise UnknownNameError(
-                "camera",
-                camera,
-                known,
-                "Or give the path of a camera file, such as calib.yaml.",
-            )
+        self._check_lens_exists(camera)
         scene = self
         # empty for a bundled model, and for a file with one camera
         rig = read_rig(camera) if is_path(camera) else ()
         if rig:
-            first_camera = rig[0]
-            model = first_camera.camera_model
-            scene = replace(scene, rig=rig, rig_spec=camera)
-            if first_camera.fov is not None:
-                scene = scene.with_values(camera__fov=first_camera.fov)
+            model = rig[0].camera_model
+            scene = self._with_rig(rig, camera)
         elif is_path(camera):
             with track_opened_files(camera.partition("#")[0]):
                 model = read_camera(camera)
@@ -390,6 +387,23 @@ class SceneDescription(SceneData):
         if model is not None:
             model.check_no_fov(self.requested)
         return replace(scene, camera_model=model)
+
+    def _check_lens_exists(self, camera: str) -> None:
+        """Raise UnknownNameError if there is no file and no bundled model of a name."""
+        if not is_path(camera) and camera not in make_bundled_models():
+            known = (ORBIT_CAMERA, *self.cameras, *make_bundled_models(), *PRESETS)
+            raise UnknownNameError(
+                "camera",
+                camera,
+                known,
+                "Or give the path of a camera file, such as calib.yaml.",
+            )
+
+    def _with_rig(self, rig: Sequence[RigCamera], spec: str) -> SceneDescription:
+        """Return the scene with several cameras, of the file `spec`."""
+        scene = replace(self, rig=rig, rig_spec=spec)
+        fov = rig[0].fov
+        return scene if fov is None else scene.with_values(camera__fov=fov)
 
     def _with_mounted_camera(self, name: str) -> SceneDescription:
         """Return the scene as a mounted camera sees it, by its name in `PRESETS`.
@@ -402,12 +416,7 @@ class SceneDescription(SceneData):
         Raises InputError: the object's size in metres is not known.
         """
         preset = PRESETS[name]
-        if self.object.size_in_metres is None:
-            raise InputError(
-                f"`camera={name}` is {preset.height:g} m high, and the "
-                f"size of {self.object.name} is not known; give its longest side in "
-                "metres, such as `size=0.1`"
-            )
+        self._check_size_for_preset(name, preset)
         preset_values = {
             setting: value
             for setting, value in self._make_preset_values(preset).items()
@@ -419,13 +428,28 @@ class SceneDescription(SceneData):
         )
         if "camera.distance" in self.requested:
             return scene
-        fov = torch.tensor(scene.get_number("camera.fov"), dtype=torch.float64)
+        return scene._with_preset_distance(preset)
+
+    def _check_size_for_preset(self, name: str, preset: CameraPreset) -> None:
+        """Raise InputError if the object has no size for a camera at a height in
+        meters.
+        """
+        if self.object.size_in_metres is None:
+            raise InputError(
+                f"`camera={name}` is {preset.height:g} m high, and the "
+                f"size of {self.object.name} is not known; give its longest side in "
+                "metres, such as `size=0.1`"
+            )
+
+    def _with_preset_distance(self, preset: CameraPreset) -> SceneDescription:
+        """Return the scene with a mounted camera at its distance, or farther away."""
+        fov = torch.tensor(self.get_number("camera.fov"), dtype=torch.float64)
         # the distance from which the object fits into the image, in object sizes
         framing_distance = float(
-            geometry.compute_framing_distance(scene, fov, scene.aspect)
+            geometry.compute_framing_distance(self, fov, self.aspect)
         )
-        distance = max(preset.distance, framing_distance * scene.size_in_metres)
-        return scene.with_values(camera__distance=distance)
+        distance = max(preset.distance, framing_distance * self.size_in_metres)
+        return self.with_values(camera__distance=distance)
 
     def _make_preset_values(self, preset: CameraPreset) -> dict[str, float]:
         """Return the settings of a mounted camera by name, except for its distance.
@@ -434,12 +458,7 @@ class SceneDescription(SceneData):
         ground stands on a table: then this ground is the table top, with the size of a
         table, and the floor is `TABLE_HEIGHT` below it.
         """
-        is_on_plain_ground = (
-            self.get_number("ground.size") > 0.0
-            and self.photograph is None
-            and not is_paved(self)
-        )
-        is_on_table = is_on_plain_ground and self.size_in_metres <= MAX_TABLETOP_SIZE
+        is_on_table = self._is_on_table()
         preset_values = {"camera.fov": preset.fov}
         # A requested elevation takes the place of the height: only one can be set.
         if "camera.elevation" not in self.requested:
@@ -454,6 +473,15 @@ class SceneDescription(SceneData):
         if is_on_table:
             preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres
         return preset_values
+
+    def _is_on_table(self) -> bool:
+        """Return whether the object is so small that its plain ground is a table."""
+        is_on_plain_ground = (
+            self.get_number("ground.size") > 0.0
+            and self.photograph is None
+            and not is_paved(self)
+        )
+        return is_on_plain_ground and self.size_in_metres <= MAX_TABLETOP_SIZE
 
     @property
     def things(self) -> Mapping[str, ThingPart]:
@@ -528,25 +556,28 @@ class SceneDescription(SceneData):
             has_user_size=self.size is not None,
             needs_metres=is_paved(self),
         )
-        front = self.object.front
-        front_remarks: tuple[str, ...] = ()
-        stands_on_road = self.is_in_lane or has_lanes(self)
-        if front is not None and stands_on_road:
-            # how the front was found, which matters on a road
-            front_remarks = (front.reason,)
-        traffic_remarks: tuple[str, ...] = ()
-        if self._drives_against_traffic:
-            traffic_remarks = (make_traffic_remark(self),)
         notes = (
             *self.object.notes,
-            *front_remarks,
+            *self._front_remarks,
             *size_remarks,
             *light_notes,
             *camera_notes,
-            *traffic_remarks,
+            *self._traffic_remarks,
             *self.remarks,
         )
         return tuple(dict.fromkeys(note for note in notes if note))
+
+    @property
+    def _front_remarks(self) -> tuple[str, ...]:
+        """How the object's front was found, which matters on a road."""
+        front = self.object.front
+        stands_on_road = self.is_in_lane or has_lanes(self)
+        return () if front is None or not stands_on_road else (front.reason,)
+
+    @property
+    def _traffic_remarks(self) -> tuple[str, ...]:
+        """A remark if the object drives against the traffic."""
+        return (make_traffic_remark(self),) if self._drives_against_traffic else ()
 
     @property
     def _drives_against_traffic(self) -> bool:
@@ -617,15 +648,8 @@ class SceneDescription(SceneData):
         requested: dict[str, float | str] = {}
         for name in self.requested & self.values.keys():
             value = self.values[name]
-            if value is None:
-                continue
-            setting = settings.find_parameter(name)
-            is_choice = setting is not None and bool(setting.options)
-            if setting is not None and is_choice:
-                option_index = int(value)
-                requested[name] = setting.options[option_index]
-            else:
-                requested[name] = value
+            if value is not None:
+                requested[name] = _to_user_value(name, value)
         return requested
 
     @property
@@ -662,6 +686,25 @@ class SceneDescription(SceneData):
                 "one of the avenue, or leave camera.ev out, and exposure is metered"
             )
         return unit / (1.2 * math.pow(2.0, exposure_value))
+
+
+def _compute_fov_of_lens(model: CameraModel) -> float:
+    """Return the field of view of a lens along the larger side, in degrees."""
+    # Focal lengths are in widths and heights of the image, so that half a side's angle
+    # has the tangent 0.5 / focal. The field of view is along the larger side.
+    tangents = (
+        0.5 / model.intrinsic_by_name["fx"],
+        0.5 / model.intrinsic_by_name["fy"],
+    )
+    return 2.0 * math.degrees(math.atan(max(tangents)))
+
+
+def _to_user_value(name: str, value: float) -> float | str:
+    """Return the value of a setting as users write it: of a choice the option."""
+    setting = settings.find_parameter(name)
+    if setting is None or not setting.options:
+        return value
+    return setting.options[int(value)]
 
 
 def load_description(
@@ -717,14 +760,7 @@ def load_description(
     # what stands around the object has a ground of its own
     if source.is_scene and not {"ground.size", "ground.kind"} & set(setting_values):
         values["ground.size"] = 0.0
-    requested = set(setting_values)
-    if environment_spec is not None:
-        requested.add(ENVIRONMENT)
-    camera = ORBIT_CAMERA
-    # A Mitsuba scene is seen by its first camera, if it has one and settings describe
-    # no other.
-    if is_mitsuba and not _describes_orbit(setting_values):
-        camera = next(iter(imported.cameras), ORBIT_CAMERA)
+    camera = _choose_camera(imported, setting_values, is_mitsuba=is_mitsuba)
     described = SceneDescription(
         object=imported.object,
         environment=_load_environment(lit_by),
@@ -735,21 +771,55 @@ def load_description(
         facing=facing,
         size=size,
         unit=unit,
-        requested=frozenset(requested),
+        requested=_list_requested(setting_values, environment_spec),
         parts=imported.surroundings,
         cameras=imported.cameras,
         camera=camera,
         # The light of a Mitsuba scene counts as it is, without metering.
         metered=not is_mitsuba,
     )
-    # Things stand on the ground, and lamps are carried by things.
-    described = with_requested_ground(described)
-    described = add_things(described, things, _load_thing)
-    described = add_solid_remarks(described)
-    described = add_lamps(described)
+    described = _add_surroundings(described, things)
     check_mesh_names(described, values)
     _check_material_settings(described.object, setting_values)
     return described
+
+
+def _choose_camera(
+    imported: ImportedScene,
+    setting_values: settings.SettingValues,
+    *,
+    is_mitsuba: bool,
+) -> str:
+    """Return the name of the camera that sees a scene.
+
+    A Mitsuba scene is seen by its first camera, if it has one and settings describe no
+    other.
+    """
+    if is_mitsuba and not _describes_orbit(setting_values):
+        return next(iter(imported.cameras), ORBIT_CAMERA)
+    return ORBIT_CAMERA
+
+
+def _list_requested(
+    setting_values: settings.SettingValues,
+    environment_spec: str | Path | EnvironmentAsset | None,
+) -> frozenset[str]:
+    """Return the names of what the user requests: settings, and an environment."""
+    environment_names = () if environment_spec is None else (ENVIRONMENT,)
+    return frozenset((*setting_values, *environment_names))
+
+
+def _add_surroundings(
+    described: SceneDescription, things: str | None
+) -> SceneDescription:
+    """Return a scene with its ground, the things next to the object, and lamps.
+
+    Things stand on the ground, and lamps are carried by things.
+    """
+    described = with_requested_ground(described)
+    described = add_things(described, things, _load_thing)
+    described = add_solid_remarks(described)
+    return add_lamps(described)
 
 
 class _Source(NamedTuple):
@@ -1010,6 +1080,12 @@ def _load_object(
             known_up = "z"
         with track_opened_files(spec):
             return import_object(Path(spec), up=known_up, facing=facing)
+    _check_bundled_axes(spec, up, facing)
+    return library.load_object(str(spec))
+
+
+def _check_bundled_axes(spec: str | Path, up: str | None, facing: str | None) -> None:
+    """Raise InputError if axes of a bundled object are given."""
     if up is not None:
         raise InputError(
             "up: bundled objects stand upright already; leave `up` out, or give a "
@@ -1020,7 +1096,6 @@ def _load_object(
             f"facing: {spec} is bundled and faces +x; leave `facing` out, "
             "or turn it: `set` pose.yaw"
         )
-    return library.load_object(str(spec))
 
 
 def is_path(spec: str | Path) -> bool:
