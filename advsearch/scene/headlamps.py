@@ -163,17 +163,7 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     other_parts = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
-    # "off", "low" or "high" beam of each car
-    kind_by_carrier = {
-        OBJECT: get_lamp_kind(scene, "object.lamps"),
-        CAMERA: get_lamp_kind(scene, "camera.lamps"),
-    }
-    for part in other_parts:
-        if isinstance(part, ThingPart):
-            kind_by_carrier[part.name] = part.lamps
-    kind_by_lit_carrier = {
-        carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS_OFF
-    }
+    kind_by_lit_carrier = _find_lit_carriers(scene, other_parts)
     if not kind_by_lit_carrier:
         had_lamps = len(other_parts) < len(scene.parts)
         return replace(scene, parts=other_parts) if had_lamps else scene
@@ -187,13 +177,40 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
         lamps += _make_lamps(scene, carrier, kind, radiance_unit, weight)
+    _check_lamp_names(other_parts, lamps)
+    return replace(scene, parts=(*other_parts, *lamps))
+
+
+def _find_lit_carriers(
+    scene: SceneData, other_parts: Sequence[ScenePart]
+) -> dict[str, str]:
+    """Return the beam, "low" or "high", of each car whose lamps are on, by its name.
+
+    `other_parts` are all parts but lamps.
+    """
+    # "off", "low" or "high" beam of each car
+    kind_by_carrier = {
+        OBJECT: get_lamp_kind(scene, "object.lamps"),
+        CAMERA: get_lamp_kind(scene, "camera.lamps"),
+    }
+    for part in other_parts:
+        if isinstance(part, ThingPart):
+            kind_by_carrier[part.name] = part.lamps
+    return {
+        carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS_OFF
+    }
+
+
+def _check_lamp_names(
+    other_parts: Sequence[ScenePart], lamps: Sequence[ScenePart]
+) -> None:
+    """Raise InputError if another part has the name of a lamp."""
     duplicates = {part.name for part in other_parts} & {lamp.name for lamp in lamps}
     if duplicates:
         raise InputError(
             f"things: lamps of the scene are called {', '.join(sorted(duplicates))}; "
             "give yours another name="
         )
-    return replace(scene, parts=(*other_parts, *lamps))
 
 
 def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
@@ -261,20 +278,10 @@ def _make_lamps(
         front_power = HEADLAMP_CANDELA / radiance_unit * WHITE
         rear_power = TAILLAMP_CANDELA / radiance_unit * RED
         headlamp_glass = _make_glass(
-            part,
-            "headlamps",
-            facing=1.0,
-            units_per_metre=units_per_metre,
-            power=front_power,
+            part, "headlamps", 1.0, units_per_metre, front_power
         )
         yield headlamp_glass
-        yield _make_glass(
-            part,
-            "taillamps",
-            facing=-1.0,
-            units_per_metre=units_per_metre,
-            power=rear_power,
-        )
+        yield _make_glass(part, "taillamps", -1.0, units_per_metre, rear_power)
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
     yield from _make_beams(scene, carrier, kind, positions, radiance_unit, weight)
 
@@ -389,42 +396,63 @@ def _make_glass(
             straight ahead.
     """
     mesh = part.mesh
-    named_faces = [
-        faces
-        for name, faces in mesh.materials.items()
-        if MATERIAL_NAMES[lamp_type].search(name) and len(faces)
-    ]
-    if named_faces:
-        glass = _lift_faces(
-            mesh, np.concatenate(named_faces), GLASS_OFFSET * units_per_metre
-        )
-    else:
-        glass = _make_disks(mesh, lamp_type, facing, units_per_metre)
-    corners_in_metres = glass.vertices[glass.faces] / units_per_metre
-    # (F,) square meters of each face for a viewer straight ahead, below 0 if it faces
-    # the other way. An area vector is along the normal, with twice the area as length.
-    facing_area = facing * compute_area_vectors(corners_in_metres)[:, 0] / 2.0
-    glass_mesh = Mesh(
-        vertices=glass.vertices.astype(np.float32),
-        faces=glass.faces.astype(np.uint32),
-        normals=glass.normals.astype(np.float32),
-        uvs=mesh.uvs[glass.vertex_of_carrier],
-    )
+    glass = _shape_glass(mesh, lamp_type, facing, units_per_metre)
     # The base color has the light's color, with 0.8 as its largest channel: no surface
     # reflects all light.
     glass_color = (0.8 * power / power.max()).astype(np.float32)
-    # The visible area is that of both lamps, so that the power of one is doubled.
-    visible_area = float(facing_area.clip(0.0).sum())
-    radiance = 2.0 * power / max(visible_area, 1e-9)
+    radiance = 2.0 * power / _measure_visible_area(glass, facing, units_per_metre)
     return LampGlass(
         name=f"{part.name}-{lamp_type}",
-        mesh=glass_mesh,
+        mesh=_make_glass_mesh(glass, mesh),
         base_color=np.tile(glass_color, (2, 2, 1)),
         material=GLASS_MATERIAL,
         emission=radiance.astype(np.float32)[None, None],
         carrier=part.name,
         vertex_of_carrier=glass.vertex_of_carrier,
         face_of_carrier=glass.face_of_carrier,
+    )
+
+
+def _shape_glass(
+    mesh: Mesh, lamp_type: str, facing: float, units_per_metre: float
+) -> _Glass:
+    """Return the shape of the glass of a car's lamps; the arguments are
+    `_make_glass`'s.
+
+    `mesh` is that of the car.
+    """
+    named_faces = [
+        faces
+        for name, faces in mesh.materials.items()
+        if MATERIAL_NAMES[lamp_type].search(name) and len(faces)
+    ]
+    if not named_faces:
+        return _make_disks(mesh, lamp_type, facing, units_per_metre)
+    faces = np.concatenate(named_faces)
+    return _lift_faces(mesh, faces, GLASS_OFFSET * units_per_metre)
+
+
+def _measure_visible_area(
+    glass: _Glass, facing: float, units_per_metre: float
+) -> float:
+    """Return the area of glass, square meters, for a viewer straight ahead of it.
+
+    It is that of both lamps, and at least 1e-9.
+    """
+    corners_in_metres = glass.vertices[glass.faces] / units_per_metre
+    # (F,) square meters of each face for a viewer straight ahead, below 0 if it faces
+    # the other way. An area vector is along the normal, with twice the area as length.
+    facing_area = facing * compute_area_vectors(corners_in_metres)[:, 0] / 2.0
+    return max(float(facing_area.clip(0.0).sum()), 1e-9)
+
+
+def _make_glass_mesh(glass: _Glass, car_mesh: Mesh) -> Mesh:
+    """Return the mesh of glass, with texture coordinates of its car's mesh."""
+    return Mesh(
+        vertices=glass.vertices.astype(np.float32),
+        faces=glass.faces.astype(np.uint32),
+        normals=glass.normals.astype(np.float32),
+        uvs=car_mesh.uvs[glass.vertex_of_carrier],
     )
 
 

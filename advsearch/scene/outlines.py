@@ -105,6 +105,15 @@ def _compare_outline(
     outline = _rasterise_outline(corners)
     if not outline.covers(mask):
         return None, None
+    return _measure_outline(outline, mask)
+
+
+def _measure_outline(outline: _Outline, mask: BoolArray) -> tuple[float, bool]:
+    """Return which fraction of an outline is visible, and whether it leaves the image.
+
+    `mask` (H, W) are the visible pixels.
+    """
+    height, width = mask.shape
     row, column = np.nonzero(outline.cells)
     x = outline.left + (column + 0.5) * outline.step
     y = outline.top + (row + 0.5) * outline.step
@@ -147,10 +156,10 @@ def _project_faces(
     description = renderer.scene.description_and_filter[0]
     part = description.meshes[name]
     vertices = renderer.scene.input_assembler.get_vertices(name, inputs)
-    default_camera = torch.from_numpy(camera_to_world(description, width / height))
-    camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
-    # in the camera's coordinates: left, up and ahead
-    points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
+    camera = inputs.get("camera.to_world")
+    if camera is None:
+        camera = torch.from_numpy(camera_to_world(description, width / height))
+    points = _to_camera_points(vertices, camera)
     positions, is_before = project_points(
         description, _select_camera_inputs(inputs), points, size
     )
@@ -163,6 +172,12 @@ def _project_faces(
     # positions count from the center of the image
     center = (width / 2.0, height / 2.0)
     return np.asarray(positions.numpy()[faces.numpy()] + center)
+
+
+def _to_camera_points(vertices: Tensor, camera: Tensor) -> Tensor:
+    """Return vertices (V, 3) in the axes of a camera (4, 4): left, up and ahead."""
+    camera = camera.detach().double().cpu()
+    return (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
 
 
 @dataclass(frozen=True, eq=False)

@@ -450,6 +450,16 @@ def make_sphere(rows: int, columns: int) -> Mesh:
         [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)],
         axis=1,
     )
+    faces = _make_sphere_faces(rows, columns)
+    vertices, outwards, uvs = (
+        array.astype(np.float32)
+        for array in (0.5 * normals, normals, np.stack([u, v], axis=1))
+    )
+    return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)
+
+
+def _make_sphere_faces(rows: int, columns: int) -> IntArray:
+    """Return the faces (F, 3) of a sphere of cells, see `make_sphere`."""
     # the vertex at the lower left corner of each cell, and the one above it
     corner = (
         np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]
@@ -459,9 +469,4 @@ def make_sphere(rows: int, columns: int) -> Mesh:
     upper = np.stack([corner, above + 1, above], 1)
     # without the lower faces of the first row and the upper faces of the last one, two
     # of whose corners are at a pole
-    faces = np.concatenate([lower[columns:], upper[:-columns]])
-    vertices, outwards, uvs = (
-        array.astype(np.float32)
-        for array in (0.5 * normals, normals, np.stack([u, v], axis=1))
-    )
-    return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)
+    return np.concatenate([lower[columns:], upper[:-columns]])

@@ -11,7 +11,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -155,11 +155,7 @@ def read_photograph_folder(
     for path in _list_photographs(directory):
         file = find_camera_file(path)
         if file is None and not has_camera:
-            raise FileFormatError(
-                f"{path}: expected its camera file beside it, such as "
-                f"{path.with_suffix('.yaml').name}, got none; add it, remove the "
-                "photograph from the folder, or set `camera` for all of them"
-            )
+            _reject_without_camera(path)
         _check_inside(path, directory)
         if file is not None:
             _check_inside(file, directory)
@@ -174,6 +170,15 @@ def read_photograph_folder(
         _check_same_statements(view, first_view)
         views[path.name] = view
     return views
+
+
+def _reject_without_camera(path: Path) -> NoReturn:
+    """Raise FileFormatError for a photograph that has no camera file beside it."""
+    raise FileFormatError(
+        f"{path}: expected its camera file beside it, such as "
+        f"{path.with_suffix('.yaml').name}, got none; add it, remove the "
+        "photograph from the folder, or set `camera` for all of them"
+    )
 
 
 def _list_photographs(folder: Path) -> list[Path]:
@@ -238,22 +243,10 @@ def _parse_view(
     """
     stated = {name: entries[name] for name in VIEW_KEYS & entries.keys()}
     has_lens = bool(entries.keys() - VIEW_KEYS)  # all other entries are about the lens
-    pose = None
-    if "object_to_camera" in stated:
-        numbers = _parse_numbers(file, "object_to_camera", stated, (12, 16))
-        # The last row of a pose is always 0 0 0 1, and may be left out.
-        pose = np.eye(4)
-        n_rows = len(numbers) // 4
-        pose[:n_rows] = numbers.reshape(-1, 4)
+    pose = _parse_pose(file, stated) if "object_to_camera" in stated else None
     spec = str(photograph)
     if "part" in stated:
-        part = _parse_numbers(file, "part", stated, (4,))
-        spec += "#" + ",".join(f"{number:.0f}" for number in part.tolist())
-        if not CROP.fullmatch(spec):
-            raise FileFormatError(
-                f"{file}: part: expected X, Y, WIDTH, HEIGHT in pixels, got "
-                f"{stated['part']!s:.60}"
-            )
+        spec = _parse_part(file, spec, stated)
     return PhotographView(
         spec=spec,
         file=str(file),
@@ -263,6 +256,28 @@ def _parse_view(
         up=_parse_numbers(file, "up", stated, (3,)) if "up" in stated else None,
         occluder=_parse_occluder(file, stated),
     )
+
+
+def _parse_pose(file: Path, stated: Mapping[str, Any]) -> Float64Array:
+    """Return the pose (4, 4) of the object that a camera file states."""
+    numbers = _parse_numbers(file, "object_to_camera", stated, (12, 16))
+    # The last row of a pose is always 0 0 0 1, and may be left out.
+    pose = np.eye(4)
+    n_rows = len(numbers) // 4
+    pose[:n_rows] = numbers.reshape(-1, 4)
+    return pose
+
+
+def _parse_part(file: Path, photograph: str, stated: Mapping[str, Any]) -> str:
+    """Return the path of a photograph with the part of it that a camera file states."""
+    part = _parse_numbers(file, "part", stated, (4,))
+    spec = photograph + "#" + ",".join(f"{number:.0f}" for number in part.tolist())
+    if not CROP.fullmatch(spec):
+        raise FileFormatError(
+            f"{file}: part: expected X, Y, WIDTH, HEIGHT in pixels, got "
+            f"{stated['part']!s:.60}"
+        )
+    return spec
 
 
 def _parse_numbers(
@@ -281,20 +296,25 @@ def _parse_numbers(
             numbers.
     """
     value = stated[name]
-    if isinstance(value, Mapping):  # a matrix as OpenCV writes it
-        value = value.get("data")
-    if isinstance(value, str):
-        value = value.replace(",", " ").split()
-    try:
-        numbers = np.array(value, np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
+    numbers = _to_flat_numbers(value)
     if len(numbers) not in counts or not np.isfinite(numbers).all():
         expected = " or ".join(map(str, counts))
         raise FileFormatError(
             f"{file}: {name}: expected {expected} finite numbers, got {value!s:.60}"
         )
     return numbers
+
+
+def _to_flat_numbers(value: object) -> Float64Array:
+    """Return the numbers (N,) of an entry; none if it has other values."""
+    if isinstance(value, Mapping):  # a matrix as OpenCV writes it
+        value = value.get("data")
+    if isinstance(value, str):
+        value = value.replace(",", " ").split()
+    try:
+        return np.array(value, np.float64).reshape(-1)
+    except (TypeError, ValueError):
+        return np.empty(0)
 
 
 def _parse_settings(file: Path, stated: object) -> dict[str, float]:
@@ -362,27 +382,12 @@ def make_photograph_scene(
         FileFormatError: a file cannot be used.
         InputError: the entries contradict the scene.
     """
-    stated = {
-        name: value
-        for name, value in view.settings.items()
-        if name not in description.requested
-    }
-    # Controls (the parameters that a search varies) must not vary settings that the
-    # user requested. Settings of the file are protected like these, except for those of
-    # camera and pose.
-    fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
-    scene = replace(
-        description,
-        values={**description.values, **stated},
-        requested=description.requested | fixed,
-    )
+    scene = _apply_stated_settings(description, view.settings)
     requested_camera = camera or view.camera
     photograph = find_photograph_file(view.spec)  # `spec` is a path: never None here
     cameras = requested_camera
     if isinstance(requested_camera, str):
-        # A file may have the cameras of many photographs; otherwise it is one camera.
-        with track_opened_files(photograph or requested_camera):
-            cameras = read_photograph_cameras(requested_camera) or requested_camera
+        cameras = _read_cameras(requested_camera, photograph)
     if isinstance(cameras, str):
         scene = scene.with_camera(cameras)
     elif cameras is not None and photograph is not None:
@@ -390,8 +395,43 @@ def make_photograph_scene(
     scene = scene.with_backdrop(view.spec, occluder or view.occluder)
     if view.object_to_camera is None:
         return scene
+    return _apply_measured_pose(scene, view, view.object_to_camera)
+
+
+def _apply_stated_settings(
+    description: SceneDescription, settings: Mapping[str, float]
+) -> SceneDescription:
+    """Return a scene with the settings of a camera file that the user has not
+    requested.
+    """
+    stated = {
+        name: value
+        for name, value in settings.items()
+        if name not in description.requested
+    }
+    # Controls (the parameters that a search varies) must not vary settings that the
+    # user requested. Settings of the file are protected like these, except for those of
+    # camera and pose.
+    fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
+    return replace(
+        description,
+        values={**description.values, **stated},
+        requested=description.requested | fixed,
+    )
+
+
+def _read_cameras(spec: str, photograph: Path | None) -> str | PhotographCameras:
+    """Return the cameras of many photographs in a file, or the file of a single one."""
+    with track_opened_files(photograph or spec):
+        return read_photograph_cameras(spec) or spec
+
+
+def _apply_measured_pose(
+    scene: SceneDescription, view: PhotographView, object_to_camera: Float64Array
+) -> SceneDescription:
+    """Return a scene with the measured pose (4, 4) of the object in a photograph."""
     try:
-        measured = compute_view_settings(scene.object, view.object_to_camera, view.up)
+        measured = compute_view_settings(scene.object, object_to_camera, view.up)
     except InputError as error:
         raise InputError(f"{view.file}: {error}") from None
     measured_values = {

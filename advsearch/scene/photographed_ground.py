@@ -10,7 +10,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import EnvironmentAsset, Float32Array, Mesh
+from advsearch.scene.assets import (
+    EnvironmentAsset,
+    Float32Array,
+    Float64Array,
+    Mesh,
+)
 
 N_SECTORS = 128
 N_RINGS = 64
@@ -89,16 +94,7 @@ class PhotographedGround:
             [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
             axis=-1,
         )
-        # Rows of the map are counted at their centers: row 0 is straight up, and the
-        # last one straight down.
-        angle_from_up = math.pi - np.arctan(radius)
-        map_row = angle_from_up / math.pi * (self._map_rows - 1)
-        # Row 0 of the texture is `_horizon_row` of the map. v is 1 at the upper border
-        # of row 0, half a row above its center.
-        texture_row = map_row - self._horizon_row
-        n_texture_rows = self._map_rows - self._horizon_row
-        v = 1.0 - (texture_row + 0.5) / n_texture_rows
-        uvs = np.stack([map_column, v], axis=-1)
+        uvs = np.stack([map_column, self._compute_texture_v(radius)], axis=-1)
         normals = np.tile(
             np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
         )
@@ -108,6 +104,19 @@ class PhotographedGround:
             normals,
             uvs.reshape(-1, 2).astype(np.float32),
         )
+
+    def _compute_texture_v(self, radius: Float64Array) -> Float64Array:
+        """Return the texture coordinate v at radii, in heights of the camera."""
+        # Rows of the map are counted at their centers: row 0 is straight up, and the
+        # last one straight down.
+        angle_from_up = math.pi - np.arctan(radius)
+        map_row = angle_from_up / math.pi * (self._map_rows - 1)
+        # Row 0 of the texture is `_horizon_row` of the map. v is 1 at the upper border
+        # of row 0, half a row above its center.
+        texture_row = map_row - self._horizon_row
+        n_texture_rows = self._map_rows - self._horizon_row
+        v: Float64Array = 1.0 - (texture_row + 0.5) / n_texture_rows
+        return v
 
     def compute_reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
