@@ -501,10 +501,7 @@ class Motion:
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
         self._choose_ground_points(description)
-        # Points of the environment; none if the camera does not see it.
-        is_hidden = description.backdrop or description.environment is None
-        directions = _sample_sphere(0 if is_hidden else N_DIRECTIONS)
-        self._environment_points = directions * ENVIRONMENT_DISTANCE
+        self._environment_points = _sample_environment(description)
         # indices of the vertices of each mesh that are followed
         self._followed_vertices = {
             name: torch.from_numpy(_spread_indices(len(mesh.vertices), N_VERTICES))
@@ -632,6 +629,13 @@ class Motion:
             if bool((distances > 0.0).any()):
                 return float(distances.max()) / nudge
         return 0.0
+
+
+def _sample_environment(description: SceneDescription) -> Tensor:
+    """Return points (n, 3) of the environment; none if the camera does not see it."""
+    is_hidden = description.backdrop or description.environment is None
+    directions = _sample_sphere(0 if is_hidden else N_DIRECTIONS)
+    return directions * ENVIRONMENT_DISTANCE
 
 
 def _sample_square_edge(half_width: float) -> Tensor:

@@ -334,24 +334,35 @@ def compose_over_photograph(
     if "backdrop.plane" not in inputs:
         return radiance + uncovered * behind
 
-    # change of the plane relative to its radiance; 0 where the plane is covered
-    relative_change = rendered[..., channels.PLANE_CHANGE] / inputs["backdrop.plane"]
-    coat_change = rendered[..., channels.COAT_CHANGE]
-    if front is not None:
-        # The last channel of two is the plane's. With one, it holds for both.
-        visible_plane = 1.0 - front[..., -1:]
-        relative_change = visible_plane * relative_change
-        coat_change = visible_plane * coat_change
+    relative_change, coat_change = _compute_plane_changes(rendered, inputs)
     shade = (uncovered + relative_change).clamp_min(0.0)
     has_coat = coat_change.shape[-1] > 0
     if not has_coat:
         return radiance + shade * behind
 
     # A shadow darkens only the matt ground. `shade` has also darkened the reflection,
-    # and
-    # what it has lost is added again.
+    # and what it has lost is added again.
     lost_reflection = (uncovered - shade) * _compute_coat_reflection(rendered, behind)
     return radiance + (shade * behind + lost_reflection + coat_change).clamp_min(0.0)
+
+
+def _compute_plane_changes(
+    rendered: Tensor, inputs: Mapping[str, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return the visible changes of the plane, and of the light that its coat reflects.
+
+    The first (H, W, 3) is relative to the plane's radiance, and 0 where the plane is
+    covered. The second is radiance (H, W, 3), with no channels without a coat. The
+    arguments are those of `compose_over_photograph`.
+    """
+    relative_change = rendered[..., channels.PLANE_CHANGE] / inputs["backdrop.plane"]
+    coat_change = rendered[..., channels.COAT_CHANGE]
+    front = inputs.get("backdrop.front")
+    if front is None:
+        return relative_change, coat_change
+    # The last channel of two is the plane's. With one, it holds for both.
+    visible_plane = 1.0 - front[..., -1:]
+    return visible_plane * relative_change, visible_plane * coat_change
 
 
 def _compute_coat_reflection(rendered: Tensor, behind: Tensor) -> Tensor:

@@ -491,8 +491,25 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
     entries |= {"distortion_model": kind, "image_width": width, "image_height": height}
     if kind == "equirectangular":
         return entries
-    entries["camera_matrix"] = _make_metashape_matrix(value_by_name, width, height)
-    entries |= {"p1": value_by_name["p2"], "p2": value_by_name["p1"]}
+    return entries | _name_metashape_lens(path, kind, value_by_name, (width, height))
+
+
+def _name_metashape_lens(
+    path: str, kind: str, value_by_name: Mapping[str, float], size: tuple[float, float]
+) -> dict[str, Any]:
+    """Return the entries of the lens of a camera of Metashape, by OpenCV's names.
+
+    Args:
+        path: the file, for messages.
+        kind: kind of the model, which is no panorama.
+        value_by_name: Metashape's numbers.
+        size: width and height of the image in pixels.
+    """
+    entries: dict[str, Any] = {
+        "camera_matrix": _make_metashape_matrix(value_by_name, *size),
+        "p1": value_by_name["p2"],
+        "p2": value_by_name["p1"],
+    }
     if kind == "fisheye":
         entries["k4"] = value_by_name["k4"]
     else:

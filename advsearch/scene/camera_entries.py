@@ -343,12 +343,7 @@ def make_camera_model(
     path = spec.partition("#")[0]
     height, width = size
     _check_side_lengths(path, size)
-    if kind == EQUIRECTANGULAR:
-        pixel_values = _make_panorama_numbers(size)
-        pixel_offset = 0.0
-    value_by_name = {name: pixel_values.get(name, 0.0) for name in NUMBER_NAMES}
-    value_by_name["cx"] += pixel_offset
-    value_by_name["cy"] += pixel_offset
+    value_by_name = _complete_numbers(kind, size, pixel_values, pixel_offset)
     _check_numbers(path, value_by_name, width, height)
     numbers = tuple(
         number / _get_unit(name, size) for name, number in value_by_name.items()
@@ -359,6 +354,25 @@ def make_camera_model(
         name=spec,
         calibrated_shape=(int(height), int(width)),
     )
+
+
+def _complete_numbers(
+    kind: str,
+    size: tuple[float, float],
+    pixel_values: Mapping[str, float],
+    pixel_offset: float,
+) -> dict[str, float]:
+    """Return the numbers of a camera in pixels, by all `NUMBER_NAMES`.
+
+    The arguments are those of `make_camera_model`.
+    """
+    if kind == EQUIRECTANGULAR:
+        pixel_values = _make_panorama_numbers(size)
+        pixel_offset = 0.0
+    value_by_name = {name: pixel_values.get(name, 0.0) for name in NUMBER_NAMES}
+    value_by_name["cx"] += pixel_offset
+    value_by_name["cy"] += pixel_offset
+    return value_by_name
 
 
 def _check_side_lengths(path: str, size: tuple[float, float]) -> None:

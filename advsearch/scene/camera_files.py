@@ -473,17 +473,36 @@ def _read_nerfstudio(
     width = entries.get_number("w")
     height = entries.get_number("h")
     kind = _read_projection(path, entries)
+    numbers = _read_nerfstudio_numbers(data, entries, kind, (height, width))
+    model = make_camera_model(spec, kind, (height, width), numbers)
+    unread = entries.find_unread()
+    frame_entries = CameraEntries(path, _select_other_entries(frames))
+    return add_notes(model, [*unread, *frame_entries.find_unread("frames.")])
+
+
+def _read_nerfstudio_numbers(
+    data: Mapping[str, Any],
+    entries: CameraEntries,
+    kind: str,
+    size: tuple[float, float],
+) -> dict[str, float]:
+    """Return the numbers of a camera of nerfstudio in pixels, by name.
+
+    Args:
+        data: all entries of the file.
+        entries: entries of the camera.
+        kind: kind of its model.
+        size: height and width of the image in pixels.
+    """
+    height, width = size
     # The angles of view are among the `SCENE_KEYS`, so that `entries` lacks them.
-    numbers = _read_focal_lengths(path, data, entries, width, height)
+    numbers = _read_focal_lengths(entries.path, data, entries, width, height)
     numbers["cx"] = entries.get_number("cx", width / 2.0)
     numbers["cy"] = entries.get_number("cy", height / 2.0)
     is_fisheye = kind == FISHEYE
     names = COEFFICIENTS[:4] if is_fisheye else ("k1", "k2", "k3", "p1", "p2")
     numbers |= _read_optional_numbers(entries, names)
-    model = make_camera_model(spec, kind, (height, width), numbers)
-    unread = entries.find_unread()
-    frame_entries = CameraEntries(path, _select_other_entries(frames))
-    return add_notes(model, [*unread, *frame_entries.find_unread("frames.")])
+    return numbers
 
 
 def _list_frames(data: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -308,12 +308,22 @@ def _add_material(
         normals = encode_image(_to_bytes(shape.normal_map))
         material["normalTexture"] = _add_texture(document, buffer, normals)
     if shape.emission is not None:
-        strength = float(shape.emission.max())
-        relative = linear_to_srgb(shape.emission / np.float32(strength))
-        emission = encode_image(_to_bytes(relative))
-        texture = _add_texture(document, buffer, emission)
-        _set_emission(material, texture, strength)
+        _add_emission_texture(document, buffer, material, shape.emission, encode_image)
     return material
+
+
+def _add_emission_texture(
+    document: dict[str, Any],
+    buffer: GlbBuffer,
+    material: dict[str, Any],
+    emission: Float32Array,
+    encode_image: Callable[[ByteImage], bytes],
+) -> None:
+    """Add light (H, W, 3) to a material; the others are those of `_add_material`."""
+    strength = float(emission.max())
+    relative = linear_to_srgb(emission / np.float32(strength))
+    image = encode_image(_to_bytes(relative))
+    _set_emission(material, _add_texture(document, buffer, image), strength)
 
 
 def _set_emission(

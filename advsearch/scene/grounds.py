@@ -369,14 +369,7 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
     # The near part of the place is geometry, and the far part a picture, whose limits
     # the place's file states.
     if place is not None and picture is not None:
-        # a `Box`: from and to in x, and in y
-        nearest_things: Box = (*picture.x, *picture.y)
-        return Surroundings(
-            height=picture.height,
-            nearest_distance=nearest_things,
-            ground_extent=extent,
-            rotation=scene.get_number("environment.rotation"),
-        )
+        return _bound_picture(scene, picture, extent)
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
         return _bound_photographed_map(scene, extent)
     if not is_paved(scene):
@@ -384,6 +377,20 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
     # Any other map is taken for infinitely far: only the end of the ground counts.
     return Surroundings(
         height=math.inf, nearest_distance=math.inf, ground_extent=extent
+    )
+
+
+def _bound_picture(
+    scene: SceneData, picture: PictureEntry, extent: Box | float
+) -> Surroundings:
+    """Return the limits of a picture around a ground of an extent, metres."""
+    # a `Box`: from and to in x, and in y
+    nearest_things: Box = (*picture.x, *picture.y)
+    return Surroundings(
+        height=picture.height,
+        nearest_distance=nearest_things,
+        ground_extent=extent,
+        rotation=scene.get_number("environment.rotation"),
     )
 
 
@@ -441,10 +448,7 @@ def make_camera_view(
     forward = pose[:3, 2]
     half_height_angle = _compute_half_height_angle(scene, fov)
     azimuth = math.degrees(math.atan2(y, x))
-    # straight down counts as towards the object
-    view_azimuth = azimuth + 180.0
-    if math.hypot(forward[0], forward[1]) > 1e-6:
-        view_azimuth = math.degrees(math.atan2(forward[1], forward[0]))
+    view_azimuth = _compute_view_azimuth(forward, azimuth)
     # how far above the horizon the middle of the image is
     view_elevation = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
     # how far below the horizon the lower border of the image is
@@ -456,6 +460,16 @@ def make_camera_view(
         height=float(z),
         lower_angle=lower_angle,
     )
+
+
+def _compute_view_azimuth(forward: Float64Array, azimuth: float) -> float:
+    """Return the azimuth, degrees, in which a camera looks; `azimuth` is its own.
+
+    `forward` is its direction (3,). Straight down counts as towards the object.
+    """
+    if math.hypot(forward[0], forward[1]) > 1e-6:
+        return math.degrees(math.atan2(forward[1], forward[0]))
+    return azimuth + 180.0
 
 
 def _compute_half_height_angle(scene: SceneData, fov: float | None) -> float:

@@ -500,17 +500,36 @@ def _make_disks(
     center_z = lower[2] + min(
         height * units_per_metre, height_fraction * (upper[2] - lower[2])
     )
+    gap = GLASS_OFFSET * units_per_metre
     disks = list[Float64Array]()
     for side in (1.0, -1.0):
         center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
-        # The disk lies in the plane x = 0 until it is moved in front of the body.
         center = np.array([0.0, center_y, center_z])
-        disk_vertices = np.concatenate([[center], center + rim_offsets])
-        body_x = _find_foremost_x(corners, disk_vertices, default=upper[0])
-        # `facing` mirrors the disks of tail lamps back to the rear.
-        disk_vertices[:, 0] = facing * (body_x + GLASS_OFFSET * units_per_metre)
-        disks.append(disk_vertices)
+        disks.append(_make_disk(corners, center + rim_offsets, center, facing, gap))
     return _attach_disks(mesh, disks, facing)
+
+
+def _make_disk(
+    corners: Float64Array,
+    rim: Float64Array,
+    center: Float64Array,
+    facing: float,
+    gap: float,
+) -> Float64Array:
+    """Return the vertices of a disk in front of a car's body: its center, then its rim.
+
+    Args:
+        corners: (F, 3, 3) of the car's faces, mirrored for tail lamps.
+        rim, center: (N, 3) and (3,) points of the disk, at x = 0 until it is moved.
+        facing: 1 for lamps that shine along +x, -1 along -x.
+        gap: distance in front of the body.
+    """
+    disk_vertices = np.concatenate([[center], rim])
+    foremost = corners[..., 0].max()
+    body_x = _find_foremost_x(corners, disk_vertices, default=foremost)
+    # `facing` mirrors the disks of tail lamps back to the rear.
+    disk_vertices[:, 0] = facing * (body_x + gap)
+    return disk_vertices
 
 
 def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _Glass:

@@ -153,12 +153,7 @@ def read_photograph_folder(
     views: dict[str, PhotographView] = {}
     n_pixels = 0
     for path in _list_photographs(directory):
-        file = find_camera_file(path)
-        if file is None and not has_camera:
-            _reject_without_camera(path)
-        _check_inside(path, directory)
-        if file is not None:
-            _check_inside(file, directory)
+        _check_files(path, directory, has_camera=has_camera)
         with open_image(path, LARGEST_FILE) as image:
             n_pixels += image.width * image.height
         check_most(
@@ -170,6 +165,20 @@ def read_photograph_folder(
         _check_same_statements(view, first_view)
         views[path.name] = view
     return views
+
+
+def _check_files(path: Path, directory: Path, *, has_camera: bool) -> None:
+    """Check a photograph of a folder, and the camera file beside it.
+
+    Raises FileFormatError: one of them is a link that leads out of the folder, or
+    there is no camera file, and the user names no camera (`has_camera`).
+    """
+    file = find_camera_file(path)
+    if file is None and not has_camera:
+        _reject_without_camera(path)
+    _check_inside(path, directory)
+    if file is not None:
+        _check_inside(file, directory)
 
 
 def _reject_without_camera(path: Path) -> NoReturn:

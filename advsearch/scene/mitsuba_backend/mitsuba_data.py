@@ -114,12 +114,11 @@ def _find_numbers(
         if values is None:
             other_types[key] = f"a {type(value).__name__}"
             continue
-        estimators = _find_valid_estimators(scene.parameters.flags(key))
         numbers[key] = PluginNumber(
             key,
             values,
             input=input_of_key.get(key, ""),
-            valid=estimators,
+            valid=_find_valid_estimators(scene.parameters.flags(key)),
             # A Python float is a constant that Mitsuba compiles into its kernels.
             plain=isinstance(value, float),
         )

@@ -1051,9 +1051,26 @@ def _refract_through_drop(
     outside_direction = (
         WATER_IOR * inside_direction + (cos_outside - WATER_IOR * cos_inside) * normal
     )
+    transmitted = _compute_drop_transmittance(
+        direction.z, inside_direction.z, cos_inside, cos_outside
+    )
+    # A ray that leaves the cap towards the sheet does not reach the scene.
+    is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
+    return outside_direction, transmitted, is_lost
+
+
+def _compute_drop_transmittance(
+    cos_before: Any, cos_entered: Any, cos_inside: Any, cos_outside: Any
+) -> Any:
+    """Return the fraction of the light that passes both surfaces of a drop.
+
+    Args:
+        cos_before, cos_entered: cosines at the flat side, outside and inside.
+        cos_inside, cos_outside: cosines at the cap.
+    """
     transmitted = _compute_transmittance(
-        cos_incident=direction.z,
-        cos_refracted=inside_direction.z,
+        cos_incident=cos_before,
+        cos_refracted=cos_entered,
         ior_incident=1.0,
         ior_refracted=WATER_IOR,
     )
@@ -1063,9 +1080,7 @@ def _refract_through_drop(
         ior_incident=WATER_IOR,
         ior_refracted=1.0,
     )
-    # A ray that leaves the cap towards the sheet does not reach the scene.
-    is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
-    return outside_direction, transmitted, is_lost
+    return transmitted
 
 
 def _refract_into_water(direction: Any) -> Any:

@@ -88,12 +88,19 @@ def write_scene(
     for part in (description.meshes[OBJECT], *description.parts):
         _put_part(xml_scene, description, part, remaining_inputs)
     _put_all_inputs(xml_scene, scene, remaining_inputs)
-    meshes = {
+    meshes = _list_file_meshes(scene, inputs, xml_scene)
+    write_xml(path, xml_scene, meshes, note)
+
+
+def _list_file_meshes(
+    scene: MitsubaScene, inputs: Mapping[str, Tensor], xml_scene: Plugin
+) -> dict[str, Any]:
+    """Return Mitsuba's meshes with inputs set, by their entries in a dictionary."""
+    return {
         shape.id(): shape
         for shape in scene.set_inputs(inputs).shapes()
         if shape.is_mesh() and shape.id() in xml_scene
     }
-    write_xml(path, xml_scene, meshes, note)
 
 
 def _check_has_stock_lens(scene: MitsubaScene) -> None:
