@@ -624,8 +624,7 @@ class Motion:
             shifts = (new_positions - positions)[is_visible & still_visible]
             distances = shifts.norm(dim=1)
             # If no visible point has moved, all that moved may have left the frame.
-            # Then
-            # the next, smaller change is tried.
+            # Then the next, smaller change is tried.
             if bool((distances > 0.0).any()):
                 return float(distances.max()) / nudge
         return 0.0

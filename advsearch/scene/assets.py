@@ -423,7 +423,14 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
             break
     # The clusters and faces are those of the grid with which the loop has ended.
     distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
-    return _Simplifier(cluster_of, representative, distinct_faces).simplify
+    simplifier = _Simplifier(
+        cluster_of,
+        cluster_size=np.bincount(cluster_of),
+        cluster_of_new=cluster_of[representative],
+        representative=representative,
+        faces=distinct_faces,
+    )
+    return simplifier.simplify
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,6 +438,8 @@ class _Simplifier:
     """Simplifies meshes that have the same vertices elsewhere in the same manner."""
 
     cluster_of: IntArray  # (V,) cluster of each vertex
+    cluster_size: IntArray  # number of vertices in each cluster
+    cluster_of_new: IntArray  # (N,) cluster of each new vertex
     representative: IntArray  # (N,) for each new vertex an old one of its cluster
     faces: npt.NDArray[np.uint32]  # (F, 3) faces of new vertices
 
@@ -440,14 +449,12 @@ class _Simplifier:
         A new vertex is at the mean of its cluster's vertices, and has the normal and
         the texture coordinates of one of them.
         """
-        cluster_size = np.bincount(self.cluster_of)
         sums = [
             np.bincount(self.cluster_of, full.vertices[:, axis]) for axis in range(3)
         ]
-        cluster_mean = np.stack([total / cluster_size for total in sums], axis=1)
-        cluster_of_new = self.cluster_of[self.representative]
+        cluster_mean = np.stack([total / self.cluster_size for total in sums], axis=1)
         return Mesh(
-            cluster_mean[cluster_of_new].astype(np.float32),
+            cluster_mean[self.cluster_of_new].astype(np.float32),
             self.faces,
             full.normals[self.representative],
             full.uvs[self.representative],

@@ -147,12 +147,13 @@ def _read_array_header(
             (1, 0): np.lib.format.read_array_header_1_0,
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
-        return read_header(stream)
+        header: tuple[tuple[int, ...], bool, np.dtype[Any]] = read_header(stream)
     except (ValueError, KeyError, EOFError, SyntaxError, RecursionError) as error:
         raise FileFormatError(
             f"{path}: expected an array of NumPy, got a file that is corrupt or of "
             "another version; save it again"
         ) from error
+    return header
 
 
 def _check_array_form(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:

@@ -6,7 +6,7 @@ It also has what there is to say of the scene. `load_description` reads one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -399,7 +399,7 @@ class SceneDescription(SceneData):
                 "Or give the path of a camera file, such as calib.yaml.",
             )
 
-    def _with_rig(self, rig: Sequence[RigCamera], spec: str) -> SceneDescription:
+    def _with_rig(self, rig: tuple[RigCamera, ...], spec: str) -> SceneDescription:
         """Return the scene with several cameras, of the file `spec`."""
         scene = replace(self, rig=rig, rig_spec=spec)
         fov = rig[0].fov
@@ -753,10 +753,7 @@ def load_description(
 
     lit_by = environment_spec or _choose_environment(imported, is_mitsuba=is_mitsuba)
     check_ground(setting_values, lit_by)
-    if lit_by != NO_ENVIRONMENT:
-        check_single_environment(
-            imported.surroundings, f"`environment={_spec_text(lit_by)}`"
-        )
+    _check_environment(imported, lit_by)
     # what stands around the object has a ground of its own
     if source.is_scene and not {"ground.size", "ground.kind"} & set(setting_values):
         values["ground.size"] = 0.0
@@ -798,6 +795,16 @@ def _choose_camera(
     if is_mitsuba and not _describes_orbit(setting_values):
         return next(iter(imported.cameras), ORBIT_CAMERA)
     return ORBIT_CAMERA
+
+
+def _check_environment(
+    imported: ImportedScene, lit_by: str | Path | EnvironmentAsset
+) -> None:
+    """Raise InputError if a scene with an environment map has a second environment."""
+    if lit_by != NO_ENVIRONMENT:
+        check_single_environment(
+            imported.surroundings, f"`environment={_spec_text(lit_by)}`"
+        )
 
 
 def _list_requested(

@@ -406,7 +406,8 @@ def _find_ground_hits(
     # below is in its lower half.
     has_plain_ground = scene.photograph is None and not is_paved(scene)
     is_on_square = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
-    return has_plain_ground & is_on_square
+    hits_ground: BoolArray = has_plain_ground & is_on_square
+    return hits_ground
 
 
 def compute_environment_light(
@@ -738,7 +739,7 @@ def _weigh_moments(
         # which the middle of its exposure is.
         row_middle = row_opens + shutter / 2.0
         moment = (row_middle / moment_duration).long().clamp_max(len(moment_starts) - 1)
-        weights = torch.nn.functional.one_hot(moment, len(moment_starts))
+        weights: Tensor = torch.nn.functional.one_hot(moment, len(moment_starts))
         return weights.T.double()
     # (M, H) seconds for which moment and row overlap
     moment_ends = moment_starts + moment_duration

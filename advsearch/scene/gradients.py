@@ -338,6 +338,14 @@ def _plan_group(
             group, estimator="none", reason="a discrete choice has no derivative"
         )
     group = replace(group, step=_choose_step(group, image_size))
+    return _choose_estimator(group, forced)
+
+
+def _choose_estimator(group: Group, forced: Mapping[str, str]) -> Group:
+    """Return a group with its preferred or forced estimator, of those that are valid.
+
+    `forced` has estimators by the name of a group, of a control, or "*".
+    """
     forced_by_name = forced.get(group.name) or forced.get(group.control)
     if forced_by_name is not None:
         _check_is_valid(group, forced_by_name)

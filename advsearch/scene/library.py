@@ -208,7 +208,8 @@ def _read_base_color(directory: Traversable) -> Float32Array:
 
     content = (directory / "base_color.png").read_bytes()
     levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
-    return levels.astype(np.float32) / np.float32(255.0)
+    base_color: Float32Array = levels.astype(np.float32) / np.float32(255.0)
+    return base_color
 
 
 def _read_mesh(
@@ -299,12 +300,13 @@ def _read_map(name: str, map_name: str) -> Float32Array:
     try:
         content = _get_map_file(map_name).read_bytes()
         planes, _notes = read_exr(Path(name), content)  # red, green and blue
-        return np.stack(planes, axis=2).astype(np.float32)
+        radiance: Float32Array = np.stack(planes, axis=2).astype(np.float32)
     except (OSError, FileFormatError) as error:
         raise FileFormatError(
             f"bundled environment {name!r} cannot be read ({error}); "
             "reinstall advsearch"
         ) from error
+    return radiance
 
 
 def _get_map_file(map_name: str) -> Traversable:

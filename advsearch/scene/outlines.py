@@ -17,6 +17,7 @@ from torch import Tensor
 
 from advsearch.scene.assets import BoolArray, Float64Array
 from advsearch.scene.camera_model import EQUIRECTANGULAR
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, project_points
 from advsearch.scene.raster import rasterize_triangles
 from advsearch.scene.renderer import Renderer
@@ -156,9 +157,7 @@ def _project_faces(
     description = renderer.scene.description_and_filter[0]
     part = description.meshes[name]
     vertices = renderer.scene.input_assembler.get_vertices(name, inputs)
-    camera = inputs.get("camera.to_world")
-    if camera is None:
-        camera = torch.from_numpy(camera_to_world(description, width / height))
+    camera = _get_camera_pose(description, inputs, aspect=width / height)
     points = _to_camera_points(vertices, camera)
     positions, is_before = project_points(
         description, _select_camera_inputs(inputs), points, size
@@ -172,6 +171,19 @@ def _project_faces(
     # positions count from the center of the image
     center = (width / 2.0, height / 2.0)
     return np.asarray(positions.numpy()[faces.numpy()] + center)
+
+
+def _get_camera_pose(
+    description: SceneDescription, inputs: Mapping[str, Tensor], aspect: float
+) -> Tensor:
+    """Return the pose (4, 4) of the camera of inputs, or else that of the scene.
+
+    `aspect` is width over height of the image.
+    """
+    camera = inputs.get("camera.to_world")
+    if camera is None:
+        return torch.from_numpy(camera_to_world(description, aspect))
+    return camera
 
 
 def _to_camera_points(vertices: Tensor, camera: Tensor) -> Tensor:

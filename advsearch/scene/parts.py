@@ -469,4 +469,5 @@ def _make_sphere_faces(rows: int, columns: int) -> IntArray:
     upper = np.stack([corner, above + 1, above], 1)
     # without the lower faces of the first row and the upper faces of the last one, two
     # of whose corners are at a pole
-    return np.concatenate([lower[columns:], upper[:-columns]])
+    faces = np.concatenate([lower[columns:], upper[:-columns]])
+    return np.asarray(faces, np.int64)

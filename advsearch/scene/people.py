@@ -333,11 +333,10 @@ class Person:
             ankle_height = _move_joint(foot, rotations, translations, joints)[2]
             # 0 at the hip, 1 at the ankle
             below_hip = (hip_height - posed[:, 2]) / (hip_height - ankle_height)
-            below_hip = below_hip.clamp(0.0, 1.0)
-            foot_weight = sum(
-                weights[:, index] for index in self._find_foot_bones(foot)
-            )
-            leg_weight = (weights[:, thigh] + weights[:, calf]) * below_hip
+            leg_weight = weights[:, thigh] + weights[:, calf]
+            leg_weight = leg_weight * below_hip.clamp(0.0, 1.0)
+            foot_bones = self._find_foot_bones(foot)
+            foot_weight = sum(weights[:, index] for index in foot_bones)
             rise = rise + foot_rise * (foot_weight + leg_weight)
         return torch.cat([posed[:, :2], (posed[:, 2] + rise)[:, None]], dim=1)
 
@@ -406,9 +405,7 @@ class Person:
             mixture: (G, A, W) weights of the extremes of gender, age and weight.
             requested_height: scalar, meters.
         """
-        # the heights (H,) in meters of the shortest, the average and the tallest body
-        # of
-        # the mixture
+        # (H,) meters: the shortest, the average and the tallest body of the mixture
         statures = torch.einsum(
             "gaw,gawh->h", mixture, self._get_tensor("stature", mixture.device)
         )

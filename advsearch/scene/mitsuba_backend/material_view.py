@@ -473,9 +473,8 @@ def compute_outline_term(
     edge_film = view.camera.project(edge_point)
     hit, strength = _look_past_outline(view, edge_point, edge_film, film_normal, stream)
     # Attached outside of `suspend_grad`, since the motion is differentiated by the
-    # vertices.
-    # Only its gradient is used. So a point that does not move may have any position: it
-    # is 0.
+    # vertices. Only its gradient is used. So a point that does not move may have any
+    # position: it is 0.
     point_behind, _normal, _shading_normal, moves_behind = view.attach_hit(hit)
     film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
     motion = dr.dot(film_normal, edge_film - film_behind)

@@ -113,16 +113,27 @@ def _find_numbers(
         values = _read_values(value)
         if values is None:
             other_types[key] = f"a {type(value).__name__}"
-            continue
-        numbers[key] = PluginNumber(
-            key,
-            values,
-            input=input_of_key.get(key, ""),
-            valid=_find_valid_estimators(scene.parameters.flags(key)),
-            # A Python float is a constant that Mitsuba compiles into its kernels.
-            plain=isinstance(value, float),
-        )
+        else:
+            name = input_of_key.get(key, "")
+            numbers[key] = _make_plugin_number(scene, key, values, name)
     return numbers, other_types
+
+
+def _make_plugin_number(
+    scene: MitsubaScene, key: str, values: tuple[float, ...], input_name: str
+) -> PluginNumber:
+    """Return a number or a color of a scene by Mitsuba's key.
+
+    `input_name` is the scene's own input for it, or empty.
+    """
+    return PluginNumber(
+        key,
+        values,
+        input=input_name,
+        valid=_find_valid_estimators(scene.parameters.flags(key)),
+        # A Python float is a constant that Mitsuba compiles into its kernels.
+        plain=isinstance(scene.parameters[key], float),
+    )
 
 
 def _find_input_names(scene: MitsubaScene) -> dict[str, str]:

@@ -822,9 +822,8 @@ class MitsubaScene:
             # "mug.base_color" belongs to a mesh, and a pattern to a projector, which is
             # one of Mitsuba's emitters.
             part = name.partition(".")[0]
-            projector = (
-                self._find_projector(part) if name.endswith(PATTERN_SUFFIX) else None
-            )
+            is_pattern = name.endswith(PATTERN_SUFFIX)
+            projector = self._find_projector(part) if is_pattern else None
             paths = collect_paths(
                 self._scene,
                 self.parameters,
