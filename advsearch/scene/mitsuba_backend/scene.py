@@ -607,13 +607,7 @@ class MitsubaScene:
             names = (*sorted(extra - set(requested)), *requested)
             with self._tracked(names, inputs) as tracked, self._crop_film():
                 self._backpropagate(method, image_gradient, seed, spp)
-                return {
-                    name: dr.grad(tracked[name])
-                    .torch()
-                    .clone()
-                    .reshape(inputs[name].shape)
-                    for name in requested
-                }
+                return _collect_gradients(tracked, requested, inputs)
 
     def _choose_adjoint(self, method: str) -> tuple[str, set[str]]:
         """Return the method of an integrator for the adjoint, and the inputs it adds.
@@ -1079,6 +1073,17 @@ def _make_render_function(spp: int) -> Callable[..., Any]:
         return image
 
     return render
+
+
+def _collect_gradients(
+    tracked: Mapping[str, Any], names: Sequence[str], inputs: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return the gradients of tracked inputs with some names, in the inputs' shapes."""
+    gradients = {name: dr.grad(tracked[name]).torch().clone() for name in names}
+    return {
+        name: gradient.reshape(inputs[name].shape)
+        for name, gradient in gradients.items()
+    }
 
 
 def _repeat_vertices(

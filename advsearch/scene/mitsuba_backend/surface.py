@@ -835,14 +835,17 @@ def _look_up_bilinear(
     lower = dr.minimum(upper + 1, n_rows - 1)
     left, right, x_fraction = _find_neighbor_columns(x, n_columns, wraps)
 
-    def look_up_row(row: Any) -> Any:
-        row_start = first_cell + row * n_columns
-        return (
-            _gather_color(values, row_start + left) * (1.0 - x_fraction)
-            + _gather_color(values, row_start + right) * x_fraction
-        )
+    upper_start = first_cell + upper * n_columns
+    lower_start = first_cell + lower * n_columns
+    above = _lerp_cells(values, upper_start + left, upper_start + right, x_fraction)
+    below = _lerp_cells(values, lower_start + left, lower_start + right, x_fraction)
+    return above * (1.0 - y_fraction) + below * y_fraction
 
-    return look_up_row(upper) * (1.0 - y_fraction) + look_up_row(lower) * y_fraction
+
+def _lerp_cells(values: Any, left: Any, right: Any, fraction: Any) -> Any:
+    """Interpolate between the colors of two cells, by their indices in a flat array."""
+    left_color = _gather_color(values, left) * (1.0 - fraction)
+    return left_color + _gather_color(values, right) * fraction
 
 
 def _find_neighbor_columns(x: Any, n_columns: Any, wraps: bool) -> tuple[Any, Any, Any]:

@@ -619,13 +619,9 @@ def _sample_bsdf(
         position, normal: (3,) point on the shape and its unit normal.
         cosines: cosines of the angle of view.
     """
-    n_samples = N_ANGLES * N_LOBE_SAMPLES
-    # one lane for each sample, angle by angle
-    cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), N_LOBE_SAMPLES)
-    # in the frame of the surface, whose z is the normal
-    to_viewer = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
+    to_viewer = _make_viewer_directions(cosines)
     noise = mi.load_dict({"type": "independent"})
-    noise.seed(0, n_samples)
+    noise.seed(0, N_ANGLES * N_LOBE_SAMPLES)
     sample1 = noise.next_1d()
     sample2 = noise.next_2d()
     cosine_direction = mi.warp.square_to_cosine_hemisphere(sample2)
@@ -649,6 +645,16 @@ def _sample_bsdf(
         x=_to_table(bsdf_sample.wo.x.numpy()),
         z=_to_table(bsdf_sample.wo.z.numpy()),
     )
+
+
+def _make_viewer_directions(cosines: Float64Array) -> Any:
+    """Return directions to viewers, one lane for each sample, angle by angle.
+
+    They are in the frame of the surface, whose z is the normal. `cosines` (N_ANGLES,)
+    are those of the angles of view.
+    """
+    cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), N_LOBE_SAMPLES)
+    return mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
 
 
 def _eval_opaque_bsdf(si: Any, direction: Any) -> Any:
