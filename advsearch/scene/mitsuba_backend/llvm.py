@@ -32,6 +32,7 @@ from advsearch.errors import AdvsearchError, EnvironmentSetupError
 from advsearch.trust.code import SUBPROCESS_DIRECTORY
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+_VARIABLE_ADVICE = "Correct it, or unset it to let advsearch look for one."
 ELF_HEADER_SIZE = 20  # bytes of the beginning of an ELF file that are compared
 MIN_VERSION = 17  # the first major version that renders: see the head of this file
 _PATTERNS = (
@@ -149,6 +150,17 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         path: path of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
+    reason = _explain_unusable_file(path)
+    if reason:
+        return LibraryFile(path, version=(), refusal=reason)
+    version = (
+        parse_version(path) or parse_version(name_hint) or query_version(str(path))
+    )
+    return LibraryFile(path, version, refusal=explain_refusal(version))
+
+
+def _explain_unusable_file(path: Path) -> str:
+    """Return why a file cannot be loaded, by its first bytes; empty if it can."""
     # The first bytes of Python's own program. They are empty on systems whose programs
     # are no ELF files: there the library is not checked by its header.
     interpreter_header = read_interpreter_header()
@@ -156,15 +168,8 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         with path.open("rb") as file:
             header = file.read(ELF_HEADER_SIZE)
     except OSError as error:
-        reason = f"it cannot be read: {error.strerror}"
-        return LibraryFile(path, version=(), refusal=reason)
-    reason = _explain_wrong_header(header, interpreter_header)
-    if reason:
-        return LibraryFile(path, version=(), refusal=reason)
-    version = (
-        parse_version(path) or parse_version(name_hint) or query_version(str(path))
-    )
-    return LibraryFile(path, version, refusal=explain_refusal(version))
+        return f"it cannot be read: {error.strerror}"
+    return _explain_wrong_header(header, interpreter_header)
 
 
 def _explain_wrong_header(header: bytes, interpreter_header: bytes) -> str:
@@ -233,26 +238,34 @@ def ensure_llvm() -> LibraryFile:
 
 def _examine_named_library(variable: str) -> LibraryFile:
     """Return the libLLVM that ``DRJIT_LIBLLVM_PATH`` names, if it is usable."""
+    library = _find_named_library(variable)
+    if library.refusal:
+        raise EnvironmentSetupError(
+            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or "
+            f"later, got {library}. {_VARIABLE_ADVICE}"
+        )
+    # the path as the variable has it, not resolved
+    return replace(library, path=Path(variable))
+
+
+def _find_named_library(variable: str) -> LibraryFile:
+    """Return the libLLVM with a path or a plain name, usable or not.
+
+    Raises:
+        EnvironmentSetupError: there is no file with the path.
+    """
     path = Path(variable)
-    advice = "Correct it, or unset it to let advsearch look for one."
     # A plain name: the dynamic loader finds the file, and only the library itself knows
     # its version.
     if os.sep not in variable:
         version = query_version(variable)
-        library = LibraryFile(path, version, explain_refusal(version))
-    elif path.is_file():
-        library = examine_library(path.resolve(), name_hint=path)
-    else:
-        raise EnvironmentSetupError(
-            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which "
-            f"does not exist. {advice}"
-        )
-    if library.refusal:
-        raise EnvironmentSetupError(
-            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or "
-            f"later, got {library}. {advice}"
-        )
-    return replace(library, path=path)  # as the variable has it, not resolved
+        return LibraryFile(path, version, explain_refusal(version))
+    if path.is_file():
+        return examine_library(path.resolve(), name_hint=path)
+    raise EnvironmentSetupError(
+        f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which "
+        f"does not exist. {_VARIABLE_ADVICE}"
+    )
 
 
 def get_install_command(

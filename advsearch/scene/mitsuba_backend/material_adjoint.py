@@ -163,15 +163,14 @@ def material_adjoint(
         # cancels. For a smooth cotangent, independent noise averages out better.
         tile = ROUGH_TILE if _is_rough(cotangent) else 1
         total += _compute_interior_term(view, seed, spp, tile)
-    total += _compute_boundary_terms(view, seed, boundary_spp, shadow_spp)
+    total = _add_boundary_terms(total, view, seed, boundary_spp, shadow_spp)
     return _backpropagate_to_meshes(view, total)
 
 
-def _compute_boundary_terms(
-    view: FilmView, seed: int, outline_spp: int, shadow_spp: int
+def _add_boundary_terms(
+    total: Any, view: FilmView, seed: int, outline_spp: int, shadow_spp: int
 ) -> Any:
-    """Return a value whose gradient is that of all outline and shadow terms."""
-    total = mi.Float(0)
+    """Return a value plus the outline and shadow terms of all meshes, one by one."""
     # A still mesh may hide a moving one, or cast a shadow on it. The index gives each
     # mesh random numbers of its own.
     for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
@@ -311,9 +310,7 @@ def _sample_first_hits(
     hit = view.scene.ray_intersect_preliminary(
         view.camera.make_ray(film), coherent=True
     )
-    on_moving = mi.Bool(False)
-    for mesh in view.moving_meshes:
-        on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
+    on_moving = _find_moving_hits(view, hit)
     dr.eval(on_moving, film, hit, sampler)
     # Keep the lanes that see a moving mesh, with the states of their generators.
     selected_lanes = dr.compress(on_moving)
@@ -321,6 +318,14 @@ def _sample_first_hits(
     hit = dr.gather(type(hit), hit, selected_lanes)
     sampler.rng = dr.gather(type(sampler.rng), sampler.rng, selected_lanes)
     return film, hit, sampler
+
+
+def _find_moving_hits(view: FilmView, hit: Any) -> Any:
+    """Return whether each hit is on a mesh that moves."""
+    on_moving = mi.Bool(False)
+    for mesh in view.moving_meshes:
+        on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
+    return on_moving
 
 
 def _sample_film(camera: Camera, seed: int, spp: int, tile: int) -> tuple[Any, Any]:

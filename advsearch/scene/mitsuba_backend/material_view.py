@@ -208,11 +208,23 @@ class FilmView:
         fraction = padded_film - mi.Point2f(cell)
         # index of the cell's upper left corner in the padded image
         corner = cell.y * (width + 2) + cell.x
-        cell_corners = self._gather_cell_corners(corner, active)
-        top = dr.lerp(cell_corners[0], cell_corners[1], fraction.x)
-        bottom = dr.lerp(cell_corners[2], cell_corners[3], fraction.x)
         # In Dr.Jit, a value & a mask is 0 where the mask is False.
-        return dr.lerp(top, bottom, fraction.y) & active
+        return self._interpolate_in_cell(corner, fraction, active) & active
+
+    def _interpolate_in_cell(self, corner: Any, fraction: Any, active: Any) -> Any:
+        """Return the padded cotangent in cells, bilinear between their four corners.
+
+        Args:
+            corner: index of each cell's upper left corner in the padded image.
+            fraction: position in the cell, in [0, 1]^2.
+            active: lanes that are read.
+        """
+        upper_left, upper_right, lower_left, lower_right = self._gather_cell_corners(
+            corner, active
+        )
+        top = dr.lerp(upper_left, upper_right, fraction.x)
+        bottom = dr.lerp(lower_left, lower_right, fraction.x)
+        return dr.lerp(top, bottom, fraction.y)
 
     def _gather_cell_corners(self, corner: Any, active: Any) -> list[Any]:
         """Return the padded cotangent at four corners of cells, in the order of rows.
@@ -472,14 +484,21 @@ def compute_outline_term(
     edge_point = mesh.interpolate_edge(sampled.ends, sampled.fraction)
     edge_film = view.camera.project(edge_point)
     hit, strength = _look_past_outline(view, edge_point, edge_film, film_normal, stream)
-    # Attached outside of `suspend_grad`, since the motion is differentiated by the
-    # vertices. Only its gradient is used. So a point that does not move may have any
-    # position: it is 0.
-    point_behind, _normal, _shading_normal, moves_behind = view.attach_hit(hit)
-    film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
+    film_behind = _locate_on_film(view, hit)
     motion = dr.dot(film_normal, edge_film - film_behind)
     # minus: where the outline moves outwards, the radiance behind is lost
     return dr.sum(strength * motion) * -sampled.pixels_per_sample
+
+
+def _locate_on_film(view: FilmView, hit: Any) -> Any:
+    """Return the film positions of hits in pixels, attached to the vertices.
+
+    Only their gradients are used. So a point that does not move may have any position:
+    it is 0. This is called outside of `suspend_grad`, since the motion of the points is
+    differentiated.
+    """
+    point, _normal, _shading_normal, is_moving = view.attach_hit(hit)
+    return dr.select(is_moving, view.camera.project(point), 0.0)
 
 
 def _look_past_outline(
@@ -608,9 +627,8 @@ def _sample_outline(
     Returns:
         The samples; None if no outline is in the image.
     """
-    # An axis of a Dr.Jit point is an array over lanes, of which there is one here.
-    eye = torch.tensor([axis[0] for axis in camera.eye], dtype=torch.float64)
-    forward = torch.tensor([axis[0] for axis in camera.forward], dtype=torch.float64)
+    eye = _read_single_vector(camera.eye)
+    forward = _read_single_vector(camera.forward)
     ends, outwards = _find_outline(mesh, eye)
     if len(ends) == 0 or len(random) == 0:
         return None
@@ -628,6 +646,12 @@ def _sample_outline(
     fraction = _to_space_fraction(film_fraction, depth[edge_index])
     pixels_per_sample = float(length.sum()) / len(random)
     return _OutlineSamples(ends[edge_index], fraction, normal, pixels_per_sample)
+
+
+def _read_single_vector(vector: Any) -> Tensor:
+    """Return a point or vector of Dr.Jit with a single lane as (3,) float64."""
+    # An axis is an array over lanes, of which there is one.
+    return torch.tensor([axis[0] for axis in vector], dtype=torch.float64)
 
 
 def _project_directions(
@@ -660,11 +684,7 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
     """
     edges = _find_edges(mesh.vertices, mesh.corners)
     ends = edges.ends
-    # (E, 3) normals of the planes
-    plane = torch.linalg.cross(
-        mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
-    )
-    plane = torch.nn.functional.normalize(plane, dim=1)
+    plane = _compute_plane_normals(mesh, ends, eye)
     # (3 F,) for each side of a face: signed distance of the face's third corner from
     # the plane of the edge on which the side lies
     corner_from_eye = mesh.vertices[edges.third_corner] - eye
@@ -676,6 +696,14 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
     # turns the normals away from the faces
     sign = torch.where(are_faces_in_front[on_outline], -1.0, 1.0)[:, None]
     return ends[on_outline], plane[on_outline] * sign
+
+
+def _compute_plane_normals(mesh: TriMesh, ends: Tensor, eye: Tensor) -> Tensor:
+    """Return unit normals (E, 3) of the planes through edges (E, 2) and an eye (3,)."""
+    normal = torch.linalg.cross(
+        mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
+    )
+    return torch.nn.functional.normalize(normal, dim=1)
 
 
 def _find_offset_range(edges: _MeshEdges, offset: Tensor) -> tuple[Tensor, Tensor]:
@@ -846,9 +874,8 @@ def _sample_shadow_borders(
     line_index = dr.compress(dr.any(light_weight != 0.0))
     if dr.width(line_index) == 0:
         return None
-    light_weight, hit, si, edge_position, offset, edge_normal = (
-        dr.gather(type(value), value, line_index)
-        for value in (light_weight, hit, si, edge_position, offset, edge_normal)
+    light_weight, hit, si, edge_position, offset, edge_normal = _select_lanes(
+        line_index, light_weight, hit, si, edge_position, offset, edge_normal
     )
     # how much the loss changes as the lit point passes the shadow's border
     difference = _sample_radiance_difference(view, si, edge_position, offset, stream)
@@ -860,6 +887,11 @@ def _sample_shadow_borders(
         edge_normal=edge_normal,
         strength=strength,
     )
+
+
+def _select_lanes(lanes: Any, *values: Any) -> list[Any]:
+    """Return each of some values of Dr.Jit with only the lanes of these indices."""
+    return [dr.gather(type(value), value, lanes) for value in values]
 
 
 def _locate_edge_points(mesh: TriMesh, lines: _TangentLines) -> Tensor:

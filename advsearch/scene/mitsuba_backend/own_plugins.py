@@ -109,19 +109,39 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
     ) / GRID_SIZE * 2.0 * half_width - half_width
     highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))  # no drop
     max_height = np.zeros((GRID_SIZE, GRID_SIZE))
-    for index, (x, y, radius, curvature_radius) in enumerate(drops):
-        # only the cells in the square around the drop are computed
-        rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
-        columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
-        dy = cell_centers[rows] - y
-        dx = cell_centers[columns] - x
-        distance_squared = dy[:, None] ** 2 + dx[None] ** 2
-        height = _compute_cap_height(distance_squared, radius, curvature_radius)
-        cells = np.ix_(rows, columns)
-        is_higher = (distance_squared < radius**2) & (height > max_height[cells])
-        highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
-        max_height[cells] = np.where(is_higher, height, max_height[cells])
+    for index, drop in enumerate(drops):
+        _put_drop(highest_drop, max_height, cell_centers, index, drop)
     return highest_drop
+
+
+def _put_drop(
+    highest_drop: IntArray,
+    max_height: Float64Array,
+    cell_centers: Float64Array,
+    index: int,
+    drop: Float64Array,
+) -> None:
+    """Put a drop into a grid where it is higher than the drops so far.
+
+    Args:
+        highest_drop: (GRID, GRID) index of the highest drop so far; is changed.
+        max_height: (GRID, GRID) its height, millimeters, 0 without one; is changed.
+        cell_centers: (GRID,) coordinates of the cells' centers, the same for x and y.
+        index: index of the drop.
+        drop: (4,) x, y, radius on the sheet, and radius of curvature.
+    """
+    x, y, radius, curvature_radius = drop
+    # only the cells in the square around the drop are computed
+    rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
+    columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
+    dy = cell_centers[rows] - y
+    dx = cell_centers[columns] - x
+    distance_squared = dy[:, None] ** 2 + dx[None] ** 2
+    height = _compute_cap_height(distance_squared, radius, curvature_radius)
+    cells = np.ix_(rows, columns)
+    is_higher = (distance_squared < radius**2) & (height > max_height[cells])
+    highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
+    max_height[cells] = np.where(is_higher, height, max_height[cells])
 
 
 common: Any = mi.ad.integrators.common
@@ -436,13 +456,29 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         distance = dr.select(is_environment, dr.inf, ds.dist)
         _, haze_length = self._find_haze_segment(event.p, ds.d, distance)
         if not primal:
-            # The sampled weight has no gradient. The emitter is evaluated again with
-            # gradients; the value stays that of the sample.
-            with dr.resume_grad():
-                radiance = scene.eval_emitter_direction(event, ds, active)
-                inverse_density = dr.select(active, dr.rcp(ds.pdf), 0.0)
-                weight = dr.replace_grad(weight, radiance * inverse_density)
+            weight = _attach_sampled_light(scene, event, ds, weight, active)
         return ds, weight, haze_length, active
+
+
+def _attach_sampled_light(
+    scene: Any, event: Any, ds: Any, weight: Any, active: Any
+) -> Any:
+    """Return the weights of emitter samples, attached to the emitters' parameters.
+
+    A sampled weight has no gradient. The emitter is evaluated again with gradients; the
+    value stays that of the sample.
+
+    Args:
+        scene: Mitsuba's scene.
+        event: the event from which the emitters were sampled.
+        ds: Mitsuba's direction sample.
+        weight: radiance over density of the sample.
+        active: lanes in which there is a sample.
+    """
+    with dr.resume_grad():
+        radiance = scene.eval_emitter_direction(event, ds, active)
+        inverse_density = dr.select(active, dr.rcp(ds.pdf), 0.0)
+        return dr.replace_grad(weight, radiance * inverse_density)
 
 
 def _eval_towards_emitter(
@@ -628,21 +664,15 @@ class _PlaneHits:
         This also sets `_factors`, by which that radiance is multiplied for each of the
         quantities: the change of the matt ground, and with a coat also the change of
         the coat and the environment in it. A factor is the fraction of the light that
-        is reflected. For the two changes it has a sign:
-
-        - light of the environment is already in the photograph: -1 where something
-          blocks it, else 0;
-        - light of a lamp is not: 1, or 0 where something blocks it.
+        is reflected. For the two changes it has a sign, see `_find_light_signs`.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
             si, sampler.next_2d(), test_visibility=False, active=self.is_hit
         )
         is_sampled = self.is_hit & (ds.pdf != 0.0)
-        is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
         is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        visibility = dr.select(is_blocked, 0.0, 1.0)
-        sign = dr.select(is_environment, visibility - 1.0, visibility)
+        sign = self._find_light_signs(scene, ds.p, is_sampled, is_environment)
         direction = si.to_local(ds.d)
         matt_fraction = self._albedo * dr.inv_pi * dr.maximum(direction.z, 0.0)
         self._emitter_sample = ds
@@ -652,6 +682,26 @@ class _PlaneHits:
                 self._coat, direction, sign, is_sampled, is_environment
             )
         return light
+
+    def _find_light_signs(
+        self, scene: Any, light_point: Any, is_sampled: Any, is_environment: Any
+    ) -> Any:
+        """Return the sign with which the light of each sample changes the photograph.
+
+        - Light of the environment is already in the photograph: -1 where something
+          blocks it, else 0.
+        - Light of a lamp is not: 1, or 0 where something blocks it.
+
+        Args:
+            scene: Mitsuba's scene.
+            light_point: sampled points on the emitters.
+            is_sampled: lanes in which there is a sample.
+            is_environment: lanes whose emitter is the environment.
+        """
+        ray = self._si.spawn_ray_to(light_point)
+        is_blocked = scene.ray_test(ray, is_sampled)
+        visibility = dr.select(is_blocked, 0.0, 1.0)
+        return dr.select(is_environment, visibility - 1.0, visibility)
 
     def _compute_coat_factors(
         self,
@@ -667,7 +717,7 @@ class _PlaneHits:
         Args:
             coat: coat of the plane.
             direction: local direction to the emitter.
-            sign: sign of the change, see `_sample_emitter`.
+            sign: sign of the change, see `_find_light_signs`.
             is_sampled: lanes in which there is a sample.
             is_environment: lanes whose emitter is the environment.
         """
@@ -1220,6 +1270,17 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         if self._sheet_half_width > 0.0:
             direction, transmitted = self._bend_by_drops(direction, sample3)
         weight = dr.select(is_inside, transmitted, 0.0)
+        ray = self._make_sampled_ray(time, direction, weight > 0.0)
+        return ray, mi.Spectrum(weight)
+
+    def _make_sampled_ray(self, time: Any, direction: Any, has_light: Any) -> Any:
+        """Return rays in the world, along directions in the camera's axes.
+
+        Args:
+            time: time of the rays.
+            direction: unit directions.
+            has_light: lanes whose ray may meet something; others have the length 0.
+        """
         # Each field has one entry a lane, `maxt` too: Dr.Jit cannot differentiate a ray
         # whose fields have different lengths.
         ray = dr.zeros(mi.RayDifferential3f)
@@ -1227,9 +1288,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         # Near and far are distances along the ray, since a wide lens has no planes.
         ray.o = self.pose @ mi.Point3f(self._near * direction)
         ray.d = self.pose @ mi.Vector3f(direction)
-        # of length 0 where the lens has no direction, so that the ray hits nothing
-        ray.maxt = dr.select(weight > 0.0, mi.Float(self._far), 0.0)
-        return ray, mi.Spectrum(weight)
+        ray.maxt = dr.select(has_light, mi.Float(self._far), 0.0)
+        return ray
 
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
@@ -1313,13 +1373,9 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         cells_per_mm = GRID_SIZE / (2.0 * half_width)
         column = (x + half_width) * cells_per_mm
         row = (y + half_width) * cells_per_mm
-        on_grid = (
-            active
-            & (column >= 0.0)
-            & (column < GRID_SIZE)
-            & (row >= 0.0)
-            & (row < GRID_SIZE)
-        )
+        has_column = (column >= 0.0) & (column < GRID_SIZE)
+        has_row = (row >= 0.0) & (row < GRID_SIZE)
+        on_grid = active & has_column & has_row
         row_index = mi.UInt32(dr.clip(row, 0.0, GRID_SIZE - 1.0))
         column_index = mi.UInt32(dr.clip(column, 0.0, GRID_SIZE - 1.0))
         cell = row_index * GRID_SIZE + column_index

@@ -303,8 +303,8 @@ def _make_principled_inputs(name: str) -> list[SceneInput]:
     )
     numbers = [
         SceneInput(
-            f"{name}.{parameter}",
-            f"{name}.*.{key}",
+            name=f"{name}.{parameter}",
+            key=f"{name}.*.{key}",
             convert_to_mitsuba=to_flat_array,
             has_interior_adjoint=True,
             shape=(1,),
@@ -582,15 +582,15 @@ def _make_haze_inputs(name: str) -> tuple[SceneInput, ...]:
     """Return the inputs of the haze with a name: its density and its albedo."""
     return (
         SceneInput(
-            f"{name}.density",
-            f"{name}.sigma_t.value.value",
+            name=f"{name}.density",
+            key=f"{name}.sigma_t.value.value",
             convert_to_mitsuba=to_flat_array,
             has_interior_adjoint=True,
             shape=(1,),
         ),
         SceneInput(
-            f"{name}.albedo",
-            f"{name}.albedo.value.value",
+            name=f"{name}.albedo",
+            key=f"{name}.albedo.value.value",
             convert_to_mitsuba=to_color,
             has_interior_adjoint=True,
             shape=(3,),
@@ -625,17 +625,7 @@ def make_scene_dict(
         resolution: height and width.
         filter, sampler: Mitsuba's types of reconstruction filter and sampler.
     """
-    height, width = resolution
-    to_world = camera_to_world(description, width / height)
-    camera: Plugin = {
-        **_make_lens(description),
-        # object sizes
-        "near_clip": 0.01,
-        "far_clip": 1e5,
-        "to_world": mi.ScalarTransform4f(to_world),
-        "film": _make_film(description, resolution, filter),
-        "sampler": {"type": sampler},
-    }
+    camera = _make_camera_plugin(description, resolution, filter, sampler)
     scene: Plugin = {"type": "scene", "camera": camera}
     if description.environment is not None:
         scene["environment"] = _make_environment(
@@ -645,6 +635,29 @@ def make_scene_dict(
     if ground is not None:
         scene[GROUND_NAME] = ground
     return scene
+
+
+def _make_camera_plugin(
+    description: SceneDescription,
+    resolution: tuple[int, int],
+    filter: str,
+    sampler: str,
+) -> Plugin:
+    """Return the dictionary of a scene's camera, with pose, film and sampler.
+
+    The arguments are those of `make_scene_dict`.
+    """
+    height, width = resolution
+    to_world = camera_to_world(description, width / height)
+    return {
+        **_make_lens(description),
+        # object sizes
+        "near_clip": 0.01,
+        "far_clip": 1e5,
+        "to_world": mi.ScalarTransform4f(to_world),
+        "film": _make_film(description, resolution, filter),
+        "sampler": {"type": sampler},
+    }
 
 
 def _make_film(
@@ -699,12 +712,15 @@ def _make_ground(description: SceneDescription) -> Any:
         if not has_plane(description):
             return None
         level = description.get_number("ground.level")
-    bsdf = _make_ground_surface(description)
+    return _make_square(size, level, _make_ground_surface(description))
+
+
+def _make_square(size: float, level: float, bsdf: Plugin) -> Plugin:
+    """Return a two-sided horizontal square of a width, at a height above 0."""
+    pose = mi.ScalarTransform4f().translate([0.0, 0.0, level])
     return {
         "type": "rectangle",
-        "to_world": mi.ScalarTransform4f()
-        .translate([0.0, 0.0, level])
-        .scale(size / 2.0),  # Mitsuba's rectangle is 2 wide
+        "to_world": pose.scale(size / 2.0),  # Mitsuba's rectangle is 2 wide
         "bsdf": {"type": "twosided", "bsdf": bsdf},
     }
 
@@ -782,16 +798,21 @@ def _check_background(
             "leave one of the two out"
         )
     has_plain_backdrop = description.backdrop and not description.backdrop_photograph
-    # A lens has no name if its numbers are searched. Some numbers make a lens that
-    # folds (two directions fall on one point of the image), and leaves other parts
-    # black.
-    is_searched = not model.name
-    may_leave_black = model.black_fraction > 0.0 or is_searched
-    if has_plain_backdrop and may_leave_black:
+    if has_plain_backdrop and _may_leave_black(model):
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
             "leave the plain background out, or take a lens that fills the picture"
         )
+
+
+def _may_leave_black(model: CameraModel) -> bool:
+    """Return whether parts of the image may be black since a lens sees nothing there.
+
+    A lens has no name if its numbers are searched. Some numbers make a lens that folds
+    (two directions fall on one point of the image), and leaves other parts black.
+    """
+    is_searched = not model.name
+    return model.black_fraction > 0.0 or is_searched
 
 
 def _make_lens(description: SceneDescription) -> Plugin:
@@ -875,8 +896,8 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     return (
         _make_pose_input("camera", "to_world"),
         SceneInput(
-            "camera.fov",
-            "camera.x_fov",
+            name="camera.fov",
+            key="camera.x_fov",
             convert_to_mitsuba=_make_fov_conversion(resolution),
             shape=(1,),
         ),
@@ -889,8 +910,8 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         _make_pose_input(GROUND_NAME, "to_world"),
         # (h, w, 3): colors of a ground that the map of the environment shows
         SceneInput(
-            "ground.reflectance",
-            f"{GROUND_NAME}.*.reflectance.data",
+            name="ground.reflectance",
+            key=f"{GROUND_NAME}.*.reflectance.data",
             has_interior_adjoint=True,
         ),
     )

@@ -448,16 +448,10 @@ class MitsubaScene:
         self, method: str, integrator: Any, seed: int, spp: int
     ) -> Tensor:
         """Render one image, see `render_images`; it is recorded if that saves time."""
-        render = _make_render_function(spp)
-        function: Callable[..., Any] = render
-        if self._uses_recordings:
-            media = scene_registry.list_media() if self.is_volumetric else []
-            key = (method, spp, self.current_max_depth, self.window)
-            function = self._recorded.get_or_record(key, render, media)
+        render = self._get_render_function(method, spp)
         # opaque: a literal seed would be a constant of the recorded kernel
-        drjit_image = function(
-            self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
-        )
+        opaque_seed = dr.opaque(mi.UInt32, seed)
+        drjit_image = render(self._scene, self._sensor, integrator, opaque_seed)
         image = drjit_image.torch().clone()
         if method == "guides":
             # Albedo and normal are the last six channels. There may be a color
@@ -465,6 +459,15 @@ class MitsubaScene:
             image = image[..., -6:]
             image[..., :3].clamp_(0.0, 1.0)
         return image
+
+    def _get_render_function(self, method: str, spp: int) -> Callable[..., Any]:
+        """Return the function that renders images by a method, recorded or not."""
+        render = _make_render_function(spp)
+        if not self._uses_recordings:
+            return render
+        media = scene_registry.list_media() if self.is_volumetric else []
+        key = (method, spp, self.current_max_depth, self.window)
+        return self._recorded.get_or_record(key, render, media)
 
     @property
     def mitsuba_shapes(self) -> list[Any]:
@@ -716,18 +719,15 @@ class MitsubaScene:
         value = self.parameters[key]
         # a copy: the parameter itself is replaced below
         old_values[key] = type(value)(value)
-        if rendered is not None:
+        if rendered is None:
+            tensor = mi.TensorXf(parts.to_torch(value))
+        else:
             # `to_rendered` limits the value to what Mitsuba can render.
             tensor = mi.TensorXf(scene_input.to_rendered(rendered))
-        else:
-            tensor = mi.TensorXf(parts.to_torch(value))
         dr.enable_grad(tensor)
         # Mitsuba's parameter may have another type than a tensor.
-        self.parameters[key] = (
-            scene_input.convert_to_mitsuba(tensor)
-            if scene_input.convert_to_mitsuba
-            else tensor
-        )
+        convert = scene_input.convert_to_mitsuba
+        self.parameters[key] = convert(tensor) if convert else tensor
         return tensor
 
     def _restore_parameters(self, old_values: dict[str, Any]) -> None:
@@ -830,12 +830,25 @@ class MitsubaScene:
                 unseen=self._find_plane(),  # its change is rendered apart
                 roulette_depth=self.roulette_depth,
             )
-            surface = None  # for `_to_repeating` a projector's image
-            if projector is None:
-                surface = self.description_and_filter[0].meshes[part].surface
-                if surface is None:
-                    return paths
-            return _repeat_vertices(paths, surface, self.parameters[key].shape[:2])
+            if projector is not None:
+                size = self.parameters[key].shape[:2]
+                return _repeat_vertices(paths, surface=None, size=size)
+            return self._repeat_on_mesh(paths, part, key)
+
+    def _repeat_on_mesh(self, paths: TracedPaths, part: str, key: str) -> TracedPaths:
+        """Return paths with texture coordinates for the repeating texture of a mesh.
+
+        Only the texture of a surface of the user's repeats.
+
+        Args:
+            paths: the paths.
+            part: name of the mesh.
+            key: Mitsuba's key of the texture.
+        """
+        surface = self.description_and_filter[0].meshes[part].surface
+        if surface is None:
+            return paths
+        return _repeat_vertices(paths, surface, self.parameters[key].shape[:2])
 
     def _make_noise(self, seed: int, spp: int) -> Any:
         """Return Mitsuba's sampler, seeded for all samples of the window."""
@@ -942,10 +955,7 @@ class MitsubaScene:
         _check_input_size(name, scene_input, tensor)
         is_buffer = name in self._buffers
         if name not in self._base_values:
-            # The memory of a buffer is copied, since it is overwritten in place below.
-            # Other values are replaced.
-            base = current.torch().clone() if is_buffer else current
-            self._base_values[name] = type(current)(base)
+            self._base_values[name] = _copy_parameter(current, is_buffer)
         if tensor is None:
             # a copy, so that the stored value is not what Mitsuba changes
             value = type(current)(self._base_values[name])
@@ -1028,6 +1038,15 @@ class MitsubaScene:
         hidden["reflectance"] = description.get_number("ground.gloss")
         hidden["roughness"] = description.get_number("ground.roughness")
         return hidden
+
+
+def _copy_parameter(value: Any, is_buffer: bool) -> Any:
+    """Return a copy of a parameter's value.
+
+    The memory of a buffer is copied, since it is overwritten in place. Other values are
+    replaced.
+    """
+    return type(value)(value.torch().clone() if is_buffer else value)
 
 
 def _can_be_recorded(description: SceneDescription) -> bool:

@@ -561,18 +561,24 @@ def measure_lobes(
         0.0, 1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
     )
     core, tail = _measure_spreads(samples.weight, squared_angle)
-    # The base color of `grey` is 0.5 and that of `black` is 0. Their difference is the
-    # diffuse part; dividing by 0.5 gives it for a base color of 1.
-    by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
-    diffuse = np.maximum(by_color, 0.0) / 0.5
     return Lobes(
-        diffuse=diffuse.astype(np.float32),
+        diffuse=_measure_diffuse_fraction(samples).astype(np.float32),
         gloss=gloss.astype(np.float32),
         up=up.astype(np.float32),
         along=(-towards_viewer).astype(np.float32),
         core=core.astype(np.float32),
         tail=tail.astype(np.float32),
     )
+
+
+def _measure_diffuse_fraction(samples: _BsdfSamples) -> Float64Array:
+    """Return the fraction (N_ANGLES,) of even light reflected diffusely, for a base color of 1.
+
+    The base color of `grey` is 0.5 and that of `black` is 0. Their difference is the
+    diffuse part; dividing by 0.5 gives it for a base color of 1.
+    """
+    by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
+    return np.asarray(np.maximum(by_color, 0.0) / 0.5)
 
 
 def _measure_mean_direction(
@@ -628,12 +634,13 @@ def _sample_bsdf(
 
     mitsuba_scene = _set_base_color(scene, inputs, grid.name, 0.5)
     si = _hit_point(mitsuba_scene, position, normal, to_viewer)
-    grey = _eval_opaque_bsdf(si, cosine_direction)
+    grey = _eval_opaque_bsdf(si, cosine_direction, _eval_opacity(si))
 
     mitsuba_scene = _set_base_color(scene, inputs, grid.name, 0.0)
     si = _hit_point(mitsuba_scene, position, normal, to_viewer)
-    black = _eval_opaque_bsdf(si, cosine_direction)
-    bsdf_sample, weight = _sample_gloss(si, sample1, sample2)
+    opacity = _eval_opacity(si)
+    black = _eval_opaque_bsdf(si, cosine_direction, opacity)
+    bsdf_sample, weight = _sample_gloss(si, opacity, sample1, sample2)
 
     # density of `cosine_direction`, by which the values of `grey` and `black` are
     # divided
@@ -657,22 +664,28 @@ def _make_viewer_directions(cosines: Float64Array) -> Any:
     return mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
 
 
-def _eval_opaque_bsdf(si: Any, direction: Any) -> Any:
-    """Return the grey value of a BSDF, as that of a surface without cut-outs."""
-    opacity = _eval_opacity(si)
+def _eval_opaque_bsdf(si: Any, direction: Any, opacity: Any) -> Any:
+    """Return the grey value of a BSDF, as that of a surface without cut-outs.
+
+    `opacity` is the fraction of light that the surface stops, see `_eval_opacity`.
+    """
     return dr.mean(si.bsdf().eval(mi.BSDFContext(), si, direction) / opacity)
 
 
-def _sample_gloss(si: Any, sample1: Any, sample2: Any) -> tuple[Any, Any]:
+def _sample_gloss(si: Any, opacity: Any, sample1: Any, sample2: Any) -> tuple[Any, Any]:
     """Sample the BSDF of a black surface, and return samples and weights.
 
     A black surface reflects nothing but gloss, so that samples of its BSDF are samples
     of the gloss. A direction below the surface (z < 0) is transmitted, and is none.
+
+    Args:
+        si: surface interactions.
+        opacity: fraction of light that the surface stops.
+        sample1, sample2: random numbers that choose the lobe and the direction.
     """
     context = mi.BSDFContext()
     bsdf_sample, bsdf_weight = si.bsdf().sample(context, si, sample1, sample2)
     is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
-    opacity = _eval_opacity(si)
     weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
     weight = dr.select(dr.isfinite(weight), weight, 0.0)
     return bsdf_sample, weight
