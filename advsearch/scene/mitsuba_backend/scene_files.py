@@ -763,30 +763,42 @@ class _ObjectFrame:
             at_top: whether it is at the top of the scene; inside another plugin only
                 media and volumes change.
         """
+        if at_top and plugin["type"] == "merge":
+            # It has no pose: each shape in it is moved, as at the top of the scene.
+            return map_inner_plugins(plugin, self.move_plugin)
+        if at_top:
+            entries = self._move_entries(plugin)
+        else:
+            entries = self._scale_medium(plugin)
+        return map_inner_plugins(
+            entries, lambda inner: self.move_plugin(inner, at_top=False)
+        )
+
+    def _move_entries(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin at the top of the scene, moved without those inside of it."""
+        kind = plugin["type"]
+        if kind in SHAPE_TYPES - {"shapegroup"}:
+            return self._with_pose(plugin)
+        if kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
+            return self._move_distant_light(plugin)
+        if kind in ("point", "spot", "projector"):
+            return self._move_lamp(plugin)
+        return self._scale_medium(plugin)
+
+    def _scale_medium(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin in the object's coordinates if it is a medium or a volume.
+
+        Any other plugin stays as it is.
+        """
         kind = plugin["type"]
         if kind in MEDIUM_TYPES:
             # density is per length, and the object's unit of length is `size` times as
             # long as the scene's
             scale = float(np.asarray(plugin.get("scale", 1.0)))
-            entries = {**plugin, "scale": scale * self.size}
-        elif kind in ("gridvolume", "constvolume"):
-            entries = self._with_pose(plugin)
-        elif not at_top:
-            entries = dict(plugin)
-        elif kind == "merge":
-            # It has no pose: each shape in it is moved, as at the top of the scene.
-            return map_inner_plugins(plugin, self.move_plugin)
-        elif kind in SHAPE_TYPES - {"shapegroup"}:
-            entries = self._with_pose(plugin)
-        elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
-            entries = self._move_distant_light(plugin)
-        elif kind in ("point", "spot", "projector"):
-            entries = self._move_lamp(plugin)
-        else:
-            entries = dict(plugin)
-        return map_inner_plugins(
-            entries, lambda inner: self.move_plugin(inner, at_top=False)
-        )
+            return {**plugin, "scale": scale * self.size}
+        if kind in ("gridvolume", "constvolume"):
+            return self._with_pose(plugin)
+        return dict(plugin)
 
     def _with_pose(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin whose `to_world` leads to the object's coordinates."""

@@ -140,23 +140,22 @@ def _make_used_mesh(buffers: Buffers, normal_sign: float) -> Mesh:
     The buffers have normals, which are multiplied by `normal_sign`, and texture
     coordinates.
     """
-    vertices, faces, normals, uvs, attributes = buffers  # in the order of its fields
-    assert normals is not None and uvs is not None
-    used_vertices, vertex_index = np.unique(faces, return_inverse=True)
+    assert buffers.normals is not None and buffers.uvs is not None
+    used_vertices, vertex_index = np.unique(buffers.faces, return_inverse=True)
     faces = vertex_index.reshape(-1, 3)
-    vertices = vertices[used_vertices]
+    vertices = buffers.vertices[used_vertices]
     # v points up in our meshes and down in Mitsuba's, so that it becomes 1 - v.
-    uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
+    uvs = buffers.uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
     # The normals of a face without area are NaN.
-    normals = np.nan_to_num(normals)[used_vertices] * normal_sign
+    normals = np.nan_to_num(buffers.normals)[used_vertices] * normal_sign
     if _has_opposite_winding(vertices, faces, normals):
         faces = faces[:, ::-1]
     return Mesh(
-        vertices.astype(np.float32),
-        np.ascontiguousarray(faces, np.uint32),
-        normals.astype(np.float32),
-        uvs.astype(np.float32),
-        _select_vertices(attributes, used_vertices),
+        vertices=vertices.astype(np.float32),
+        faces=np.ascontiguousarray(faces, np.uint32),
+        normals=normals.astype(np.float32),
+        uvs=uvs.astype(np.float32),
+        attributes=_select_vertices(buffers.attributes, used_vertices),
     )
 
 
@@ -777,11 +776,7 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
     clauses = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
-        unsupported_colors = sorted(types & {"mesh_attribute", "volume"})
-        if unsupported_colors:
-            reason = f"its color is a {unsupported_colors[0]}"
-        else:
-            reason = f"a {surface['type']} has none"
+        reason = _explain_missing_color(surface, types)
         clauses.append(
             f"it has no base color that can be searched ({reason}), so that the "
             "controls texture, patch and material cannot be used on it"
@@ -790,6 +785,17 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
     if not (linear.min() >= 0.0 and linear.max() <= 1.0 + 1e-4):
         clauses.append("its base color is clipped to reflectances from 0 to 1")
     return clauses
+
+
+def _explain_missing_color(surface: Plugin, types: set[str]) -> str:
+    """Return why a surface has no base color that can be searched, as a clause.
+
+    `types` are those of the surface and of all plugins in it.
+    """
+    unsupported_colors = sorted(types & {"mesh_attribute", "volume"})
+    if unsupported_colors:
+        return f"its color is a {unsupported_colors[0]}"
+    return f"a {surface['type']} has none"
 
 
 def _apply_uv_transform(

@@ -303,10 +303,10 @@ class ViewTracer:
                 ray, ray_flags, coherent=layer == 0, active=active
             )
             is_hit = active & si.is_valid()
-            stopped_fraction = transmittance
-            if layer < n_layers:  # the last layer stops all light that is left
-                opacity = 1.0 - texel_rays.eval_transmittance(si, is_hit)
-                stopped_fraction = transmittance * opacity
+            is_last = layer == n_layers
+            stopped_fraction = _compute_stopped_light(
+                si, is_hit, transmittance, is_last=is_last
+            )
             surface_radiance, diffuse, side = self._shade(
                 mitsuba_scene, si, is_hit, direction, tables, lit
             )
@@ -327,10 +327,7 @@ class ViewTracer:
         # Evaluated at once: otherwise the kernel of each channel's sum would trace all
         # rays again.
         dr.eval(radiance, coverage, texture_channels)
-        pixel_sums = [
-            dr.block_sum(channel, RAYS_PER_PIXEL) for channel in (*radiance, coverage)
-        ]
-        return [*pixel_sums, *texture_channels]
+        return [*_sum_over_pixels([*radiance, coverage]), *texture_channels]
 
     def _make_rays(self, lane: Any, camera_numbers: Any, lens: Any) -> tuple[Any, Any]:
         """Return the ray of each lane, and whether the lens has one there.
@@ -344,10 +341,7 @@ class ViewTracer:
         """
         height, width = self._scene.resolution
         camera_index = lane // RAYS_PER_PIXEL // (height * width)
-        camera = [
-            dr.gather(mi.Float, camera_numbers, camera_index * CAMERA_SIZE + index)
-            for index in range(CAMERA_SIZE)
-        ]
+        camera = _gather_camera(camera_numbers, camera_index)
         # three numbers for each axis of the camera
         left = camera[0:3]
         up = camera[3:6]
@@ -680,6 +674,37 @@ class ViewTracer:
             lit.texels, first_cell, n_rows, n_columns, row, column
         )
         return dr.select(on_any_grid, radiance, 0.0)
+
+
+def _gather_camera(camera_numbers: Any, camera_index: Any) -> list[Any]:
+    """Return the `CAMERA_SIZE` numbers of each lane's camera, from a flat array."""
+    first = camera_index * CAMERA_SIZE
+    return [
+        dr.gather(mi.Float, camera_numbers, first + index)
+        for index in range(CAMERA_SIZE)
+    ]
+
+
+def _compute_stopped_light(
+    si: Any, is_hit: Any, transmittance: Any, *, is_last: bool
+) -> Any:
+    """Return the fraction of a ray's light that one layer of surfaces stops.
+
+    Args:
+        si: surface interactions of the rays in this layer.
+        is_hit: lanes in which the ray hits a surface.
+        transmittance: fraction of the light that is left before the layer.
+        is_last: whether this layer is the last one, which stops all that is left.
+    """
+    if is_last:
+        return transmittance
+    opacity = 1.0 - texel_rays.eval_transmittance(si, is_hit)
+    return transmittance * opacity
+
+
+def _sum_over_pixels(channels: list[Any]) -> list[Any]:
+    """Return the sum over the rays of each pixel, for channels with one value a ray."""
+    return [dr.block_sum(channel, RAYS_PER_PIXEL) for channel in channels]
 
 
 def _list_texture_channels(

@@ -251,11 +251,28 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> 
     albedo = remaining_inputs.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
     if not density[0] > 0.0:
         return  # without haze its inputs have no effect
+    _put_haze_ball(scene, haze, density[0], albedo)
+    scene["integrator"]["max_depth"] += EXTRA_DEPTH
+
+
+def _put_haze_ball(
+    scene: Plugin, haze: parts.HazePart, density: float, albedo: list[float]
+) -> None:
+    """Put the ball and the medium of a haze into a scene's dictionary.
+
+    The camera gets the medium as well, since it stands in it.
+
+    Args:
+        scene: the scene's dictionary, which is changed.
+        haze: the haze.
+        density: its extinction per object size.
+        albedo: its albedo (RGB).
+    """
     medium_name = f"{haze.name}-medium"
     medium_reference = {"type": "ref", "id": medium_name}
     scene[medium_name] = {
         "type": "homogeneous",
-        "sigma_t": density[0],
+        "sigma_t": density,
         "albedo": {"type": "rgb", "value": albedo},
     }
     scene[haze.name] = {
@@ -265,7 +282,6 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> 
         "interior": medium_reference,
     }
     scene["camera"]["medium"] = medium_reference
-    scene["integrator"]["max_depth"] += EXTRA_DEPTH
 
 
 def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> bool:

@@ -194,10 +194,7 @@ class _SceneText:
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
-            got = describe_content(data)
-            if data.lstrip().startswith(b"<"):
-                message = expat.errors.messages[error.code]
-                got = f"{message} in line {error.lineno}"
+            got = _describe_parse_error(data, error)
             raise damaged(self.path, "an XML file", got) from error
         # an encoding that Python does not have
         except (LookupError, ValueError) as error:
@@ -294,6 +291,14 @@ class _SceneText:
                 f"{self.path}: ${name} has no value: no <default> has that name"
             )
         return self.values[name]
+
+
+def _describe_parse_error(data: bytes, error: expat.ExpatError) -> str:
+    """Return what the mistake in XML is; of other data, what they are instead."""
+    if not data.lstrip().startswith(b"<"):
+        return describe_content(data)
+    message = expat.errors.messages[error.code]
+    return f"{message} in line {error.lineno}"
 
 
 def _check_version(path: Path, root: ElementTree.Element) -> None:
