@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
+from advsearch.scene.assets import Float32Array, IntArray, Material, Mesh, Shape
 from advsearch.scene.backdrop import make_image_inputs
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
@@ -111,11 +111,7 @@ class MovingMesh:
         faces, groups = (
             indices.to(vertices.device) for indices in self._faces_and_groups
         )
-        first, second, third = (
-            vertices.index_select(0, faces[:, corner]) for corner in range(3)
-        )
-        # as long as twice the face's area: the sum weights faces by area
-        face_normals = torch.linalg.cross(second - first, third - first)
+        face_normals = _compute_area_normals(vertices, faces)
         # Each face counts for the groups of its three corners. Both tensors have first
         # the first corners of all faces, then the second and the third ones.
         group_of_corner = groups[faces].T.reshape(-1)
@@ -150,6 +146,17 @@ class MovingMesh:
         return torch.from_numpy(faces), torch.from_numpy(groups.astype(np.int64))
 
 
+def _compute_area_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return the normals (F, 3) of faces, as long as twice the face's area.
+
+    A sum of them weights faces by area.
+    """
+    first, second, third = (
+        vertices.index_select(0, faces[:, corner]) for corner in range(3)
+    )
+    return torch.linalg.cross(second - first, third - first)
+
+
 def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
     """Return a mesh of a scene with its inputs applied, in world space, z up.
 
@@ -170,13 +177,16 @@ def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
     color = part.base_color
     if "base_color" in values:
         color = linear_to_srgb(values["base_color"].clamp(0.0, 1.0)).numpy()
-    material_numbers = {
-        key: float(values[key]) for key in vars(part.material) if key in values
-    }
-    material = replace(part.material, **material_numbers)
+    material = _update_material(part.material, values)
     return replace(
         part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4)
     )
+
+
+def _update_material(material: Material, values: Mapping[str, Tensor]) -> Material:
+    """Return a material with those of its numbers replaced that `values` has by name."""
+    numbers = {key: float(values[key]) for key in vars(material) if key in values}
+    return replace(material, **numbers)
 
 
 def _select_inputs_of(name: str, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -271,9 +281,7 @@ class InputAssembler:
         # Inputs of the space, which are replaced one after the other by those of
         # Mitsuba's scene.
         parameters = dict(inputs)
-        photograph_index = 0
-        if PHOTOGRAPH_INPUT in parameters:
-            photograph_index = int(parameters.pop(PHOTOGRAPH_INPUT))
+        photograph_index = int(parameters.pop(PHOTOGRAPH_INPUT, 0))
         parameters |= self._get_image_inputs(photograph_index)
         # Lamps move with the car that carries them, whose pose is in `inputs`. From
         # `parameters` it is removed below.
@@ -616,10 +624,7 @@ class Motion:
             positions, is_visible: what `project_points` returns at `u`.
         """
         for nudge in NUDGES:  # changes of u, largest first
-            nudged = u.clone()
-            # At the upper border of the unit cube the change goes backwards.
-            sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
-            nudged[coordinate] += sign * nudge
+            nudged = _nudge_coordinate(u, coordinate, nudge)
             new_positions, still_visible = self.project_points(make_inputs(nudged))
             shifts = (new_positions - positions)[is_visible & still_visible]
             distances = shifts.norm(dim=1)
@@ -628,6 +633,17 @@ class Motion:
             if bool((distances > 0.0).any()):
                 return float(distances.max()) / nudge
         return 0.0
+
+
+def _nudge_coordinate(u: Tensor, coordinate: int, nudge: float) -> Tensor:
+    """Return a configuration (d,) of which one coordinate is changed by `nudge`.
+
+    At the upper border of the unit cube the change goes backwards.
+    """
+    nudged = u.clone()
+    sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
+    nudged[coordinate] += sign * nudge
+    return nudged
 
 
 def _sample_environment(description: SceneDescription) -> Tensor:

@@ -414,14 +414,7 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     """
     if len(mesh.faces) <= max_faces:
         return None
-    for grid in SIMPLIFICATION_GRIDS:  # from the finest to the coarsest
-        cluster_of = _cluster_vertices(mesh, grid)
-        # For each new vertex, the index of an old one that it represents. The two sides
-        # of a texture seam have a new vertex each, in one cluster.
-        representative, faces = _merge_clusters(mesh, cluster_of)
-        if len(faces) <= max_faces:
-            break
-    # The clusters and faces are those of the grid with which the loop has ended.
+    cluster_of, representative, faces = _cluster_to_limit(mesh, max_faces)
     distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
     simplifier = _Simplifier(
         cluster_of,
@@ -431,6 +424,26 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
         faces=distinct_faces,
     )
     return simplifier.simplify
+
+
+def _cluster_to_limit(
+    mesh: Mesh, max_faces: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Cluster a mesh by the finest grid that leaves at most `max_faces` faces.
+
+    If no grid does, it is the coarsest.
+
+    Returns:
+        (V,) the cluster of each vertex; (N,) for each new vertex the index of an old
+        one that it represents; and the faces (F, 3) of new vertices. The two sides of a
+        texture seam have a new vertex each, in one cluster.
+    """
+    for grid in SIMPLIFICATION_GRIDS:  # from the finest to the coarsest
+        cluster_of = _cluster_vertices(mesh, grid)
+        representative, faces = _merge_clusters(mesh, cluster_of)
+        if len(faces) <= max_faces:
+            break
+    return cluster_of, representative, faces
 
 
 @dataclass(frozen=True, eq=False)

@@ -265,18 +265,30 @@ def make_image_inputs(
     blur = _find_blur(description, color)
     noise_setting = description.values.get("backdrop.noise")
     noise = photograph.make_noise(resolution, noise_setting)
-    depth = photograph.resample_depth(resolution)
-    if depth is not None:
-        _check_has_size(description, photograph)
+    depth = _resample_depth_in_sizes(description, photograph, resolution)
     inputs: dict[str, Tensor | None] = {
         "backdrop.color": color,
         "backdrop.plane": compute_plane_radiance(description),
         "backdrop.front": photograph.resample_front(resolution),
-        "backdrop.depth": None if depth is None else depth / description.size_in_metres,
+        "backdrop.depth": depth,
         "backdrop.noise": noise if bool(noise.any()) else None,
         "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
     }
     return {name: value for name, value in inputs.items() if value is not None}
+
+
+def _resample_depth_in_sizes(
+    description: SceneData, photograph: BackdropPhotograph, resolution: tuple[int, int]
+) -> Tensor | None:
+    """Return the depth of a photograph in object sizes; None if it has none.
+
+    Raises InputError: it has depth, and the object's size in meters is not known.
+    """
+    depth = photograph.resample_depth(resolution)
+    if depth is None:
+        return None
+    _check_has_size(description, photograph)
+    return depth / description.size_in_metres
 
 
 def _find_blur(description: SceneData, color: Tensor) -> float:
@@ -322,8 +334,7 @@ def compose_over_photograph(
         Radiance (H, W, 3).
     """
     radiance = rendered[..., channels.RADIANCE]
-    rendered_coverage = rendered[..., channels.COVERAGE]
-    coverage = rendered_coverage
+    coverage = rendered[..., channels.COVERAGE]
     front = inputs.get("backdrop.front")
     if front is not None:
         visible_object = 1.0 - front[..., :1]
@@ -629,16 +640,7 @@ def _look_up_levels(
         points: (N, 3) in world space.
     """
     height, width = photograph.full_size
-    camera = camera_to_world(description, width / height)
-    # points in the camera's coordinates: left, up and ahead
-    relative = (points - camera[:3, 3]) @ camera[:3, :3]
-    # Projection needs the aspect of the full photograph; that of the description may
-    # be that of a part.
-    full_description = replace(description, aspect=width / height)
-    no_inputs: dict[str, Tensor] = {}
-    positions, is_visible = project_points(
-        full_description, no_inputs, torch.from_numpy(relative), (height, width)
-    )
+    positions, is_visible = _project_to_photograph(description, (height, width), points)
     size = np.array([width, height])
     # Positions (x to the right, y down) are counted from the middle of the image,
     # pixels from its top left.
@@ -647,6 +649,33 @@ def _look_up_levels(
     column, row = pixels[is_inside].T
     looked_up: npt.NDArray[np.uint8] = photograph.levels[row, column]
     return looked_up
+
+
+def _project_to_photograph(
+    description: SceneData, full_size: tuple[int, int], points: Float64Array
+) -> tuple[Tensor, Tensor]:
+    """Return where points (N, 3) lie in a full photograph.
+
+    Args:
+        description: the scene with the camera of the full photograph, not of a part.
+        full_size: height and width of the photograph in pixels.
+        points: (N, 3) in world space.
+
+    Returns:
+        (N, 2) pixels from the middle of the image, and (N,) whether the camera sees the
+        point.
+    """
+    height, width = full_size
+    camera = camera_to_world(description, width / height)
+    # points in the camera's coordinates: left, up and ahead
+    relative = (points - camera[:3, 3]) @ camera[:3, :3]
+    # Projection needs the aspect of the full photograph; that of the description may
+    # be that of a part.
+    full_description = replace(description, aspect=width / height)
+    no_inputs: dict[str, Tensor] = {}
+    return project_points(
+        full_description, no_inputs, torch.from_numpy(relative), full_size
+    )
 
 
 # ---- The camera of a photograph
@@ -666,21 +695,28 @@ def make_matrix_camera(
     """
     matrix = np.asarray(camera_matrix, np.float64)
     _check_camera_matrix(matrix)
-    height, width = size
-    # In the order of `LINEAR_PARAMETERS`: fx, fy, cx, cy and skew, lengths along x as
-    # fractions of the width, those along y of the height. Half a pixel is added to the
-    # principal point, since our (0, 0) is the corner of the first pixel, not its
-    # center.
-    linear = (
-        matrix[0, 0] / width,
-        matrix[1, 1] / height,
-        (matrix[0, 2] + 0.5) / width,
-        (matrix[1, 2] + 0.5) / height,
-        matrix[0, 1] / width,
-    )
     n_coefficients = len(NUMBER_NAMES) - len(LINEAR_PARAMETERS)
-    numbers = (*map(float, linear), *[0.0] * n_coefficients)
+    no_distortion = [0.0] * n_coefficients
+    numbers = (*_list_linear_parameters(matrix, size), *no_distortion)
     return CameraModel(BROWN_CONRADY, numbers, PHOTOGRAPH_CAMERA, size)
+
+
+def _list_linear_parameters(matrix: Float64Array, size: tuple[int, int]) -> list[float]:
+    """Return the `LINEAR_PARAMETERS` of a camera matrix (3, 3), in their order.
+
+    They are fx, fy, cx, cy and skew, lengths along x as fractions of the width, those
+    along y of the height. Half a pixel is added to the principal point, since our (0,
+    0) is the corner of the first pixel, not its center. `size` is height and width in
+    pixels.
+    """
+    height, width = size
+    return [
+        float(matrix[0, 0] / width),
+        float(matrix[1, 1] / height),
+        float((matrix[0, 2] + 0.5) / width),
+        float((matrix[1, 2] + 0.5) / height),
+        float(matrix[0, 1] / width),
+    ]
 
 
 def _check_camera_matrix(matrix: Float64Array) -> None:
@@ -723,12 +759,7 @@ def fit_to_photograph(
     """
     _check_film(photograph, resolution)
     _check_gloss(description)
-    full_height, full_width = photograph.full_size
-    full_aspect = full_width / full_height
-    model = description.camera_model
-    if model is not None:
-        model = _adapt_bundled_model(model, full_aspect)
-        _check_camera_shape(photograph, model)
+    model = _find_full_camera(description, photograph)
     uncropped = replace(description, camera_model=model)
     color_settings = measure_plane_color(uncropped, photograph, gain)
     if photograph.is_cropped:
@@ -740,6 +771,22 @@ def fit_to_photograph(
         camera_model=model,
         values={**description.values, **color_settings},
     )
+
+
+def _find_full_camera(
+    description: SceneData, photograph: BackdropPhotograph
+) -> CameraModel | None:
+    """Return the lens model that took a full photograph; None for a pinhole.
+
+    Raises InputError: the camera's pictures have another shape than the photograph.
+    """
+    model = description.camera_model
+    if model is None:
+        return None
+    full_height, full_width = photograph.full_size
+    model = _adapt_bundled_model(model, full_width / full_height)
+    _check_camera_shape(photograph, model)
+    return model
 
 
 def _adapt_bundled_model(model: CameraModel, aspect: float) -> CameraModel:

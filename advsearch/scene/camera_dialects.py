@@ -264,16 +264,24 @@ def _translate_orbslam(
     }
     other_cameras = {name for name in cameras if name != selected_camera}
     for name, value in data.items():
-        camera, _, entry_name = name.partition(".")
+        camera, _, _entry_name = name.partition(".")
         is_other = camera in other_cameras or ORBSLAM_NON_LENS_KEYS.fullmatch(name)
         if is_other or name == "Camera.type":  # the distortion model above
             continue
-        # Several cameras share the entries of `Camera`, such as `Camera.width`.
-        if camera in (selected_camera, "Camera"):
-            entries[ORBSLAM_SIZE_NAMES.get(entry_name, entry_name)] = value
-        else:
-            entries[name] = value
+        entries[_shorten_orbslam_name(name, selected_camera)] = value
     return entries
+
+
+def _shorten_orbslam_name(name: str, selected_camera: str) -> str:
+    """Return the name of an entry of ORB-SLAM without the selected camera before it.
+
+    Several cameras share the entries of `Camera`, such as `Camera.width`. Other entries
+    keep their names.
+    """
+    camera, _, entry_name = name.partition(".")
+    if camera in (selected_camera, "Camera"):
+        return ORBSLAM_SIZE_NAMES.get(entry_name, entry_name)
+    return name
 
 
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
@@ -342,16 +350,31 @@ def _translate_kitti(
     raw_match = KITTI_RAW.fullmatch(matrix_name)
     if raw_match:
         distortion_name = f"D_{raw_match[1]}"
-        entries["distortion_coefficients"] = _read_numbers(
-            path, data, distortion_name, 5
-        )
-    # K_02 has its size in S_02, P_rect_02 in S_rect_02, and P2 has none.
+        coefficients = _read_numbers(path, data, distortion_name, count=5)
+        entries["distortion_coefficients"] = coefficients
+    return entries | _read_kitti_size(path, data, matrix_name)
+
+
+def _read_kitti_size(
+    path: str, data: Mapping[str, Any], matrix_name: str
+) -> dict[str, Any]:
+    """Return `image_size` of a camera of KITTI; empty if other entries have the size.
+
+    K_02 has its size in S_02, P_rect_02 in S_rect_02, and P2 has none.
+
+    Args:
+        path: the file, for messages.
+        data: all entries of the file.
+        matrix_name: name of the camera's matrix, such as "P_rect_02".
+
+    Raises:
+        FileFormatError: the file has no size of the image.
+    """
     size_name = re.sub(r"^[KP]_", "S_", matrix_name)
     if size_name != matrix_name and size_name in data:
-        entries["image_size"] = _read_numbers(path, data, size_name, 2)
-    else:
-        _check_has_size_entries(path, data)
-    return entries
+        return {"image_size": _read_numbers(path, data, size_name, count=2)}
+    _check_has_size_entries(path, data)
+    return {}
 
 
 def _read_kitti_matrix(

@@ -1078,17 +1078,22 @@ def _load_object(
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
-        # `up` is "y", "z" or None: others were rejected before. These branches do not
-        # change it, but give it a type that `import_object` accepts.
-        known_up: Literal["y", "z"] | None = None
-        if up == "y":
-            known_up = "y"
-        elif up == "z":
-            known_up = "z"
         with track_opened_files(spec):
-            return import_object(Path(spec), up=known_up, facing=facing)
+            return import_object(Path(spec), up=_narrow_up_axis(up), facing=facing)
     _check_bundled_axes(spec, up, facing)
     return library.load_object(str(spec))
+
+
+def _narrow_up_axis(up: str | None) -> Literal["y", "z"] | None:
+    """Return an axis as it is, with the type that `import_object` accepts.
+
+    It is "y", "z" or None: others were rejected before.
+    """
+    if up == "y":
+        return "y"
+    if up == "z":
+        return "z"
+    return None
 
 
 def _check_bundled_axes(spec: str | Path, up: str | None, facing: str | None) -> None:

@@ -326,21 +326,31 @@ def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
     """
     vertices = scene.base_vertices
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    # Unit directions (W, 3) to the light, and radiance times solid angle (W, 3). The
-    # latter times the cosine at the surface is irradiance.
     directions, power = _compute_distant_light(scene, center)
-    cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
-    # by `einsum`, not by BLAS, whose last bits depend on the number of threads
-    irradiances = np.asarray(np.einsum("nw,wc->nc", cosines, power))
+    irradiances = _sum_irradiance(normals, directions, power)
     irradiances = _add_lamp_light(irradiances, scene, normals, center)
     # The object's own emission is left out: it does not light the object from outside.
     for name in scene.surrounding_meshes:
         part = scene.meshes[name]
         if part.emission is not None:
             directions, power = _compute_emitted_light(part, part.emission, center)
-            cosines = np.maximum(np.einsum("nk,fk->nf", normals, directions), 0.0)
-            irradiances = irradiances + np.einsum("nf,fc->nc", cosines, power)
+            irradiances = irradiances + _sum_irradiance(normals, directions, power)
     return irradiances
+
+
+def _sum_irradiance(
+    normals: Float64Array, directions: Float64Array, power: Float64Array
+) -> Float64Array:
+    """Return the irradiance (N, 3) of surfaces with unit normals (N, 3).
+
+    Args:
+        normals: normals of the surfaces.
+        directions: (W, 3) unit directions to the light.
+        power: (W, 3) irradiance that it causes on a surface turned towards it.
+    """
+    cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
+    # by `einsum`, not by BLAS, whose last bits depend on the number of threads
+    return np.asarray(np.einsum("nw,wc->nc", cosines, power))
 
 
 def _add_lamp_light(
@@ -517,14 +527,7 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     faces = faces[is_ahead]
     frame = Frame.from_fov(scene.get_number("camera.fov"), scene.aspect)
     pixel_width, shape = _choose_metering_shape(frame)
-    tangents = points[faces][..., :2] / points[faces][..., 2:]
-    # The image is mirrored and upside down: its columns go to the left and its rows up,
-    # as the camera's coordinates do. That changes no normal. The frame is symmetric, so
-    # that the image begins at the same tangents in these directions.
-    from_first_corner = tangents - (frame.left, frame.low)
-    # The raster's coordinates are 0 at the center of its first pixel, not at the
-    # border.
-    pixel_coordinates = from_first_corner / pixel_width - 0.5
+    pixel_coordinates = _locate_in_raster(points[faces], frame, pixel_width)
     face, row, column, weights = rasterize_triangles(pixel_coordinates, shape)
     # 1 / depth, unlike depth, may be interpolated linearly over the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)
@@ -536,6 +539,27 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     from_camera = points[corners].mean(axis=1) @ camera_axes.T
     is_back_facing = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
     return np.asarray(np.where(is_back_facing, -normals, normals))
+
+
+def _locate_in_raster(
+    points: Float64Array, frame: Frame, pixel_width: float
+) -> Float64Array:
+    """Return positions (..., 2) of points (..., 3) in the raster of an image, in pixels.
+
+    The image is mirrored and upside down: its columns go to the left and its rows up,
+    as the camera's coordinates do. That changes no normal. The frame is symmetric, so
+    that the image begins at the same tangents in these directions.
+
+    Args:
+        points: points in the camera's coordinates: left, up and ahead.
+        frame: frame of the image.
+        pixel_width: width of a pixel at distance 1.
+    """
+    tangents = points[..., :2] / points[..., 2:]
+    from_first_corner = tangents - (frame.left, frame.low)
+    # The raster's coordinates are 0 at the center of its first pixel, not at the
+    # border.
+    return np.asarray(from_first_corner / pixel_width - 0.5)
 
 
 def _interpolate_normals(
@@ -717,9 +741,7 @@ def divide_exposure(
     offsets = moment_starts + moment_duration / 2.0 - (shutter + rolling) / 2.0
     # A row overlaps with shutter / moment_duration moments, each of which takes this
     # fraction of its samples. Without a shutter one moment takes all of them.
-    sample_fraction = 1.0
-    if shutter:
-        sample_fraction = min(1.0, moment_duration / shutter)
+    sample_fraction = min(1.0, moment_duration / shutter) if shutter else 1.0
     return offsets, weights.float(), sample_fraction
 
 

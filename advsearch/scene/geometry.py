@@ -201,13 +201,8 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
         roll: rotation of the image, counter-clockwise, degrees.
     """
     azimuth = math.radians(azimuth)
-    elevation = math.radians(elevation)
     roll = math.radians(roll)
-    horizontal = math.cos(elevation)
-    vertical = math.sin(elevation)
-    outwards = np.array(
-        [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), vertical]
-    )
+    outwards = _compute_orbit_direction(azimuth, math.radians(elevation))
     left = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     upright = np.cross(-outwards, left)
     rolled_axes = (
@@ -215,6 +210,15 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
         math.cos(roll) * upright - math.sin(roll) * left,
     )
     return np.stack([*rolled_axes, outwards])
+
+
+def _compute_orbit_direction(azimuth: float, elevation: float) -> Float64Array:
+    """Return the unit vector (3,) at an azimuth and an elevation, in radians."""
+    horizontal = math.cos(elevation)
+    vertical = math.sin(elevation)
+    return np.array(
+        [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), vertical]
+    )
 
 
 def compute_center(description: SceneData) -> Float64Array:
@@ -622,23 +626,34 @@ def find_overlap_interval(
     if not has_common_height:
         return NO_OVERLAP
     normals = _compute_edge_normals(first, second)
-    # positions (corners, k) of the corners along each normal
-    first_positions = first.outline @ normals.T
-    second_positions = second.outline @ normals.T
-    # (k,) how far the first has to move along each normal until its projection begins
-    # to overlap that of the second, and until it no longer overlaps
-    distance_to_begin = second_positions.min(axis=0) - first_positions.max(axis=0)
-    distance_to_end = second_positions.max(axis=0) - first_positions.min(axis=0)
+    distances = _measure_overlap_distances(first, second, normals)
     # (k,) how far a shift of 1 moves the first along each normal
     speeds = normals @ direction
     # Along a normal at a right angle to the shift the first does not move. If its
     # projection does not overlap before the shift, it never does.
     is_still = speeds == 0.0
+    distance_to_begin, distance_to_end = distances
     is_separated = (distance_to_begin >= 0.0) | (distance_to_end <= 0.0)
     if (is_still & is_separated).any():
         return NO_OVERLAP
-    distances = np.stack([distance_to_begin, distance_to_end])
     return _intersect_overlaps(distances[:, ~is_still], speeds[~is_still])
+
+
+def _measure_overlap_distances(
+    first: Footprint, second: Footprint, normals: Float64Array
+) -> Float64Array:
+    """Return how far a footprint has to move along normals (k, 2) to overlap another.
+
+    Returns:
+        (2, k) distances until the projection of the first on each normal begins to
+        overlap that of the second, and until it no longer overlaps.
+    """
+    # positions (corners, k) of the corners along each normal
+    first_positions = first.outline @ normals.T
+    second_positions = second.outline @ normals.T
+    distance_to_begin = second_positions.min(axis=0) - first_positions.max(axis=0)
+    distance_to_end = second_positions.max(axis=0) - first_positions.min(axis=0)
+    return np.stack([distance_to_begin, distance_to_end])
 
 
 def _intersect_overlaps(

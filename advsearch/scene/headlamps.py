@@ -141,12 +141,24 @@ def make_candela_table(kind: str) -> Float32Array:
         np.degrees(np.arctan(side_tangent)),
         np.degrees(np.arctan2(up_tangent, np.hypot(1.0, side_tangent))),
     )
-    # 0.2 of half the width is a tenth of the width
     fade = np.minimum(
-        (TABLE_HALF_WIDTH - np.abs(side_tangent)) / (0.2 * TABLE_HALF_WIDTH),
-        (half_height - np.abs(up_tangent)) / (0.2 * half_height),
+        _compute_border_fade(side_tangent, TABLE_HALF_WIDTH),
+        _compute_border_fade(up_tangent, half_height),
     )
     return np.asarray(candela * fade.clip(0.0, 1.0), np.float32)
+
+
+def _compute_border_fade(tangent: Float64Array, half_size: float) -> Float64Array:
+    """Return factors that fall to 0 in the outer tenth at each border of a table.
+
+    Further inside they are above 1.
+
+    Args:
+        tangent: positions along one axis, from the middle of the table.
+        half_size: half the width or height of the table.
+    """
+    # 0.2 of half the size is a tenth of the size
+    return np.asarray((half_size - np.abs(tangent)) / (0.2 * half_size))
 
 
 def add_lamps(scene: AnyScene) -> AnyScene:
@@ -223,9 +235,7 @@ def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
     Raises InputError: the environment's light has no unit, or the object's size in
     metres is not known.
     """
-    # the setting that switched the lamps on, for the message; all other cars are things
-    setting_by_carrier = {OBJECT: "`set` object.lamps", CAMERA: "`set` camera.lamps"}
-    setting = setting_by_carrier.get(carrier, "things: lamps")
+    setting = _name_lamp_setting(carrier)
     radiance_unit = None if scene.environment is None else scene.environment.candelas
     if radiance_unit is None:
         raise InputError(
@@ -240,6 +250,15 @@ def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
             "such as `size=4.5`"
         )
     return radiance_unit
+
+
+def _name_lamp_setting(carrier: str) -> str:
+    """Return what switches on the lamps of a car, for messages.
+
+    Cars other than the object and the camera's own are things.
+    """
+    setting_by_carrier = {OBJECT: "`set` object.lamps", CAMERA: "`set` camera.lamps"}
+    return setting_by_carrier.get(carrier, "things: lamps")
 
 
 def get_lamp_kind(scene: SceneData, setting: str) -> str:
@@ -497,9 +516,9 @@ def _make_disks(
     # A disk is at most a fifth as wide as the car.
     rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
     # the lower one of both heights, above the lowest point
-    center_z = lower[2] + min(
-        height * units_per_metre, height_fraction * (upper[2] - lower[2])
-    )
+    body_height = upper[2] - lower[2]
+    lamp_height = min(height * units_per_metre, height_fraction * body_height)
+    center_z = lower[2] + lamp_height
     gap = GLASS_OFFSET * units_per_metre
     disks = list[Float64Array]()
     for side in (1.0, -1.0):

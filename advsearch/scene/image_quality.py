@@ -54,21 +54,27 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     """
     sigmas = []
     for channel in range(levels.shape[2]):
-        values = levels[..., channel].astype(np.float64)
-        # The filter reaches beyond the image at its outermost pixels, which are left
-        # out.
-        residual = np.abs(ndimage.convolve(values, RESIDUAL)[1:-1, 1:-1])
-        is_clipped = ((values == 0.0) | (values == 255.0))[1:-1, 1:-1]
-        block_residuals = _split_blocks(residual)  # (blocks, pixels)
-        clipped_fraction = _split_blocks(is_clipped).mean(axis=1)
-        usable_blocks = block_residuals[clipped_fraction <= MAX_CLIPPED]
-        sigma = 0.0
-        if len(usable_blocks):
-            medians = np.median(usable_blocks, axis=1)
-            sigma = MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
+        sigma = _measure_channel_noise(levels[..., channel].astype(np.float64))
         # The variance that rounding to integer levels adds is subtracted.
         sigmas.append(np.sqrt(max(0.0, sigma**2 - ROUNDING_VARIANCE)))
     return np.array(sigmas)
+
+
+def _measure_channel_noise(values: Float64Array) -> float:
+    """Return the standard deviation of the noise of one channel (H, W), in levels.
+
+    It contains the noise of rounding. It is 0 if too much of the image is clipped.
+    """
+    # The filter reaches beyond the image at its outermost pixels, which are left out.
+    residual = np.abs(ndimage.convolve(values, RESIDUAL)[1:-1, 1:-1])
+    is_clipped = ((values == 0.0) | (values == 255.0))[1:-1, 1:-1]
+    block_residuals = _split_blocks(residual)  # (blocks, pixels)
+    clipped_fraction = _split_blocks(is_clipped).mean(axis=1)
+    usable_blocks = block_residuals[clipped_fraction <= MAX_CLIPPED]
+    if not len(usable_blocks):
+        return 0.0
+    medians = np.median(usable_blocks, axis=1)
+    return MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
 
 
 def _split_blocks(image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
@@ -180,15 +186,19 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
     for angle in np.radians(CALIBRATION_ANGLES):
         pixels = _render_edge(grid, angle, oversampling)
         for index, blur in enumerate(blurs):
-            image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
-            measured_blur = _measure_edges(image)
-            assert (
-                measured_blur is not None
-            )  # an edge across the image has enough pixels
+            measured_blur = _measure_added_blur(pixels, blur)
             measured_blurs[index] += measured_blur / len(CALIBRATION_ANGLES)
     # An interpolation needs strictly rising values: equal ones get tiny differences.
     tiny_steps = 1e-9 * np.arange(len(blurs))
     return blurs, np.maximum.accumulate(measured_blurs + tiny_steps)
+
+
+def _measure_added_blur(pixels: Float64Array, blur: float) -> float:
+    """Return what `_measure_edges` returns for an edge (H, W) that is blurred."""
+    image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
+    measured_blur = _measure_edges(image)
+    assert measured_blur is not None  # an edge across the image has enough pixels
+    return measured_blur
 
 
 def _render_edge(grid: Float64Array, angle: float, oversampling: int) -> Float64Array:

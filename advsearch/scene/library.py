@@ -183,10 +183,8 @@ def _read_object(name: str, directory: Traversable) -> ObjectAsset:
     mesh = _read_mesh(name, directory, facts.get("faces", ()))
     base_color = _read_base_color(directory)
     material = Material(**facts["material"])
-    finishes = {
-        finish: Material(**values)
-        for finish, values in facts.get("finishes", {}).items()
-    }
+    finish_values = facts.get("finishes", {})
+    finishes = {name: Material(**values) for name, values in finish_values.items()}
     surface = make_finished_surface(mesh, finishes, material) if finishes else None
     return ObjectAsset(
         name=name,

@@ -771,18 +771,28 @@ def _compute_limb_turns(
     limb_angles = {joint: angle_by_joint[f"{side}_{joint}"] for joint, *_ in LIMBS}
     suffix = side[0]
     rotations = dict[str, Tensor]()
-    shoulder_rotation = make_axis_rotation(
-        "x", sign * limb_angles["shoulder_out"]
-    ) @ make_axis_rotation("y", -limb_angles["shoulder"])
+    shoulder_rotation = _make_swing_rotation(
+        outwards=sign * limb_angles["shoulder_out"], forwards=limb_angles["shoulder"]
+    )
     shoulder_turn = make_axis_rotation("z", -sign * limb_angles["shoulder_turn"])
     rotations[f"upperarm_{suffix}"] = shoulder_rotation @ shoulder_turn
     rotations[f"lowerarm_{suffix}"] = make_axis_rotation("y", -limb_angles["elbow"])
-    rotations[f"thigh_{suffix}"] = make_axis_rotation(
-        "x", sign * limb_angles["hip_out"]
-    ) @ make_axis_rotation("y", -limb_angles["hip"])
+    rotations[f"thigh_{suffix}"] = _make_swing_rotation(
+        outwards=sign * limb_angles["hip_out"], forwards=limb_angles["hip"]
+    )
     rotations[f"calf_{suffix}"] = make_axis_rotation("y", limb_angles["knee"])
     rotations[f"foot_{suffix}"] = make_axis_rotation("y", -limb_angles["ankle"])
     return rotations
+
+
+def _make_swing_rotation(outwards: Tensor, forwards: Tensor) -> Tensor:
+    """Return the rotation (3, 3) of a hanging limb forwards, and then to the left.
+
+    Args:
+        outwards: degrees to the left side; negative to the right.
+        forwards: degrees to the front.
+    """
+    return make_axis_rotation("x", outwards) @ make_axis_rotation("y", -forwards)
 
 
 def make_axis_rotation(axis: str, degrees: Tensor) -> Tensor:

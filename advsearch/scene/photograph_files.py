@@ -339,18 +339,23 @@ def _parse_settings(file: Path, stated: object) -> dict[str, float]:
     """
     if not isinstance(stated, Mapping):
         raise FileFormatError(f"{file}: set: expected settings by name")
-    for name in stated:
-        if not str(name).startswith(VIEW_SETTINGS):
-            raise FileFormatError(
-                f"{file}: set: {name!s:.60} is not about the view; expected settings "
-                f"that begin with {', '.join(VIEW_SETTINGS)}"
-            )
+    _check_view_settings(file, stated)
     try:
         values = resolve_settings(stated)
     except InputError as error:
         raise FileFormatError(f"{file}: {error}") from None
     # A stated value is never None; "or" is for the type.
     return {str(name): float(values[name] or 0.0) for name in stated}
+
+
+def _check_view_settings(file: Path, stated: Mapping[Any, object]) -> None:
+    """Raise FileFormatError if a camera file sets what is not about the view."""
+    for name in stated:
+        if not str(name).startswith(VIEW_SETTINGS):
+            raise FileFormatError(
+                f"{file}: set: {name!s:.60} is not about the view; expected settings "
+                f"that begin with {', '.join(VIEW_SETTINGS)}"
+            )
 
 
 def _parse_occluder(file: Path, stated: Mapping[str, Any]) -> str | None:
@@ -394,17 +399,34 @@ def make_photograph_scene(
     scene = _apply_stated_settings(description, view.settings)
     requested_camera = camera or view.camera
     photograph = find_photograph_file(view.spec)  # `spec` is a path: never None here
-    cameras = requested_camera
-    if isinstance(requested_camera, str):
-        cameras = _read_cameras(requested_camera, photograph)
-    if isinstance(cameras, str):
-        scene = scene.with_camera(cameras)
-    elif cameras is not None and photograph is not None:
-        scene = scene.with_photograph_camera(cameras, photograph)
+    scene = _with_requested_camera(scene, requested_camera, photograph)
     scene = scene.with_backdrop(view.spec, occluder or view.occluder)
     if view.object_to_camera is None:
         return scene
     return _apply_measured_pose(scene, view, view.object_to_camera)
+
+
+def _with_requested_camera(
+    scene: SceneDescription,
+    requested_camera: str | PhotographCameras | None,
+    photograph: Path | None,
+) -> SceneDescription:
+    """Return a scene with the camera that took a photograph, if there is one.
+
+    Args:
+        scene: the scene.
+        requested_camera: a camera file, the name of a camera, or the cameras of many
+            photographs or their file; None leaves the camera as it is.
+        photograph: the file of the photograph.
+    """
+    cameras = requested_camera
+    if isinstance(requested_camera, str):
+        cameras = _read_cameras(requested_camera, photograph)
+    if isinstance(cameras, str):
+        return scene.with_camera(cameras)
+    if cameras is not None and photograph is not None:
+        return scene.with_photograph_camera(cameras, photograph)
+    return scene
 
 
 def _apply_stated_settings(
