@@ -333,13 +333,7 @@ def compose_over_photograph(
     Returns:
         Radiance (H, W, 3).
     """
-    radiance = rendered[..., channels.RADIANCE]
-    coverage = rendered[..., channels.COVERAGE]
-    front = inputs.get("backdrop.front")
-    if front is not None:
-        visible_object = 1.0 - front[..., :1]
-        radiance = visible_object * radiance
-        coverage = visible_object * coverage
+    radiance, coverage = _cover_object(rendered, inputs.get("backdrop.front"))
     # fraction of each pixel in which the photograph is visible
     uncovered = (1.0 - coverage).clamp(0.0, 1.0)
     if "backdrop.plane" not in inputs:
@@ -355,6 +349,23 @@ def compose_over_photograph(
     # and what it has lost is added again.
     lost_reflection = (uncovered - shade) * _compute_coat_reflection(rendered, behind)
     return radiance + (shade * behind + lost_reflection + coat_change).clamp_min(0.0)
+
+
+def _cover_object(rendered: Tensor, front: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return radiance (H, W, 3) and coverage (H, W, 1) of the object's visible part.
+
+    Args:
+        rendered: (H, W, C) image with the channels of
+            `advsearch.scene.rendered_channels`.
+        front: (H, W, 1) or (H, W, 2), first channel: fraction of the object in each
+            pixel that something in front of it hides; None for nothing.
+    """
+    radiance = rendered[..., channels.RADIANCE]
+    coverage = rendered[..., channels.COVERAGE]
+    if front is None:
+        return radiance, coverage
+    visible_object = 1.0 - front[..., :1]
+    return visible_object * radiance, visible_object * coverage
 
 
 def _compute_plane_changes(

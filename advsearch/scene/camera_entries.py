@@ -226,9 +226,7 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
             has not named one.
     """
     names = list(map(str, cameras))
-    listing = ", ".join(names[:8])
-    if len(names) > 8:
-        listing += ", ..."
+    listing = _list_first_names(names)
     example = f"{path}#{names[0]}"
     if camera_name and camera_name not in names:
         raise FileFormatError(
@@ -241,6 +239,13 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
             f"picture, as in {example}"
         )
     return cameras[camera_name or names[0]]
+
+
+def _list_first_names(names: Sequence[str]) -> str:
+    """Return the first eight names of a list, for messages."""
+    max_names = 8
+    listing = ", ".join(names[:max_names])
+    return f"{listing}, ..." if len(names) > max_names else listing
 
 
 def has_no_effect(value: object) -> bool:

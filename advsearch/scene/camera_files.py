@@ -212,17 +212,22 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
         return _read_opencv(spec, CameraEntries(path, translated))
     if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
         return _read_nerfstudio(spec, camera_name, data)
-    cameras = {
-        name: entry
-        for name, entry in data.items()
-        if isinstance(entry, dict) and "intrinsics" in entry
-    }
+    cameras = _find_kalibr_cameras(data)
     if cameras:
         return _read_kalibr_chain(spec, data, cameras)
     _check_no_camera_name(path, camera_name)
     if "intrinsics" in data and "camera_model" in data:
         return _read_kalibr(spec, CameraEntries(path, data))
     return _read_opencv(spec, CameraEntries(path, _flatten_groups(data)))
+
+
+def _find_kalibr_cameras(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return those entries of a file that are cameras of Kalibr, by name."""
+    return {
+        name: entry
+        for name, entry in data.items()
+        if isinstance(entry, dict) and "intrinsics" in entry
+    }
 
 
 def _read_kalibr_chain(

@@ -537,8 +537,13 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     normals = _interpolate_normals(scene, corners, weights[visible])
     # from the camera to the middle of the visible face, in world space
     from_camera = points[corners].mean(axis=1) @ camera_axes.T
-    is_back_facing = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
-    return np.asarray(np.where(is_back_facing, -normals, normals))
+    return _turn_against(normals, from_camera)
+
+
+def _turn_against(normals: Float64Array, directions: Float64Array) -> Float64Array:
+    """Return normals (N, 3), reversed where they point along directions (N, 3)."""
+    is_along = (normals * directions).sum(axis=1, keepdims=True) > 0.0
+    return np.asarray(np.where(is_along, -normals, normals))
 
 
 def _locate_in_raster(

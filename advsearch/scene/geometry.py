@@ -489,12 +489,7 @@ def compute_real_harmonics(height: int, width: int) -> Tensor:
     which is sqrt(4 pi) times the factors of Ramamoorthi and Hanrahan 2001, section 3.
     The last axis has the degrees 0 (one), 1 (y, z, x) and 2 (five).
     """
-    theta = (torch.arange(height) + 0.5) * math.pi / height
-    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
-    # (height, width) unit vectors: theta is the angle from +z
-    x = theta.sin()[:, None] * phi.cos()[None]
-    y = theta.sin()[:, None] * phi.sin()[None]
-    z = theta.cos()[:, None].expand(height, width)
+    x, y, z = _compute_texel_directions(height, width)
     root3 = math.sqrt(3.0)
     root15 = math.sqrt(15.0)
     root5 = math.sqrt(5.0)
@@ -508,6 +503,19 @@ def compute_real_harmonics(height: int, width: int) -> Tensor:
     return torch.stack(
         [*lower_degrees, *degree_two, root15 / 2.0 * (x * x - y * y)], dim=-1
     )
+
+
+def _compute_texel_directions(height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return x, y and z (height, width) of unit vectors to the texels of a map.
+
+    Row 0 of the equirectangular map is around +z, and columns run from +x over +y.
+    """
+    theta = (torch.arange(height) + 0.5) * math.pi / height  # the angle from +z
+    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
+    x = theta.sin()[:, None] * phi.cos()[None]
+    y = theta.sin()[:, None] * phi.sin()[None]
+    z = theta.cos()[:, None].expand(height, width)
+    return x, y, z
 
 
 def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:

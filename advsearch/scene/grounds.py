@@ -449,10 +449,8 @@ def make_camera_view(
     half_height_angle = _compute_half_height_angle(scene, fov)
     azimuth = math.degrees(math.atan2(y, x))
     view_azimuth = _compute_view_azimuth(forward, azimuth)
-    # how far above the horizon the middle of the image is
-    view_elevation = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
     # how far below the horizon the lower border of the image is
-    lower_angle = half_height_angle - view_elevation
+    lower_angle = half_height_angle - _compute_view_elevation(forward)
     return CameraView(
         azimuth=azimuth,
         view_azimuth=view_azimuth,
@@ -460,6 +458,15 @@ def make_camera_view(
         height=float(z),
         lower_angle=lower_angle,
     )
+
+
+def _compute_view_elevation(forward: Float64Array) -> float:
+    """Return how far above the horizon a camera looks, degrees.
+
+    `forward` (3,) is the unit vector of its axis. Its z may be beyond 1 by rounding.
+    """
+    sine = float(np.clip(forward[2], -1.0, 1.0))
+    return math.degrees(math.asin(sine))
 
 
 def _compute_view_azimuth(forward: Float64Array, azimuth: float) -> float:

@@ -335,10 +335,21 @@ class Person:
             below_hip = (hip_height - posed[:, 2]) / (hip_height - ankle_height)
             leg_weight = weights[:, thigh] + weights[:, calf]
             leg_weight = leg_weight * below_hip.clamp(0.0, 1.0)
-            foot_bones = self._find_foot_bones(foot)
-            foot_weight = sum(weights[:, index] for index in foot_bones)
-            rise = rise + foot_rise * (foot_weight + leg_weight)
+            rise = rise + foot_rise * (self._weigh_foot(foot, weights) + leg_weight)
         return torch.cat([posed[:, :2], (posed[:, 2] + rise)[:, None]], dim=1)
+
+    def _weigh_foot(self, foot: int, weights: Tensor) -> Tensor:
+        """Return the weight (P,) with which all bones of a foot move each point.
+
+        Args:
+            foot: index of the foot's bone.
+            weights: (P, J) weights of all bones.
+        """
+        foot_bones = self._find_foot_bones(foot)
+        total = torch.zeros_like(weights[:, foot])
+        for index in foot_bones:
+            total = total + weights[:, index]
+        return total
 
     def _find_foot_bones(self, foot: int) -> list[int]:
         """Return the bone of a foot and its children."""

@@ -234,14 +234,12 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
         raise InputError(
             f"object {name}: expected a mesh with faces, got none; export triangles"
         )
-    normals = (
-        _read_buffer_rows(parameters, NORMALS, 3) if mesh.has_vertex_normals() else None
-    )
-    uvs = (
-        _read_buffer_rows(parameters, TEXCOORDS, 2)
-        if mesh.has_vertex_texcoords()
-        else None
-    )
+    normals = None
+    if mesh.has_vertex_normals():
+        normals = _read_buffer_rows(parameters, NORMALS, 3)
+    uvs = None
+    if mesh.has_vertex_texcoords():
+        uvs = _read_buffer_rows(parameters, TEXCOORDS, 2)
     attributes = _read_attributes(parameters, len(vertices), len(faces))
     return Buffers(vertices, faces, normals, uvs, attributes)
 

@@ -489,9 +489,7 @@ class ViewTracer:
         values = []
         for index in range(n_tables):
             entry = surface_start + index * texel_rays.N_ANGLES + lower
-            lower_value = dr.gather(mi.Float, tables, entry)
-            upper_value = dr.gather(mi.Float, tables, entry + 1)
-            values.append(lower_value + fraction * (upper_value - lower_value))
+            values.append(_lerp_entries(tables, entry, fraction))
         return values
 
     def _reflect(
@@ -674,6 +672,13 @@ class ViewTracer:
             lit.texels, first_cell, n_rows, n_columns, row, column
         )
         return dr.select(on_any_grid, radiance, 0.0)
+
+
+def _lerp_entries(table: Any, entry: Any, fraction: Any) -> Any:
+    """Interpolate between an entry of a flat table and the next one."""
+    lower_value = dr.gather(mi.Float, table, entry)
+    upper_value = dr.gather(mi.Float, table, entry + 1)
+    return lower_value + fraction * (upper_value - lower_value)
 
 
 def _gather_camera(camera_numbers: Any, camera_index: Any) -> list[Any]:
