@@ -578,13 +578,24 @@ def _read_focal_lengths(
     fy_by_angle = _compute_focal_length(path, data.get("camera_angle_y"), height)
     # Without an angle there is no default, and the length is required.
     fx = entries.get_number("fl_x", default=fx_by_angle)
+    _check_focal_lengths_agree(path, fx, fx_by_angle)
+    default_fy = fx if fy_by_angle is None else fy_by_angle
+    return {"fx": fx, "fy": entries.get_number("fl_y", default=default_fy)}
+
+
+def _check_focal_lengths_agree(path: str, fx: float, fx_by_angle: float | None) -> None:
+    """Raise FileFormatError if a focal length contradicts that of an angle of view.
+
+    Args:
+        path: the file, for messages.
+        fx: focal length along x in pixels.
+        fx_by_angle: that of the angle of view; None if the file has no angle.
+    """
     if fx_by_angle is not None and abs(fx - fx_by_angle) > MAX_FOCAL_MISMATCH * fx:
         raise FileFormatError(
             f"{path}: fl_x: expected {fx_by_angle:g}, as camera_angle_x states, got "
             f"{fx:g}; leave one out"
         )
-    default_fy = fx if fy_by_angle is None else fy_by_angle
-    return {"fx": fx, "fy": entries.get_number("fl_y", default=default_fy)}
 
 
 def _select_lens(
@@ -908,15 +919,24 @@ def _check_roi(entries: CameraEntries, size: tuple[float, float]) -> list[str]:
     roi = CameraEntries(entries.path, {str(key): value[key] for key in value})
     numbers = _read_optional_numbers(roi, ("x_offset", "y_offset", "height", "width"))
     roi.get("dorectify")  # marks it as read: it changes nothing in a full image
-    offset = (numbers["x_offset"], numbers["y_offset"])
-    roi_size = (numbers["height"], numbers["width"])
-    is_full_image = offset == (0.0, 0.0) and roi_size in ((0.0, 0.0), size)
-    if not is_full_image:
+    if not _is_full_image(numbers, size):
         raise FileFormatError(
             f"{entries.path}: expected a camera_info of full pictures, got one of a "
             "part (roi); set it to 0"
         )
     return roi.find_unread("roi.")
+
+
+def _is_full_image(numbers: Mapping[str, float], size: tuple[float, float]) -> bool:
+    """Return whether a region of interest of ROS is the full image.
+
+    Args:
+        numbers: offsets and size of the region in pixels, by ROS's names.
+        size: height and width of the image in pixels.
+    """
+    offset = (numbers["x_offset"], numbers["y_offset"])
+    roi_size = (numbers["height"], numbers["width"])
+    return offset == (0.0, 0.0) and roi_size in ((0.0, 0.0), size)
 
 
 def _find_kind(path: str, model: object) -> str:

@@ -567,18 +567,26 @@ def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _
     # The vertices of the second disk follow those of the first.
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
-    # A query returns the distances to the nearest points, and their indices.
-    _distances, nearest_vertex = cKDTree(mesh.vertices).query(vertices)
     car_face_centers = mesh.vertices[mesh.faces].mean(axis=1)
     disk_face_centers = vertices[faces].mean(axis=1)
-    _distances, nearest_face = cKDTree(car_face_centers).query(disk_face_centers)
     return _Glass(
         vertices,
         faces,
         normals,
-        vertex_of_carrier=nearest_vertex,
-        face_of_carrier=nearest_face,
+        vertex_of_carrier=_find_nearest_indices(vertices, mesh.vertices),
+        face_of_carrier=_find_nearest_indices(disk_face_centers, car_face_centers),
     )
+
+
+def _find_nearest_indices(
+    queries: Float64Array, points: Float32Array | Float64Array
+) -> IntArray:
+    """Return for each of (N, 3) queries the index (N,) of the nearest of some points.
+
+    `points` are (M, 3).
+    """
+    _distances, indices = cKDTree(points).query(queries)
+    return np.asarray(indices)
 
 
 def _make_circle(facing: float) -> Float64Array:

@@ -373,6 +373,18 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
     return LightImage(size=planes[0].shape, read_rows=read_rows, notes=tuple(notes))
 
 
+# values that a map may not have: a name, a test of a plane's texels, and a remedy
+_BAD_RADIANCES: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
+    ("NaN", np.isnan, "paint them over"),
+    (
+        "infinite",
+        np.isinf,
+        "clamp them, or save the map in 32-bit floats if half floats overflowed",
+    ),
+    ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
+)
+
+
 def _check_planes(path: Path, planes: Sequence[Plane]) -> None:
     """Check the radiance of an ``.exr`` image.
 
@@ -381,16 +393,7 @@ def _check_planes(path: Path, planes: Sequence[Plane]) -> None:
 
     Raises InputError: a texel is NaN, infinite or negative in one of its three planes.
     """
-    kinds: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
-        ("NaN", np.isnan, "paint them over"),
-        (
-            "infinite",
-            np.isinf,
-            "clamp them, or save the map in 32-bit floats if half floats overflowed",
-        ),
-        ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
-    )
-    for kind, is_bad, remedy in kinds:
+    for kind, is_bad, remedy in _BAD_RADIANCES:
         bad_texels = is_bad(planes[0]) | is_bad(planes[1]) | is_bad(planes[2])
         if bad_texels.any():
             raise InputError(
@@ -470,13 +473,7 @@ def _resize_map(
         read_rows: returns the rows (n, W, 3) from a first row to an end.
         size: height and width of the map.
     """
-    height, width = size
-    shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
-    if shrink == 1.0:
-        texels = read_rows(0, height)
-    else:
-        target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
-        texels = _average_map(read_rows, size, target_shape)
+    texels = _shrink_map(read_rows, size)
     # how often a texel is repeated along each side; 1 for a map that is large enough
     row_repeats = math.ceil(MIN_MAP_SIZE[0] / texels.shape[0])
     column_repeats = math.ceil(MIN_MAP_SIZE[1] / texels.shape[1])
@@ -484,6 +481,21 @@ def _resize_map(
         texels.repeat(row_repeats, axis=0).repeat(column_repeats, axis=1),
         dtype=np.float32,
     )
+
+
+def _shrink_map(
+    read_rows: Callable[[int, int], Float32Array], size: tuple[int, int]
+) -> Float32Array:
+    """Return a map, averaged down to `MAX_MAP_SIZE` if it is larger.
+
+    The arguments are those of `_resize_map`.
+    """
+    height, width = size
+    shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
+    if shrink == 1.0:
+        return read_rows(0, height)
+    target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
+    return _average_map(read_rows, size, target_shape)
 
 
 def _average_map(

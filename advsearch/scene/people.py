@@ -245,9 +245,8 @@ class Person:
             posed = self._correct_legs(
                 posed, rotations, translations, joints, foot_rises
             )
-        # The origin is below the pelvis (the first bone), at the height of the lowest
-        # point.
-        pelvis = translations[0] + rotations[0] @ joints[0]
+        pelvis = translations[0] + rotations[0] @ joints[0]  # of the first bone
+        # below the pelvis, at the height of the lowest point
         origin = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
         point_of_vertex = self._get_tensor("index", device)
         return (scale * (posed - origin)).index_select(0, point_of_vertex)
@@ -391,19 +390,17 @@ class Person:
             (G, A, W, H) weights of the extremes of gender, age, weight and height,
             which sum to 1; and the factor to the requested height.
         """
-        gender_weights = torch.stack(
-            [1.0 - number_by_name["gender"], number_by_name["gender"]]
-        )
-        age_weights = compute_interpolation_weights(
-            number_by_name["age"], number_by_name["age"].new_tensor(AGES)
-        )
-        # The "weight" of a body is 0 if it is thin, 0.5 if average and 1 if heavy.
-        body_weight_weights = compute_interpolation_weights(
-            number_by_name["weight"],
-            number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
+        gender = number_by_name["gender"]
+        gender_weights = torch.stack([1.0 - gender, gender])
+        age = number_by_name["age"]
+        age_weights = compute_interpolation_weights(age, age.new_tensor(AGES))
+        # The heaviness of a body is 0 if it is thin, 0.5 if average and 1 if heavy.
+        heaviness = number_by_name["weight"]
+        heaviness_weights = compute_interpolation_weights(
+            heaviness, heaviness.new_tensor([0.0, 0.5, 1.0])
         )
         mixture = torch.einsum(
-            "g,a,w->gaw", gender_weights, age_weights, body_weight_weights
+            "g,a,w->gaw", gender_weights, age_weights, heaviness_weights
         )
         return self._mix_heights(mixture, number_by_name["height"])
 

@@ -90,19 +90,16 @@ class PhotographedGround:
         radius, map_column = np.meshgrid(radii, map_columns, indexing="ij")
         # Columns of a map begin at +y, and continue over +x, -y and -x.
         azimuth = 0.5 * math.pi - 2.0 * math.pi * map_column + math.radians(rotation)
-        vertices = height * np.stack(
-            [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
-            axis=-1,
-        )
+        x = radius * np.cos(azimuth)
+        y = radius * np.sin(azimuth)
+        vertices = height * np.stack([x, y, np.zeros_like(radius)], axis=-1)
         uvs = np.stack([map_column, self._compute_texture_v(radius)], axis=-1)
-        normals = np.tile(
-            np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
-        )
+        upwards = np.array([0.0, 0.0, 1.0], np.float32)
         return Mesh(
-            vertices.reshape(-1, 3).astype(np.float32),
-            _make_ring_faces(),
-            normals,
-            uvs.reshape(-1, 2).astype(np.float32),
+            vertices=vertices.reshape(-1, 3).astype(np.float32),
+            faces=_make_ring_faces(),
+            normals=np.tile(upwards, (vertices.size // 3, 1)),
+            uvs=uvs.reshape(-1, 2).astype(np.float32),
         )
 
     def _compute_texture_v(self, radius: Float64Array) -> Float64Array:

@@ -813,11 +813,7 @@ class MitsubaScene:
             key, _scene_input = self.declared_inputs[name]
             spp = self.round_sample_count(spp)
             noise = self._make_noise(seed, spp)
-            # "mug.base_color" belongs to a mesh, and a pattern to a projector, which is
-            # one of Mitsuba's emitters.
-            part = name.partition(".")[0]
-            is_pattern = name.endswith(PATTERN_SUFFIX)
-            projector = self._find_projector(part) if is_pattern else None
+            projector = self._find_projector_of(name)
             paths = collect_paths(
                 self._scene,
                 self.parameters,
@@ -833,19 +829,20 @@ class MitsubaScene:
             if projector is not None:
                 size = self.parameters[key].shape[:2]
                 return _repeat_vertices(paths, surface=None, size=size)
-            return self._repeat_on_mesh(paths, part, key)
+            return self._repeat_on_mesh(paths, name, key)
 
-    def _repeat_on_mesh(self, paths: TracedPaths, part: str, key: str) -> TracedPaths:
+    def _repeat_on_mesh(self, paths: TracedPaths, name: str, key: str) -> TracedPaths:
         """Return paths with texture coordinates for the repeating texture of a mesh.
 
-        Only the texture of a surface of the user's repeats.
+        They change only on a surface of the user's: one of ours repeats already.
 
         Args:
             paths: the paths.
-            part: name of the mesh.
+            name: input of the texture, such as "mug.base_color".
             key: Mitsuba's key of the texture.
         """
-        surface = self.description_and_filter[0].meshes[part].surface
+        description, _filter = self.description_and_filter
+        surface = description.meshes[name.partition(".")[0]].surface
         if surface is None:
             return paths
         return _repeat_vertices(paths, surface, self.parameters[key].shape[:2])
@@ -858,6 +855,16 @@ class MitsubaScene:
         # `opaque`: a literal seed would be compiled into the kernel as a constant.
         noise.seed(dr.opaque(mi.UInt32, seed), n_samples)
         return noise
+
+    def _find_projector_of(self, input_name: str) -> Any:
+        """Return the projector to which an input belongs; None if it is no pattern.
+
+        "mug.base_color" belongs to a mesh, and a pattern to a projector, which is one
+        of Mitsuba's emitters.
+        """
+        if not input_name.endswith(PATTERN_SUFFIX):
+            return None
+        return self._find_projector(input_name.partition(".")[0])
 
     def _find_projector(self, name: str) -> Any:
         """Return the emitter of Mitsuba's scene with a name, or None."""

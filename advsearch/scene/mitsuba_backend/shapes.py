@@ -557,11 +557,7 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
     camera_media.discard(None)
     ball_names = _find_filled_balls(named, camera_media)
-    medium_names = [
-        name
-        for name, plugin in named.items()
-        if plugin["type"] in _UNIFORM_OR_GRID_MEDIA
-    ]
+    medium_names = _list_media(named)
     is_single_haze = len(camera_media) == len(ball_names) == len(medium_names) == 1
     if not is_single_haze:
         return None
@@ -571,6 +567,15 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     if not (is_plain and camera_media == {medium_name}):
         return None
     return ball_name, medium_name
+
+
+def _list_media(named: Plugins) -> list[str]:
+    """Return the names of the media of a scene."""
+    return [
+        name
+        for name, plugin in named.items()
+        if plugin["type"] in _UNIFORM_OR_GRID_MEDIA
+    ]
 
 
 def _find_filled_balls(named: Plugins, media: Collection[str | None]) -> list[str]:

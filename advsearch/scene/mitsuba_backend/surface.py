@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -648,8 +648,27 @@ class ViewTracer:
             masks: for each grid whether the hit is on it.
             lit: the light.
         """
-        # The grid of each lane. Without one, these are those of a single cell, whose
-        # color is replaced by 0 in the end.
+        position = self._find_grid_positions(si, masks)
+        # Rows and columns are integers at the centers of cells.
+        row = position.y * mi.Float(position.n_rows) - 0.5
+        column = position.x * mi.Float(position.n_columns) - 0.5
+        radiance = _look_up_bilinear(
+            lit.texels,
+            position.first_cell,
+            position.n_rows,
+            position.n_columns,
+            row,
+            column,
+        )
+        return dr.select(position.on_any_grid, radiance, 0.0)
+
+    def _find_grid_positions(self, si: Any, masks: Sequence[Any]) -> _GridPosition:
+        """Return the grid of texels on which each hit is, and where in that grid.
+
+        Args:
+            si: surface interaction of the hit.
+            masks: for each grid whether the hit is on it.
+        """
         first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
         n_columns = mi.UInt32(1)
@@ -664,14 +683,21 @@ class ViewTracer:
             first_cell = dr.select(mask, mi.UInt32(grid.first_cell_index), first_cell)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
-        # y and x are fractions of the grid's height and width. Rows and columns are
-        # integers at the centers of cells.
-        row = y * mi.Float(n_rows) - 0.5
-        column = x * mi.Float(n_columns) - 0.5
-        radiance = _look_up_bilinear(
-            lit.texels, first_cell, n_rows, n_columns, row, column
-        )
-        return dr.select(on_any_grid, radiance, 0.0)
+        return _GridPosition(first_cell, n_rows, n_columns, y, x, on_any_grid)
+
+
+class _GridPosition(NamedTuple):
+    """Where hits lie in grids of texels, one value in each lane.
+
+    A hit on no grid has a grid of a single cell.
+    """
+
+    first_cell: Any  # index of the grid's first cell among the cells of all grids
+    n_rows: Any
+    n_columns: Any
+    y: Any  # fraction of the grid's height
+    x: Any  # fraction of its width
+    on_any_grid: Any  # whether the hit is on a grid
 
 
 def _lerp_entries(table: Any, entry: Any, fraction: Any) -> Any:

@@ -555,11 +555,7 @@ def measure_lobes(
         samples = _sample_bsdf(scene, inputs, grid, position, normal, cosine)
     gloss = samples.weight.mean(axis=1)
     towards_viewer, up = _measure_mean_direction(samples, gloss, cosine)
-    # The squared angle from each sample to the mean direction, approximated by the
-    # squared distance of unit vectors, 2 - 2 cos(angle).
-    squared_angle = 2.0 * np.maximum(
-        0.0, 1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
-    )
+    squared_angle = _measure_squared_angles(samples, towards_viewer, up)
     core, tail = _measure_spreads(samples.weight, squared_angle)
     return Lobes(
         diffuse=_measure_diffuse_fraction(samples).astype(np.float32),
@@ -569,6 +565,23 @@ def measure_lobes(
         core=core.astype(np.float32),
         tail=tail.astype(np.float32),
     )
+
+
+def _measure_squared_angles(
+    samples: _BsdfSamples, towards_viewer: Float64Array, up: Float64Array
+) -> Float64Array:
+    """Return the squared angle from each sample of the gloss to its mean direction.
+
+    It is approximated by the squared distance of unit vectors, 2 - 2 cos(angle).
+
+    Args:
+        samples: samples of the BSDF.
+        towards_viewer, up: (N_ANGLES,) components of the mean direction.
+    """
+    one_minus_cosine = (
+        1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
+    )
+    return np.asarray(2.0 * np.maximum(0.0, one_minus_cosine))
 
 
 def _measure_diffuse_fraction(samples: _BsdfSamples) -> Float64Array:
