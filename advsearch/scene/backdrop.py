@@ -1000,9 +1000,7 @@ def compute_view_settings(
     distance = float(center[2])
     if distance <= 0.0:
         raise InputError("object_to_camera: puts the object behind the camera")
-    object_up = mesh_to_camera[:3, 2]  # z axis of the mesh in camera coordinates
-    world_up = object_up if up is None else np.asarray(up, np.float64)
-    world_axes = _make_world_axes(world_up)
+    world_axes = _make_world_axes(_find_world_up(mesh_to_camera, up))
     rotation = world_axes @ mesh_to_camera[:3, :3]
     # shift of the object's center from the point that the camera orbits, in the world
     orbit_center = np.array([0.0, 0.0, distance])
@@ -1023,6 +1021,20 @@ def compute_view_settings(
         "pose.z": lowest,
         "ground.level": lowest,
     }
+
+
+def _find_world_up(
+    mesh_to_camera: Float64Array, up: npt.ArrayLike | None
+) -> Float64Array:
+    """Return the direction (3,) in the camera's coordinates that is up in the world.
+
+    Args:
+        mesh_to_camera: (4, 4) from the mesh's coordinates to the camera's.
+        up: (3,) the direction; None: the object's own up axis, the z axis of the mesh.
+    """
+    if up is None:
+        return mesh_to_camera[:3, 2]
+    return np.asarray(up, np.float64)
 
 
 def _measure_lowest(vertices: Float64Array, rotation: Float64Array) -> float:

@@ -407,10 +407,7 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     are the same as a pinhole, and are translated to "none".
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
-    # "distortion.brown_conrady" and "Brown Conrady" become "brown_conrady".
-    stated_model = str(data.get("model", "none"))
-    model_name = stated_model.rpartition(".")[2].strip().lower()
-    model = re.sub(r"[-\s]+", "_", model_name)
+    model = _simplify_realsense_model(str(data.get("model", "none")))
     coefficients = data.get("coeffs")
     is_undistorted = isinstance(coefficients, list) and not any(coefficients)
     if model in ("kannala_brandt4", "kannala_brandt"):
@@ -423,6 +420,15 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
             model = "none"
     entries["distortion_model"] = model
     return entries
+
+
+def _simplify_realsense_model(stated_model: str) -> str:
+    """Return the name of a distortion model of RealSense in one spelling.
+
+    "distortion.brown_conrady" and "Brown Conrady" become "brown_conrady".
+    """
+    name = stated_model.rpartition(".")[2].strip().lower()
+    return re.sub(r"[-\s]+", "_", name)
 
 
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:

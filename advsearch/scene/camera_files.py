@@ -699,9 +699,7 @@ def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
     path = entries.path
     kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
-        # Binning and a region are not read here: `find_unread` rejects them.
-        panorama = make_camera_model(spec, kind, _read_size(entries), {})
-        return add_notes(panorama, entries.find_unread())
+        return _read_opencv_panorama(spec, entries)
     matrix = _read_camera_matrix(path, entries)
     height, width = _read_size(entries)
     unread_roi_keys = _check_roi(entries, (height, width))
@@ -715,6 +713,17 @@ def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
     model = replace(model, calibrated_shape=binned_size)
     rectified_keys = _find_rectified(entries, matrix)
     return add_notes(model, unread_roi_keys + entries.find_unread(), rectified_keys)
+
+
+def _read_opencv_panorama(spec: str, entries: CameraEntries) -> CameraModel:
+    """Return the model of a panorama, which has a size and no other numbers.
+
+    Binning and a region are not read here: `find_unread` rejects them. The arguments
+    are those of `_read_opencv`.
+    """
+    size = _read_size(entries)
+    panorama = make_camera_model(spec, EQUIRECTANGULAR, size, pixel_values={})
+    return add_notes(panorama, entries.find_unread())
 
 
 def _find_opencv_kind(path: str, entries: CameraEntries) -> str:

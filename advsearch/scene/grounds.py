@@ -156,10 +156,7 @@ def load_requested_place(scene: SceneData) -> Place | None:
     """
     kind = find_ground_kind(scene)
     if kind is not None:
-        if kind not in PLACE_BY_GROUND_KIND:
-            return None
-        bundled_name, variant = PLACE_BY_GROUND_KIND[kind]
-        return load_bundled_place(bundled_name, variant)
+        return _load_place_of_kind(kind)
     if scene.environment is None:
         return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
@@ -168,6 +165,14 @@ def load_requested_place(scene: SceneData) -> Place | None:
         return None
     surroundings: Place | None = scene.environment.place
     return surroundings
+
+
+def _load_place_of_kind(kind: str) -> Place | None:
+    """Return the bundled place of a kind of ground; None for a kind that is no place."""
+    if kind not in PLACE_BY_GROUND_KIND:
+        return None
+    bundled_name, variant = PLACE_BY_GROUND_KIND[kind]
+    return load_bundled_place(bundled_name, variant)
 
 
 def with_requested_ground(scene: AnyScene) -> AnyScene:

@@ -511,14 +511,11 @@ def _make_disks(
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [facing, 1.0, 1.0]
     lower = corners.min(axis=(0, 1))
     upper = corners.max(axis=(0, 1))
-    height, height_fraction = LAMP_HEIGHTS[lamp_type]  # meters, and of the car's height
     width = upper[1] - lower[1]
     # A disk is at most a fifth as wide as the car.
     rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
-    # the lower one of both heights, above the lowest point
     body_height = upper[2] - lower[2]
-    lamp_height = min(height * units_per_metre, height_fraction * body_height)
-    center_z = lower[2] + lamp_height
+    center_z = lower[2] + _find_lamp_height(lamp_type, body_height, units_per_metre)
     gap = GLASS_OFFSET * units_per_metre
     disks = list[Float64Array]()
     for side in (1.0, -1.0):
@@ -526,6 +523,20 @@ def _make_disks(
         center = np.array([0.0, center_y, center_z])
         disks.append(_make_disk(corners, center + rim_offsets, center, facing, gap))
     return _attach_disks(mesh, disks, facing)
+
+
+def _find_lamp_height(
+    lamp_type: str, body_height: float, units_per_metre: float
+) -> float:
+    """Return the height of lamps above a car's lowest point, in the car's coordinates.
+
+    Args:
+        lamp_type: "headlamps" or "taillamps", a key of `LAMP_HEIGHTS`.
+        body_height: height of the car.
+        units_per_metre: length of a metre.
+    """
+    metres, fraction_of_body = LAMP_HEIGHTS[lamp_type]
+    return min(metres * units_per_metre, fraction_of_body * body_height)
 
 
 def _make_disk(

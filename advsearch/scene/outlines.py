@@ -18,6 +18,7 @@ from torch import Tensor
 from advsearch.scene.assets import BoolArray, Float64Array
 from advsearch.scene.camera_model import EQUIRECTANGULAR
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world, project_points
 from advsearch.scene.raster import rasterize_triangles
 from advsearch.scene.renderer import Renderer
@@ -73,14 +74,31 @@ def find_visible_meshes(
         inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
     visible = []
     for name in description.meshes if names is None else names:
-        if name not in surfaces.shape_names:
-            continue
-        mask = surfaces.visible_mask(name).numpy()
-        if mask.any():
-            fraction, is_truncated = _compare_outline(renderer, inputs, name, mask)
-            distance = float(surfaces.depth.numpy()[mask].min())
-            visible.append(VisibleMesh(name, mask, fraction, is_truncated, distance))
+        mesh = _find_visible_mesh(renderer, inputs, surfaces, name)
+        if mesh is not None:
+            visible.append(mesh)
     return visible
+
+
+def _find_visible_mesh(
+    renderer: Renderer, inputs: Mapping[str, Tensor], surfaces: Surfaces, name: str
+) -> VisibleMesh | None:
+    """Return what of a mesh is visible; None if it is the nearest surface in no pixel.
+
+    Args:
+        renderer: renderer of the scene.
+        inputs: inputs of the scene, assembled.
+        surfaces: first surface that the camera sees in each pixel.
+        name: name of the mesh.
+    """
+    if name not in surfaces.shape_names:
+        return None
+    mask = surfaces.visible_mask(name).numpy()
+    if not mask.any():
+        return None
+    fraction, is_truncated = _compare_outline(renderer, inputs, name, mask)
+    distance = float(surfaces.depth.numpy()[mask].min())
+    return VisibleMesh(name, mask, fraction, is_truncated, distance)
 
 
 def _compare_outline(

@@ -307,7 +307,7 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     Raises:
         InputError: its pose has a determinant of 0, so that it has no extent.
     """
-    vertices, faces, normals, uvs = _make_unit_shape(kind)
+    vertices, faces, normals, uvs = _make_unit_shape(kind)  # in its fields' order
     shape_pose = _compute_shape_pose(kind, shape)
     # without faces that have no area, such as those at a pole
     areas = np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1)
@@ -336,41 +336,73 @@ def _compute_shape_pose(kind: str, shape: Mapping[str, object]) -> Float64Array:
     return pose
 
 
-def _make_unit_shape(
-    kind: str,
-) -> tuple[Float64Array, IntArray, Float64Array, Float64Array]:
-    """Return the triangles of one of `TESSELLATED_SHAPES` as Mitsuba's unit shape.
+class _UnitShape(NamedTuple):
+    """The triangles of one of Mitsuba's shapes before it is posed."""
 
-    Returns:
-        Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
-    """
+    vertices: Float64Array  # (V, 3)
+    faces: IntArray  # (F, 3)
+    normals: Float64Array  # (V, 3)
+    uvs: Float64Array  # (V, 2) texture coordinates
+
+
+def _make_unit_shape(kind: str) -> _UnitShape:
+    """Return the triangles of one of `TESSELLATED_SHAPES` as Mitsuba's unit shape."""
     turns = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # fractions of a full turn
-    normals = None  # for flat shapes, (0, 0, 1) below
     if kind == "sphere":
-        # u goes around, and v from pole to pole, with half as many segments.
-        uvs, faces = _make_grid(turns, turns[::2])
-        polar = np.pi * uvs[:, 1]
-        x, y = np.sin(polar) * _compute_circle_points(uvs[:, 0])
-        vertices = np.stack([x, y, np.cos(polar)], axis=1)
-        normals = vertices
-    elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        # u goes around, and v along the axis.
-        uvs, faces = _make_grid(turns, np.array([0.0, 1.0]))
-        x, y = _compute_circle_points(uvs[:, 0])
-        vertices = np.stack([x, y, uvs[:, 1]], axis=1)
-        normals = vertices * (1.0, 1.0, 0.0)
-    elif kind == "disk":
-        # v goes around. u is the radius, along which the disk is flat: an eighth of the
-        # segments is enough.
-        uvs, faces = _make_grid(turns[::8], turns)
-        x, y = uvs[:, 0] * _compute_circle_points(uvs[:, 1])
-        vertices = np.stack([x, y, np.zeros(len(uvs))], axis=1)
-    else:  # a rectangle
-        uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-        vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
-    if normals is None:
-        normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
-    return vertices, faces, normals, uvs
+        return _make_unit_sphere(turns)
+    if kind == "cylinder":
+        return _make_unit_cylinder(turns)
+    if kind == "disk":
+        return _make_unit_disk(turns)
+    return _make_unit_rectangle()
+
+
+def _make_unit_sphere(turns: Float64Array) -> _UnitShape:
+    """Return a sphere of radius 1, whose segments have borders at fractions of a turn.
+
+    u goes around, and v from pole to pole, with half as many segments.
+    """
+    uvs, faces = _make_grid(turns, turns[::2])
+    polar = np.pi * uvs[:, 1]
+    x, y = np.sin(polar) * _compute_circle_points(uvs[:, 0])
+    vertices = np.stack([x, y, np.cos(polar)], axis=1)
+    return _UnitShape(vertices, faces, normals=vertices, uvs=uvs)
+
+
+def _make_unit_cylinder(turns: Float64Array) -> _UnitShape:
+    """Return a cylinder of radius and height 1, open at both ends, as Mitsuba's.
+
+    u goes around, with segments that have borders at fractions of a turn, and v along
+    the axis.
+    """
+    uvs, faces = _make_grid(turns, np.array([0.0, 1.0]))
+    x, y = _compute_circle_points(uvs[:, 0])
+    vertices = np.stack([x, y, uvs[:, 1]], axis=1)
+    return _UnitShape(vertices, faces, normals=vertices * (1.0, 1.0, 0.0), uvs=uvs)
+
+
+def _make_unit_disk(turns: Float64Array) -> _UnitShape:
+    """Return a disk of radius 1, whose segments have borders at fractions of a turn.
+
+    v goes around. u is the radius, along which the disk is flat: an eighth of the
+    segments is enough.
+    """
+    uvs, faces = _make_grid(turns[::8], turns)
+    x, y = uvs[:, 0] * _compute_circle_points(uvs[:, 1])
+    vertices = np.stack([x, y, np.zeros(len(uvs))], axis=1)
+    return _UnitShape(vertices, faces, _make_upward_normals(vertices), uvs)
+
+
+def _make_unit_rectangle() -> _UnitShape:
+    """Return a square from -1 to 1 along x and y."""
+    uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
+    return _UnitShape(vertices, faces, _make_upward_normals(vertices), uvs)
+
+
+def _make_upward_normals(vertices: Float64Array) -> Float64Array:
+    """Return the normal +z for each of the vertices (V, 3) of a flat shape."""
+    return np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
 
 
 def _get_radius(shape: Mapping[str, object]) -> float:
@@ -887,7 +919,12 @@ def _parse_base_color(value: object) -> _Color | None:
         return None
     if value["type"] == "checkerboard":
         return _parse_checkerboard(value)
-    pixels = _read_pixels(value) if value["type"] == "bitmap" else None
+    return _parse_bitmap(value) if value["type"] == "bitmap" else None
+
+
+def _parse_bitmap(value: Mapping[str, object]) -> _Color | None:
+    """Return a bitmap as a base color; None if it cannot be read here."""
+    pixels = _read_pixels(value)
     if pixels is None:
         return None
     # What is left is how the image is looked up. `IMAGE_ENTRIES` also has `to_uv`,

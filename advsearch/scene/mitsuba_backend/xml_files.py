@@ -508,15 +508,9 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     """
     types = mi.Properties.Type
     if kind == types.Transform:
-        matrix = np.array(value.matrix, np.float64)
-        _check_finite(where, matrix)
-        _check_affine(where, matrix)
-        return matrix
+        return _convert_transform(where, value)
     if kind == types.Spectrum:
-        # A spectrum without wavelengths has a single value, and no pairs.
-        pairs = list(zip(value.wavelengths, value.values, strict=False))
-        _check_finite(where, pairs or value.values)
-        return {"type": "spectrum", "value": pairs or value.values[0]}
+        return _convert_spectrum(where, value)
     if kind in (types.Color, types.Vector):
         numbers = list(value)
         _check_finite(where, numbers)
@@ -524,6 +518,24 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     if kind in (types.Float, types.Integer):
         _check_finite(where, value)
     return value
+
+
+def _convert_transform(where: str, transform: Any) -> Float64Array:
+    """Return a transform as an array (4, 4); `where` begins error messages."""
+    matrix = np.array(transform.matrix, np.float64)
+    _check_finite(where, matrix)
+    _check_affine(where, matrix)
+    return matrix
+
+
+def _convert_spectrum(where: str, spectrum: Any) -> dict[str, object]:
+    """Return a spectrum as a plugin; `where` begins error messages.
+
+    A spectrum without wavelengths has a single value, and no pairs.
+    """
+    pairs = list(zip(spectrum.wavelengths, spectrum.values, strict=False))
+    _check_finite(where, pairs or spectrum.values)
+    return {"type": "spectrum", "value": pairs or spectrum.values[0]}
 
 
 def _check_finite(where: str, numbers: Any) -> None:
