@@ -384,13 +384,15 @@ def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArra
         cluster_and_cell, return_index=True, return_inverse=True
     )
     faces = new_vertex.reshape(-1)[mesh.faces]
-    # clusters of the three corners of each face
     cluster_of_new = cluster_of[representative]
-    cluster_a, cluster_b, cluster_c = cluster_of_new[faces].T
-    is_face = (
-        (cluster_a != cluster_b) & (cluster_b != cluster_c) & (cluster_c != cluster_a)
-    )
+    is_face = _find_distinct_triples(cluster_of_new[faces])
     return representative, faces[is_face]
+
+
+def _find_distinct_triples(triples: IntArray) -> BoolArray:
+    """Return in which rows (F, 3) all three numbers differ."""
+    first, second, third = triples.T
+    return np.asarray((first != second) & (second != third) & (third != first))
 
 
 def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None:

@@ -360,14 +360,10 @@ class CameraModel:
         Beyond it the image point moves back towards the center, so that two directions
         have the same image point. It is infinite if that never happens.
         """
-        # radial(r) = r n(s) / d(s) with s = r^2. The numerator of its derivative, as a
-        # polynomial in s, is (n + 2 s n') d - 2 s n d'. The lens folds at the smallest
-        # positive root of that, or at a pole, a root of d.
+        # The lens folds at the smallest positive root of the derivative, or at a pole of
+        # the distortion, a root of its denominator.
         numerator, denominator = self._polynomials
-        doubled_s = Polynomial([0.0, 2.0])  # 2 s
-        slope_numerator = (
-            numerator + doubled_s * numerator.deriv()
-        ) * denominator - doubled_s * (numerator * denominator.deriv())
+        slope_numerator = _differentiate_radial(numerator, denominator)
         roots = np.concatenate([slope_numerator.roots(), denominator.roots()])
         is_real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)
         positive_roots = roots.real[is_real & (roots.real > 0.0)]
@@ -514,16 +510,19 @@ class CameraModel:
         """
         if self.black_fraction == 0.0:
             return self.reading_notes
+        return (*self.reading_notes, self._describe_black_part())
+
+    def _describe_black_part(self) -> str:
+        """Return a sentence about the part of the image that the lens leaves black."""
         name = self.name or "the lens"
         black_part = f"{100.0 * self.black_fraction:.2g} % of the picture"
-        sentence = f"{name}: {black_part} lies outside the lens's circle and is black."
         if self.fold_angle_radians < math.radians(self.max_angle_degrees):
-            sentence = (
+            return (
                 f"{name}: the lens folds at {math.degrees(self.fold_angle_radians):.1f} "
                 f"degrees from its axis, and {black_part}, which only directions "
                 "beyond that would fill, is black."
             )
-        return (*self.reading_notes, sentence)
+        return f"{name}: {black_part} lies outside the lens's circle and is black."
 
     def describe_scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
         """Return a note if an image has another size than the camera's pictures.
@@ -550,6 +549,23 @@ class CameraModel:
             f"height): its focal lengths and its principal point are scaled to {width} "
             f"x {height}{stretch_text}.",
         )
+
+
+def _differentiate_radial(numerator: Polynomial, denominator: Polynomial) -> Polynomial:
+    """Return the numerator of the derivative of a radial distortion.
+
+    The distortion is radial(r) = r n(s) / d(s) with s = r^2. The numerator of its
+    derivative by r, as a polynomial in s, is (n + 2 s n') d - 2 s n d'.
+
+    Args:
+        numerator: n.
+        denominator: d.
+    """
+    doubled_s = Polynomial([0.0, 2.0])  # 2 s
+    slope: Polynomial = (
+        numerator + doubled_s * numerator.deriv()
+    ) * denominator - doubled_s * (numerator * denominator.deriv())
+    return slope
 
 
 def _step_within(points: Tensor, step: Tensor, max_radius: float) -> Tensor:

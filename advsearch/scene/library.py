@@ -513,12 +513,15 @@ def _average_map(
         size: height and width of the map.
         target_shape: height and width of the result.
     """
-    height = size[0]
-    polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(
-        np.pi / height
-    )
-    row_weights = np.sin(polar)[:, None, None]
+    row_weights = _compute_row_weights(size[0])[:, None, None]
     weighted_mean = average_in_bands(
         lambda top, end: read_rows(top, end) * row_weights[top:end], size, target_shape
     )
     return np.asarray(weighted_mean / average_area(row_weights, target_shape[0], 1))
+
+
+def _compute_row_weights(height: int) -> Float32Array:
+    """Return weights (height,) of a map's rows, the sines of their angles to the top."""
+    step = np.float32(np.pi / height)
+    polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * step
+    return np.asarray(np.sin(polar))

@@ -129,16 +129,19 @@ class PhotographedGround:
         map_row = torch.arange(
             self._horizon_row, self._map_rows, device=radiance.device
         ) * ((rows - 1) / (self._map_rows - 1))
-        # The row above is at most the last but one, so that there is a next row.
-        upper = map_row.floor().long().clamp_max(rows - 2)
-        fraction = (map_row - upper)[:, None, None].to(radiance.dtype)
-        lower_half = radiance[upper] + fraction * (
-            radiance[upper + 1] - radiance[upper]
-        )
+        lower_half = _interpolate_rows(radiance, map_row)
         irradiance = compute_irradiance(radiance)
         return torch.where(
             irradiance > 0.0, lower_half * math.pi / irradiance.clamp_min(1e-30), 0.0
         )
+
+
+def _interpolate_rows(values: Tensor, row: Tensor) -> Tensor:
+    """Return values (h, W, C) of a map (H, W, C) at positions (h,) among its rows."""
+    # The row above is at most the last but one, so that there is a next row.
+    upper = row.floor().long().clamp_max(values.shape[0] - 2)
+    fraction = (row - upper)[:, None, None].to(values.dtype)
+    return values[upper] + fraction * (values[upper + 1] - values[upper])
 
 
 def _make_ring_faces() -> npt.NDArray[np.uint32]:

@@ -114,10 +114,7 @@ class SharedPaths:
             for name, value in inputs.items()
             if name not in self._changeable_inputs
         }
-        is_same = fixed.keys() == self._fixed.keys() and all(
-            torch.equal(value, self._fixed[name]) for name, value in fixed.items()
-        )
-        if not is_same:
+        if not _have_equal_values(fixed, self._fixed):
             self._stored.clear()
             self._fixed = {
                 name: value.detach().clone() for name, value in fixed.items()
@@ -205,16 +202,22 @@ class SharedPaths:
         roulette_depth = self.scene.roulette_depth
         is_stratified = self.scene.sampler_name == "multijitter"
         trace = _make_sample_tracer(spp, is_stratified, depth, roulette_depth)
-        shape_ids = self._changeable_shapes
-        changed = [
-            shape for shape in self.scene.mitsuba_shapes if shape.id() in shape_ids
-        ]
-        key = ("shared paths", *sorted(shape_ids), spp, depth, roulette_depth)
+        shape_ids = sorted(self._changeable_shapes)
+        key = ("shared paths", *shape_ids, spp, depth, roulette_depth)
+        changed = self._list_changed_shapes()
         traced: tuple[Any, Any, Any] = self.scene.run_recorded(
             key, trace, changed, dr.opaque(mi.UInt32, seed), samples
         )
         dr.eval(traced)
         return traced
+
+    def _list_changed_shapes(self) -> list[Any]:
+        """Return Mitsuba's shapes whose surfaces may have changed."""
+        return [
+            shape
+            for shape in self.scene.mitsuba_shapes
+            if shape.id() in self._changeable_shapes
+        ]
 
     def _store(self, key: tuple[Any, ...], paths: StoredPaths) -> None:
         """Store the common light of a seed's images; drop the least recently used."""
@@ -223,6 +226,15 @@ class SharedPaths:
         while n_bytes > MAX_STORED_BYTES and len(self._stored) > 1:
             oldest_key = next(iter(self._stored))
             n_bytes -= self._stored.pop(oldest_key).n_bytes
+
+
+def _have_equal_values(
+    first: Mapping[str, Tensor], second: Mapping[str, Tensor]
+) -> bool:
+    """Return whether two mappings have the same names with equal tensors."""
+    return first.keys() == second.keys() and all(
+        torch.equal(value, second[name]) for name, value in first.items()
+    )
 
 
 def _add_selected_samples(

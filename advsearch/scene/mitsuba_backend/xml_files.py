@@ -241,11 +241,7 @@ class _SceneText:
             )
         root = self._parse_included(name)
         if root.tag != "scene":
-            # The root is the only element: it gets a parent, as elements of a scene
-            # have.
-            single = root
-            root = ElementTree.Element("scene")
-            root.append(single)
+            root = _wrap_in_scene(root)
         self.fill_element(root)
         return list(root)
 
@@ -291,6 +287,13 @@ class _SceneText:
                 f"{self.path}: ${name} has no value: no <default> has that name"
             )
         return self.values[name]
+
+
+def _wrap_in_scene(element: ElementTree.Element) -> ElementTree.Element:
+    """Return a `<scene>` around an element, which so gets a parent."""
+    root = ElementTree.Element("scene")
+    root.append(element)
+    return root
 
 
 def _describe_parse_error(data: bytes, error: expat.ExpatError) -> str:
