@@ -154,7 +154,8 @@ def _compute_area_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     first, second, third = (
         vertices.index_select(0, faces[:, corner]) for corner in range(3)
     )
-    return torch.linalg.cross(second - first, third - first)
+    normals: Tensor = torch.linalg.cross(second - first, third - first)
+    return normals
 
 
 def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:

@@ -834,7 +834,8 @@ def _compute_edge_sines(mesh: TriMesh, lines: _TangentLines) -> Tensor:
     An edge along the line sweeps no area.
     """
     edge_direction = _compute_edge_directions(mesh.vertices, lines.ends)
-    return torch.linalg.cross(lines.direction, edge_direction).norm(dim=1)
+    sine: Tensor = torch.linalg.cross(lines.direction, edge_direction).norm(dim=1)
+    return sine
 
 
 class _ShadowBorders(NamedTuple):
