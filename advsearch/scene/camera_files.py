@@ -660,11 +660,13 @@ def _read_kalibr(
     model = str(entries.get("cameramodel") or "pinhole")
     _check_kalibr_model(path, model)
     kind = _find_kind(path, entries.get("distortionmodel"))
-    intrinsics = entries.parse_numbers("intrinsics", entries.get("intrinsics"), (4,))
+    intrinsics = entries.parse_numbers(
+        "intrinsics", entries.get("intrinsics"), counts=(4,)
+    )
     names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
     resolution = entries.require("resolution")
-    width, height = entries.parse_numbers("resolution", resolution, (2,))
-    numbers = _read_distortion(entries, names, (0, 4))
+    width, height = entries.parse_numbers("resolution", resolution, counts=(2,))
+    numbers = _read_distortion(entries, names, counts=(0, 4))
     numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
     camera = make_camera_model(spec, kind, (height, width), numbers, FIRST_PIXEL_CENTER)
     return add_notes(camera, [*unread, *entries.find_unread()])
@@ -778,7 +780,7 @@ def _read_matrix_numbers(entries: CameraEntries) -> list[float]:
         fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
         return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     matrix = entries.require("camera_matrix", CAMERA_MATRIX_KEYS)
-    return entries.parse_numbers("camera_matrix", matrix, (9,))
+    return entries.parse_numbers("camera_matrix", matrix, counts=(9,))
 
 
 def _check_is_calibrated(path: str, matrix: Sequence[float]) -> None:
@@ -853,7 +855,7 @@ def _read_opencv_distortion(entries: CameraEntries, kind: str) -> dict[str, floa
     Raises FileFormatError: the sensor is tilted, which `CameraModel` cannot express.
     """
     if kind == FISHEYE:
-        return _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
+        return _read_distortion(entries, COEFFICIENTS[:4], counts=(0, 4))
     coefficients = _read_distortion(
         entries, OPENCV_COEFFICIENTS, OPENCV_COEFFICIENT_COUNTS
     )
@@ -893,7 +895,7 @@ def _find_rectified(entries: CameraEntries, matrix: Sequence[float]) -> list[str
         value = entries.get(normalize_key(name), short_name)  # either of its names
         if has_no_effect(value):  # missing, or all zeros
             continue
-        numbers = entries.parse_numbers(name, value, (len(expected),))
+        numbers = entries.parse_numbers(name, value, counts=(len(expected),))
         if _differ(numbers, expected):
             differing_names.append(name)
     return differing_names
@@ -969,7 +971,7 @@ def _read_size(entries: CameraEntries) -> tuple[float, float]:
     """Return the height and width of the image in pixels."""
     size = entries.get(*SIZE_KEYS)
     if size is not None:
-        width, height = entries.parse_numbers("image_size", size, (2,))
+        width, height = entries.parse_numbers("image_size", size, counts=(2,))
         return height, width
     width = entries.get_number("image_width", aliases=WIDTH_KEYS)
     return entries.get_number("image_height", aliases=HEIGHT_KEYS), width

@@ -517,7 +517,8 @@ def _average_map(
     weighted_mean = average_in_bands(
         lambda top, end: read_rows(top, end) * row_weights[top:end], size, target_shape
     )
-    return np.asarray(weighted_mean / average_area(row_weights, target_shape[0], 1))
+    mean_weight = average_area(row_weights, height=target_shape[0], width=1)
+    return np.asarray(weighted_mean / mean_weight)
 
 
 def _compute_row_weights(height: int) -> Float32Array:

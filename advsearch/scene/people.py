@@ -742,8 +742,8 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
         "neck_01": neck_rotation,
         "head": neck_rotation,
     }
-    rotations |= _compute_limb_turns(angle, "left", 1.0)
-    rotations |= _compute_limb_turns(angle, "right", -1.0)
+    rotations |= _compute_limb_turns(angle, "left", sign=1.0)
+    rotations |= _compute_limb_turns(angle, "right", sign=-1.0)
     return rotations
 
 

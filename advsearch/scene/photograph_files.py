@@ -262,14 +262,14 @@ def _parse_view(
         camera=str(file) if has_lens else None,
         settings=_parse_settings(file, stated.get("set", {})),
         object_to_camera=pose,
-        up=_parse_numbers(file, "up", stated, (3,)) if "up" in stated else None,
+        up=_parse_numbers(file, "up", stated, counts=(3,)) if "up" in stated else None,
         occluder=_parse_occluder(file, stated),
     )
 
 
 def _parse_pose(file: Path, stated: Mapping[str, Any]) -> Float64Array:
     """Return the pose (4, 4) of the object that a camera file states."""
-    numbers = _parse_numbers(file, "object_to_camera", stated, (12, 16))
+    numbers = _parse_numbers(file, "object_to_camera", stated, counts=(12, 16))
     # The last row of a pose is always 0 0 0 1, and may be left out.
     pose = np.eye(4)
     n_rows = len(numbers) // 4
@@ -279,7 +279,7 @@ def _parse_pose(file: Path, stated: Mapping[str, Any]) -> Float64Array:
 
 def _parse_part(file: Path, photograph: str, stated: Mapping[str, Any]) -> str:
     """Return the path of a photograph with the part of it that a camera file states."""
-    part = _parse_numbers(file, "part", stated, (4,))
+    part = _parse_numbers(file, "part", stated, counts=(4,))
     spec = photograph + "#" + ",".join(f"{number:.0f}" for number in part.tolist())
     if not CROP.fullmatch(spec):
         raise FileFormatError(

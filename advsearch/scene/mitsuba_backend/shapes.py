@@ -228,7 +228,7 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
     """
     mesh = _load_geometry(shape, name)
     parameters = mi.traverse(mesh)
-    vertices = _read_buffer_rows(parameters, POSITIONS, 3)
+    vertices = _read_buffer_rows(parameters, POSITIONS, width=3)
     faces = np.array(parameters[FACES], np.int64).reshape(-1, 3)
     if not len(faces):
         raise InputError(
@@ -236,10 +236,10 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
         )
     normals = None
     if mesh.has_vertex_normals():
-        normals = _read_buffer_rows(parameters, NORMALS, 3)
+        normals = _read_buffer_rows(parameters, NORMALS, width=3)
     uvs = None
     if mesh.has_vertex_texcoords():
-        uvs = _read_buffer_rows(parameters, TEXCOORDS, 2)
+        uvs = _read_buffer_rows(parameters, TEXCOORDS, width=2)
     attributes = _read_attributes(parameters, len(vertices), len(faces))
     return Buffers(vertices, faces, normals, uvs, attributes)
 
