@@ -431,18 +431,31 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         # gradients are enabled here only with `create_graph`, for a second derivative
         if not torch.is_grad_enabled():
             return derivatives
-        # A guarded value depends, for autograd, on all that the derivative depends on:
-        # differentiating it again reaches the guard, which raises the error.
-        arguments = (cotangent, *ctx.saved_tensors)
-        guarded = []
-        for value in derivatives:
-            # An identity returns the cotangent itself, whose derivative is right.
-            if value is not None and value is not cotangent:
-                value = _OnceDifferentiable.apply(value, *arguments)  # type: ignore[no-untyped-call]
-            guarded.append(value)
-        return tuple(guarded)
+        return _guard_derivatives(derivatives, cotangent, ctx.saved_tensors)
 
     return once
+
+
+def _guard_derivatives(
+    derivatives: Sequence[Tensor | None], cotangent: Tensor, saved: Sequence[Tensor]
+) -> tuple[Tensor | None, ...]:
+    """Return derivatives that raise an error if they are differentiated again.
+
+    A guarded value depends, for autograd, on all that the derivative depends on:
+    differentiating it again reaches the guard, which raises the error.
+
+    Args:
+        derivatives: what a backward pass has returned.
+        cotangent: its cotangent. An identity returns that itself, whose derivative is
+            right, so that it is not guarded.
+        saved: tensors that the forward pass has saved.
+    """
+    guarded: list[Tensor | None] = []
+    for value in derivatives:
+        if value is not None and value is not cotangent:
+            value = _OnceDifferentiable.apply(value, cotangent, *saved)  # type: ignore[no-untyped-call]
+        guarded.append(value)
+    return tuple(guarded)
 
 
 class _OnceDifferentiable(torch.autograd.Function):

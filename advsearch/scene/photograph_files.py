@@ -154,8 +154,7 @@ def read_photograph_folder(
     n_pixels = 0
     for path in _list_photographs(directory):
         _check_files(path, directory, has_camera=has_camera)
-        with open_image(path, LARGEST_FILE) as image:
-            n_pixels += image.width * image.height
+        n_pixels += _measure_pixels(path)
         check_most(
             directory, n_pixels, MAX_FOLDER_PIXELS, "photographs of at most {} pixels"
         )
@@ -165,6 +164,12 @@ def read_photograph_folder(
         _check_same_statements(view, first_view)
         views[path.name] = view
     return views
+
+
+def _measure_pixels(path: Path) -> int:
+    """Return the number of pixels of a photograph, from its file."""
+    with open_image(path, LARGEST_FILE) as image:
+        return image.width * image.height
 
 
 def _check_files(path: Path, directory: Path, *, has_camera: bool) -> None:
@@ -200,8 +205,7 @@ def _list_photographs(folder: Path) -> list[Path]:
     with os.scandir(folder) as entries:
         for index, entry in enumerate(entries, start=1):
             check_most(folder, index, MAX_FILES, "a folder of at most {} files")
-            is_photograph = Path(entry.name).suffix.lower() in PHOTOGRAPH_SUFFIXES
-            if is_photograph and not entry.name.startswith("."):
+            if _is_visible_photograph(entry.name):
                 paths.append(folder / entry.name)
     if not paths:
         raise FileFormatError(
@@ -210,6 +214,12 @@ def _list_photographs(folder: Path) -> list[Path]:
         )
     check_most(folder, len(paths), MAX_PHOTOGRAPHS, "at most {} photographs")
     return sorted(paths)
+
+
+def _is_visible_photograph(file_name: str) -> bool:
+    """Return whether a file is a photograph, by its name, and is not hidden."""
+    is_photograph = Path(file_name).suffix.lower() in PHOTOGRAPH_SUFFIXES
+    return is_photograph and not file_name.startswith(".")
 
 
 def _check_inside(path: Path, folder: Path) -> None:

@@ -1003,22 +1003,11 @@ class MitsubaScene:
 
     def _list_integrators(self) -> dict[str, Plugin]:
         """Return the plugins of integrators at the current depth, by the method."""
-        # `_path_entries` has what a part of the scene needs. That of haze replaces the
-        # type, so that these entries come last.
-        adjoint = {
-            "type": "prb",
-            "max_depth": self.current_max_depth,
-            "rr_depth": self._gradient_roulette_depth,
-            **self._path_entries,
-        }
-        path = {
-            "type": self.integrator_name,
-            "max_depth": self.current_max_depth,
-            "rr_depth": self.roulette_depth,
-            **self._path_entries,
-        }
+        adjoint = self._make_path_integrator("prb", self._gradient_roulette_depth)
         return {
-            "path": path,
+            "path": self._make_path_integrator(
+                self.integrator_name, self.roulette_depth
+            ),
             "adjoint": adjoint,
             "hidden": self._make_hidden_integrator(adjoint),
             "guides": self._guides,
@@ -1028,6 +1017,22 @@ class MitsubaScene:
                 "rr_depth": NO_ROULETTE_DEPTH,
                 "guiding": "none",
             },
+        }
+
+    def _make_path_integrator(self, kind: str, roulette_depth: int) -> Plugin:
+        """Return the plugin of a path integrator at the current depth.
+
+        Args:
+            kind: Mitsuba's type of the integrator.
+            roulette_depth: bounces from which on Russian roulette may end a path.
+        """
+        return {
+            "type": kind,
+            "max_depth": self.current_max_depth,
+            "rr_depth": roulette_depth,
+            # What a part of the scene needs. That of haze replaces the type, so that
+            # these entries come last.
+            **self._path_entries,
         }
 
     def _make_hidden_integrator(self, adjoint: Plugin) -> Plugin:

@@ -159,12 +159,7 @@ class ViewTracer:
         self._widths = tuple(widths)
         self._photograph_height = photograph_height
         self._center = center.tolist()
-        # the six tables of the first surface, then those of the next one
-        tables_of_surfaces = [
-            np.concatenate([getattr(surface, name) for name in texel_rays.LOBE_TABLES])
-            for surface in lobes
-        ]
-        self._lobe_tables = np.concatenate(tables_of_surfaces).astype(np.float32)
+        self._lobe_tables = _join_lobe_tables(lobes)
         self._lens = None if model is None else self._make_lens_table(model)
         self._recordings = Recordings()
 
@@ -684,6 +679,18 @@ class ViewTracer:
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
         return _GridPosition(first_cell, n_rows, n_columns, y, x, on_any_grid)
+
+
+def _join_lobe_tables(lobes: Sequence[texel_rays.Lobes]) -> Float32Array:
+    """Return the tables of all surfaces, flat: the six of the first, then the next.
+
+    The tables of a surface are in the order of `LOBE_TABLES`.
+    """
+    tables_of_surfaces = [
+        np.concatenate([getattr(surface, name) for name in texel_rays.LOBE_TABLES])
+        for surface in lobes
+    ]
+    return np.concatenate(tables_of_surfaces).astype(np.float32)
 
 
 class _GridPosition(NamedTuple):
