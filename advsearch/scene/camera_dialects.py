@@ -448,9 +448,7 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
         for name, value in camera.items()
         if name not in OPENSFM_TRANSLATED_KEYS
     }
-    width, height = (
-        parse_number(path, side, camera.get(side)) for side in ("width", "height")
-    )
+    width, height = _parse_side_lengths(path, camera)
     entries |= {
         "distortion_model": stated_type if kind is None else kind,
         "image_width": width,
@@ -459,6 +457,16 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     if kind not in (None, "equirectangular"):
         entries |= _scale_opensfm_lengths(path, camera, width, height)
     return entries
+
+
+def _parse_side_lengths(path: str, entries: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the entries `width` and `height` of a camera; `path` is for messages.
+
+    Raises FileFormatError: one of them is missing, or is no number.
+    """
+    width = parse_number(path, "width", entries.get("width"))
+    height = parse_number(path, "height", entries.get("height"))
+    return width, height
 
 
 def _scale_opensfm_lengths(
@@ -508,9 +516,7 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
         name: parse_number(path, name, data.get(name, 0.0))
         for name in ("f", "cx", "cy", "b1", "b2", "k4", "p1", "p2")
     }
-    width, height = (
-        parse_number(path, side, data.get(side)) for side in ("width", "height")
-    )
+    width, height = _parse_side_lengths(path, data)
     translated_names = (*value_by_name, "projection", "width", "height")
     entries = {
         name: entry for name, entry in data.items() if name not in translated_names

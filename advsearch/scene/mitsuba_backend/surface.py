@@ -201,9 +201,7 @@ class ViewTracer:
         with mitsuba_lock:
             height, width = self._scene.resolution
             count = len(cameras)
-            camera_rows = np.stack(
-                [_make_camera_numbers(inputs, height, width) for inputs in cameras]
-            ).astype(np.float32)
+            camera_numbers = _join_camera_numbers(cameras, height, width)
             trace = self._make_ray_tracer(lit)
             recording = self._recordings.get_or_record(
                 (count, lit.sky_shape, lit.blurred_shape), trace, media=[]
@@ -219,7 +217,7 @@ class ViewTracer:
                 self._scene._scene,
                 lane,
                 mi.Float(self._lobe_tables),
-                mi.Float(camera_rows.ravel()),
+                mi.Float(camera_numbers),
                 mi.Float(lens),
                 lit.texels,
                 lit.sky,
@@ -796,6 +794,19 @@ def _turn_to_viewer(normal: Any, direction: Any) -> Any:
     """Return normals turned over where a ray in a direction comes from behind."""
     is_from_behind = dr.dot(normal, direction) > 0.0
     return dr.select(is_from_behind, -normal, normal)
+
+
+def _join_camera_numbers(
+    cameras: Sequence[Mapping[str, Tensor]], height: int, width: int
+) -> Float32Array:
+    """Return the `CAMERA_SIZE` numbers of all cameras, one after the other, flat.
+
+    Args:
+        cameras: inputs of each camera, as for `_make_camera_numbers`.
+        height, width: size of the image in pixels.
+    """
+    rows = [_make_camera_numbers(inputs, height, width) for inputs in cameras]
+    return np.stack(rows).astype(np.float32).ravel()
 
 
 def _make_camera_numbers(

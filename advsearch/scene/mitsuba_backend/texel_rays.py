@@ -195,8 +195,8 @@ def _trace_batch(
 
     # Rays that leave the scene meet a cell of the environment. Its cells are counted
     # after those of all grids.
-    n_cells = grids[-1].first_cell_index + grids[-1].n_cells
-    sky_cell = mi.Int32(n_cells + _find_sky_cell(scene, direction, sky_shape))
+    n_grid_cells = grids[-1].first_cell_index + grids[-1].n_cells
+    sky_cell = mi.Int32(n_grid_cells + _find_sky_cell(scene, direction, sky_shape))
     met = dr.select(si.is_valid(), mi.Int32(-1), sky_cell)
 
     # Other rays meet a texel, or a shape without texels, which counts as dark (-1).
@@ -244,9 +244,7 @@ def compute_visible_cosines(
     Returns:
         (n, k) cosines; 0 where something blocks the light.
     """
-    world_to_map = np.array(get_world_to_map(scene))
-    # For rows v, `v @ world_to_map` is v turned from the map's axes to the world's.
-    world_directions = (directions @ world_to_map).astype(np.float32)
+    world_directions = _rotate_to_world(scene, directions)
     n_directions = len(world_directions)
     lane = dr.arange(mi.UInt32, len(positions) * n_directions)
     texel = lane // n_directions
@@ -259,6 +257,14 @@ def compute_visible_cosines(
     transmittance = _trace_transmittance(scene, ray, is_above)
     received = dr.select(is_above, cosine * transmittance, 0.0)
     return np.asarray(received.numpy().reshape(len(positions), n_directions))
+
+
+def _rotate_to_world(scene: MitsubaScene, directions: Float32Array) -> Float32Array:
+    """Return directions (k, 3) in the world, from the axes of the environment's map."""
+    world_to_map = np.array(get_world_to_map(scene))
+    # For rows v, `v @ world_to_map` is v turned from the map's axes to the world's.
+    world_directions: Float32Array = (directions @ world_to_map).astype(np.float32)
+    return world_directions
 
 
 def _trace_transmittance(scene: MitsubaScene, ray: Any, active: Any) -> Any:
