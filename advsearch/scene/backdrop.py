@@ -843,17 +843,22 @@ def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraMod
             f"backdrop: {photograph.spec} is a part of a picture of {model.name}, which "
             "shows all around; give the full photograph"
         )
+    values = model.intrinsic_by_name  # a new dictionary
+    _crop_intrinsics(values, photograph)
+    numbers = tuple(values[name] for name in NUMBER_NAMES)
+    # Without a size: the model's own is that of the full photograph.
+    return replace(model, intrinsics=numbers, calibrated_shape=None)
+
+
+def _crop_intrinsics(values: dict[str, float], photograph: BackdropPhotograph) -> None:
+    """Change numbers of a lens, by name, to those for the used part of a photograph."""
     left, top, width, height = photograph.crop
     full_height, full_width = photograph.full_size
-    values = model.intrinsic_by_name  # a new dictionary
     values["fx"] *= full_width / width
     values["skew"] *= full_width / width
     values["cx"] = (values["cx"] * full_width - left) / width
     values["fy"] *= full_height / height
     values["cy"] = (values["cy"] * full_height - top) / height
-    numbers = tuple(values[name] for name in NUMBER_NAMES)
-    # Without a size: the model's own is that of the full photograph.
-    return replace(model, intrinsics=numbers, calibrated_shape=None)
 
 
 def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> None:

@@ -378,11 +378,8 @@ class SceneDescription(SceneData):
         if rig:
             model = rig[0].camera_model
             scene = self._with_rig(rig, camera)
-        elif is_path(camera):
-            with track_opened_files(camera.partition("#")[0]):
-                model = read_camera(camera)
         else:
-            model = make_bundled_models()[camera]
+            model = _load_lens(camera)
         # A camera of a rig may have a field of view, and no model of a lens.
         if model is not None:
             model.check_no_fov(self.requested)
@@ -688,6 +685,17 @@ class SceneDescription(SceneData):
                 "one of the avenue, or leave camera.ev out, and exposure is metered"
             )
         return unit / (1.2 * math.pow(2.0, exposure_value))
+
+
+def _load_lens(camera: str) -> CameraModel:
+    """Return the lens of a camera file with one camera, or a bundled camera model.
+
+    `camera` is the path of the file, or the name of the model.
+    """
+    if not is_path(camera):
+        return make_bundled_models()[camera]
+    with track_opened_files(camera.partition("#")[0]):
+        return read_camera(camera)
 
 
 def _compute_fov_of_lens(model: CameraModel) -> float:

@@ -302,17 +302,28 @@ def _make_principled_inputs(name: str) -> list[SceneInput]:
         has_interior_adjoint=True,
     )
     numbers = [
-        SceneInput(
-            name=f"{name}.{parameter}",
-            key=f"{name}.*.{key}",
-            convert_to_mitsuba=to_flat_array,
-            has_interior_adjoint=True,
-            shape=(1,),
-            rendered_range=meshes.RENDERED_RANGES.get(parameter),
-        )
+        _make_surface_number_input(name, parameter, key)
         for parameter, key in SURFACE_KEYS.items()
     ]
     return [base_color, *numbers]
+
+
+def _make_surface_number_input(name: str, parameter: str, key: str) -> SceneInput:
+    """Return the input of one number of a principled surface.
+
+    Args:
+        name: name of the mesh.
+        parameter: our name of the number, such as "roughness".
+        key: Mitsuba's name of it.
+    """
+    return SceneInput(
+        name=f"{name}.{parameter}",
+        key=f"{name}.*.{key}",
+        convert_to_mitsuba=to_flat_array,
+        has_interior_adjoint=True,
+        shape=(1,),
+        rendered_range=meshes.RENDERED_RANGES.get(parameter),
+    )
 
 
 def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:

@@ -335,20 +335,16 @@ class ViewTracer:
         height, width = self._scene.resolution
         camera_index = lane // RAYS_PER_PIXEL // (height * width)
         camera = _gather_camera(camera_numbers, camera_index)
-        # three numbers for each axis of the camera
-        left = camera[0:3]
-        up = camera[3:6]
-        forward = camera[6:9]
-        position = camera[9:12]
         if self._lens is None:
-            x, y, z = self._compute_pinhole_direction(lane, camera[12:])
+            x, y, z = self._compute_pinhole_direction(lane, camera.film_numbers)
             active = mi.Bool(True)
         else:
             x, y, z, active = self._look_up_lens_direction(lane, lens)
+        axes = zip(camera.left, camera.up, camera.forward, strict=True)
         direction = mi.Vector3f(
-            *(left[axis] * x + up[axis] * y + forward[axis] * z for axis in range(3))
+            *(left * x + up * y + forward * z for left, up, forward in axes)
         )
-        return mi.Ray3f(mi.Point3f(*position), dr.normalize(direction)), active
+        return mi.Ray3f(mi.Point3f(*camera.position), dr.normalize(direction)), active
 
     def _look_up_lens_direction(
         self, lane: Any, lens: Any
@@ -712,13 +708,30 @@ def _lerp_entries(table: Any, entry: Any, fraction: Any) -> Any:
     return lower_value + fraction * (upper_value - lower_value)
 
 
-def _gather_camera(camera_numbers: Any, camera_index: Any) -> list[Any]:
-    """Return the `CAMERA_SIZE` numbers of each lane's camera, from a flat array."""
+class _CameraNumbers(NamedTuple):
+    """The numbers of a camera, one value in each lane, see `_make_camera_numbers`."""
+
+    left: list[Any]  # x, y and z of the axis to the left
+    up: list[Any]
+    forward: list[Any]
+    position: list[Any]
+    film_numbers: list[Any]  # the last four, which only a pinhole needs
+
+
+def _gather_camera(camera_numbers: Any, camera_index: Any) -> _CameraNumbers:
+    """Return the numbers of each lane's camera, from a flat array for all cameras."""
     first = camera_index * CAMERA_SIZE
-    return [
+    numbers = [
         dr.gather(mi.Float, camera_numbers, first + index)
         for index in range(CAMERA_SIZE)
     ]
+    return _CameraNumbers(
+        left=numbers[0:3],
+        up=numbers[3:6],
+        forward=numbers[6:9],
+        position=numbers[9:12],
+        film_numbers=numbers[12:],
+    )
 
 
 def _compute_stopped_light(
@@ -1005,22 +1018,27 @@ def _look_up_blurred(
     x, y = texel_rays.compute_map_position(direction, to_local)
     row = y * n_rows - 0.5
     column = x * n_columns - 0.5
-
-    def look_up_level(index: Any) -> Any:
-        """Look up the map with an index; maps follow one another in memory."""
-        return _look_up_bilinear(
-            lit.blurred,
-            index * (n_rows * n_columns),
-            mi.UInt32(n_rows),
-            mi.UInt32(n_columns),
-            row,
-            column,
-            wraps=True,
-        )
-
-    narrow = look_up_level(lower_level)
-    wide = look_up_level(lower_level + 1)  # if there is one width, it counts 0
+    narrow = _look_up_level(lit, lower_level, row, column)
+    # if there is one width, this counts 0
+    wide = _look_up_level(lit, lower_level + 1, row, column)
     return narrow + (level - mi.Float(lower_level)) * (wide - narrow)
+
+
+def _look_up_level(lit: LightMaps, index: Any, row: Any, column: Any) -> Any:
+    """Look up the blurred map with an index; maps follow one another in memory.
+
+    Rows and columns are integers at the centers of texels.
+    """
+    n_rows, n_columns = lit.blurred_shape
+    return _look_up_bilinear(
+        lit.blurred,
+        index * (n_rows * n_columns),
+        mi.UInt32(n_rows),
+        mi.UInt32(n_columns),
+        row,
+        column,
+        wraps=True,
+    )
 
 
 def _compute_blur_level(spread: Any, widths: Sequence[float]) -> Any:

@@ -132,15 +132,22 @@ def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element)
                 config, ElementTree.tostring(root, encoding="unicode")
             )
     except RuntimeError as error:
-        line_match = _ERROR_LINE.match(str(error))
-        where = ""
-        # The lines of included files are inserted into the text that Mitsuba has
-        # parsed, so that a line is known only without any.
-        if line_match and not text.included:
-            where = f"line {int(line_match[1]) + text.lines_before}: "
+        where = _find_error_line(text, str(error))
         raise FileFormatError(
             f"{path}: {where}{_ERROR_LINE.sub('', str(error))}; correct it"
         ) from error
+
+
+def _find_error_line(text: _SceneText, message: str) -> str:
+    """Return the line of an error of Mitsuba's parser, such as "line 12: ".
+
+    It is empty if the line is not known. The lines of included files are inserted into
+    the text that Mitsuba has parsed, so that a line is known only without any.
+    """
+    line_match = _ERROR_LINE.match(message)
+    if line_match and not text.included:
+        return f"line {int(line_match[1]) + text.lines_before}: "
+    return ""
 
 
 @dataclass
