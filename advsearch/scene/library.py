@@ -522,7 +522,7 @@ def _average_map(
 
 
 def _compute_row_weights(height: int) -> Float32Array:
-    """Return weights (height,) of a map's rows, the sines of their angles to the top."""
+    """Return weights (height,) of a map's rows, the sines of their angles to +z."""
     step = np.float32(np.pi / height)
     polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * step
     return np.asarray(np.sin(polar))

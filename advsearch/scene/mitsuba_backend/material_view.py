@@ -1150,10 +1150,10 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     axis = _compute_edge_directions(vertices, ends)
     start = vertices[ends[:, 0]]
 
-    along_first, along_second = (
-        _remove_component(vertices[edges.third_corner[side[is_measured]]] - start, axis)
-        for side in (first_side, last_side)
-    )
+    first_corner = vertices[edges.third_corner[first_side[is_measured]]]
+    last_corner = vertices[edges.third_corner[last_side[is_measured]]]
+    along_first = _remove_component(first_corner - start, axis)
+    along_second = _remove_component(last_corner - start, axis)
     is_single = n_faces[is_measured] == 1
     opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)
     return _ExteriorAngles(

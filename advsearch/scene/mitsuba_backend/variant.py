@@ -55,7 +55,7 @@ def import_mitsuba() -> ModuleType:
 
 
 def _set_up_libraries(mitsuba: ModuleType) -> None:
-    """Set log levels and threads, and leave imported objects to no garbage collection.
+    """Set log levels and threads, and exempt imported objects from garbage collection.
 
     Every change of the scenes calls the garbage collector. Without freezing, it would
     take 0.2 s each time for the objects of the imported modules.

@@ -78,10 +78,7 @@ def write_scene(
     _check_has_stock_lens(scene)
     xml_scene = _make_xml_scene(scene, hide_environment)
     # inputs that are not in the dictionary yet: `_put_part` takes some of them out
-    remaining_inputs = {
-        name: value.detach().cpu().numpy().astype(np.float32)
-        for name, value in inputs.items()
-    }
+    remaining_inputs = _convert_to_arrays(inputs)
     _put_camera_and_map(xml_scene, remaining_inputs)
     description, _filter = scene.description_and_filter
     _put_photographed_ground(xml_scene, description)
@@ -90,6 +87,14 @@ def write_scene(
     _put_all_inputs(xml_scene, scene, remaining_inputs)
     meshes = _list_file_meshes(scene, inputs, xml_scene)
     write_xml(path, xml_scene, meshes, note)
+
+
+def _convert_to_arrays(inputs: Mapping[str, Tensor]) -> dict[str, Float32Array]:
+    """Return inputs as arrays, by name."""
+    return {
+        name: value.detach().cpu().numpy().astype(np.float32)
+        for name, value in inputs.items()
+    }
 
 
 def _list_file_meshes(
