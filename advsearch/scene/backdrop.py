@@ -461,14 +461,18 @@ def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
         warnings.simplefilter("ignore")  # of large images and odd metadata
         image.load()
         upright = ImageOps.exif_transpose(image)
-    if image.has_transparency_data and bool(
-        (to_8bit_levels(upright, alpha=True)[:, :, 3] < 255).any()
-    ):
+    if image.has_transparency_data and _is_transparent(upright):
         raise FileFormatError(
             f"{path}: expected a photograph, got a picture that is transparent in some "
             "pixels; save it without transparency"
         )
     return np.ascontiguousarray(to_8bit_levels(upright, alpha=False))
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    """Return whether some pixel of an image is not opaque."""
+    alpha = to_8bit_levels(image, alpha=True)[:, :, 3]
+    return bool((alpha < 255).any())
 
 
 def make_backdrop(
@@ -486,15 +490,20 @@ def make_backdrop(
     Raises:
         InputError: the levels have another shape or type.
     """
+    _check_levels(levels)
+    levels = np.ascontiguousarray(levels)
+    digest = hashlib.sha256(f"{levels.shape}".encode() + levels.tobytes()).hexdigest()
+    height, width = levels.shape[:2]
+    return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
+
+
+def _check_levels(levels: npt.NDArray[np.uint8]) -> None:
+    """Raise InputError if an array is no photograph (H, W, 3) of 8-bit levels."""
     if levels.ndim != 3 or levels.shape[2] != 3 or levels.dtype != np.uint8:
         raise InputError(
             "backdrop: expected a photograph (h, w, 3) of uint8, got an array of shape "
             f"{levels.shape} of {levels.dtype}"
         )
-    levels = np.ascontiguousarray(levels)
-    digest = hashlib.sha256(f"{levels.shape}".encode() + levels.tobytes()).hexdigest()
-    height, width = levels.shape[:2]
-    return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
 
 
 # ---- The light of a photograph

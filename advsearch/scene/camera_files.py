@@ -359,11 +359,7 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
 
 def _parse_xml_root(path: str, text: str) -> ElementTree.Element:
     """Return the root of a camera in XML; the errors are those of `_parse_xml`."""
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise FileFormatError(
-            f"{path}: declares a document type or entities, which no camera needs; "
-            "remove it"
-        )
+    _check_has_no_entities(path, text)
     root = parse_text(path, text, "XML", ElementTree.fromstring)
     check_xml_root(path, root.tag)
     if root.tag not in ("opencv_storage", METASHAPE_FILE):
@@ -372,6 +368,15 @@ def _parse_xml_root(path: str, text: str) -> ElementTree.Element:
             f"<{root.tag[:40]}>; docs/cameras.md has the formats that are read"
         )
     return root
+
+
+def _check_has_no_entities(path: str, text: str) -> None:
+    """Raise FileFormatError if the text of an XML file declares types or entities."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise FileFormatError(
+            f"{path}: declares a document type or entities, which no camera needs; "
+            "remove it"
+        )
 
 
 def _convert_element(element: ElementTree.Element) -> object:
@@ -403,7 +408,7 @@ def _read_colmap(
     words_by_id = {line.split()[0]: line.split() for line in lines}
     _check_lines_differ(path, words_by_id, lines)
     _, name, *values = select_camera(path, camera_name, words_by_id)
-    _check_colmap_model(path, name)
+    _check_nerfstudio_model(path, name)
     kind, parameters = COLMAP_MODELS[name]
     numbers = _parse_colmap_numbers(path, name, parameters, values)
     size = (numbers.pop("height"), numbers.pop("width"))
@@ -424,7 +429,7 @@ def _check_lines_differ(
         )
 
 
-def _check_colmap_model(path: str, name: str) -> None:
+def _check_nerfstudio_model(path: str, name: str) -> None:
     """Raise FileFormatError if a name is not that of a model of COLMAP that is read."""
     if name not in COLMAP_MODELS:
         raise FileFormatError(
@@ -538,18 +543,23 @@ def _read_projection(path: str, entries: CameraEntries) -> str:
         FileFormatError: the model is not supported.
     """
     name = str(entries.get("cameramodel") or "PINHOLE").upper()
-    if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
-        raise FileFormatError(
-            f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
-            f"got {format_name(name)}, which is another projection; calibrate with one "
-            "of these"
-        )
+    _check_nerfstudio_model(path, name)
     if entries.get("isfisheye"):  # whatever the name is
         return FISHEYE
     if name == "PERSPECTIVE":
         return BROWN_CONRADY
     kind, _ = COLMAP_MODELS[name]
     return kind
+
+
+def _check_nerfstudio_model(path: str, name: str) -> None:
+    """Raise FileFormatError if a camera model is none of those of nerfstudio's files."""
+    if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
+        raise FileFormatError(
+            f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
+            f"got {format_name(name)}, which is another projection; calibrate with one "
+            "of these"
+        )
 
 
 def _read_focal_lengths(

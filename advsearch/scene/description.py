@@ -123,19 +123,20 @@ class SceneDescription(SceneData):
 
         Raises InputError: the scene has a part of that name.
         """
-        part_by_name = {existing.name: existing for existing in self.parts}
-        if part.name in (OBJECT, "environment", "ground", "camera", *part_by_name):
-            is_plugin = isinstance(part_by_name.get(part.name), PluginPart)
-            alternative = (
-                f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]"
-                if is_plugin
-                else ""
-            )
-            raise InputError(
-                f"`controls` {part.name}: the scene has something of that name "
-                f"already; choose another name, as in light:{part.name}-2{alternative}"
-            )
+        self._check_name_is_free(part.name)
         return replace(self, parts=(*self.parts, part))
+
+    def _check_name_is_free(self, name: str) -> None:
+        """Raise InputError if the scene has a part of a name, or reserves it."""
+        part_by_name = {part.name: part for part in self.parts}
+        if name in (OBJECT, "environment", "ground", "camera", *part_by_name):
+            alternative = ""
+            if isinstance(part_by_name.get(name), PluginPart):
+                alternative = f", or vary what is there: mitsuba:{name}.KEY=[low, high]"
+            raise InputError(
+                f"`controls` {name}: the scene has something of that name "
+                f"already; choose another name, as in light:{name}-2{alternative}"
+            )
 
     def with_values(self, **replaced: float | None) -> SceneDescription:
         """Return the scene with some settings replaced.
@@ -1057,6 +1058,16 @@ def check_ground(
             "`set` ground.kind=photograph: the scene has no environment map to show; "
             "give it one, or leave it out"
         )
+    _check_no_table_settings(kind, requested)
+
+
+def _check_no_table_settings(kind: object, requested: settings.SettingValues) -> None:
+    """Raise InputError if settings of a table are set with a ground that is none.
+
+    Args:
+        kind: the kind of ground, for the message.
+        requested: the user's settings by name.
+    """
     table_settings = [name for name in settings.TABLE_SETTINGS if name in requested]
     if table_settings:
         raise InputError(

@@ -459,19 +459,27 @@ def _format_xml(scene: Plugin) -> str:
     Raises:
         InputError: the scene cannot be written.
     """
+    root = ElementTree.fromstring(_format_with_mitsuba(scene))
+    for entry in root.findall("*[@type]"):
+        entry.set("id", entry.attrib.pop("name"))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _format_with_mitsuba(scene: Plugin) -> str:
+    """Return a scene's dictionary as XML, as Mitsuba writes it.
+
+    Raises:
+        InputError: the scene cannot be written.
+    """
     try:
-        text = mi.parser.write_string(
-            mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), scene)
-        )
+        state = mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), scene)
+        text: str = mi.parser.write_string(state)
     except (RuntimeError, TypeError) as error:
         raise InputError(
             f"out: the scene cannot be written as XML of Mitsuba: {error}; export "
             "another run"
         ) from error
-    root = ElementTree.fromstring(text)
-    for entry in root.findall("*[@type]"):
-        entry.set("id", entry.attrib.pop("name"))
-    return ElementTree.tostring(root, encoding="unicode")
+    return text
 
 
 class _SceneFiles:
