@@ -408,7 +408,7 @@ def _read_colmap(
     words_by_id = {line.split()[0]: line.split() for line in lines}
     _check_lines_differ(path, words_by_id, lines)
     _, name, *values = select_camera(path, camera_name, words_by_id)
-    _check_nerfstudio_model(path, name)
+    _check_colmap_model(path, name)
     kind, parameters = COLMAP_MODELS[name]
     numbers = _parse_colmap_numbers(path, name, parameters, values)
     size = (numbers.pop("height"), numbers.pop("width"))
@@ -429,7 +429,7 @@ def _check_lines_differ(
         )
 
 
-def _check_nerfstudio_model(path: str, name: str) -> None:
+def _check_colmap_model(path: str, name: str) -> None:
     """Raise FileFormatError if a name is not that of a model of COLMAP that is read."""
     if name not in COLMAP_MODELS:
         raise FileFormatError(
