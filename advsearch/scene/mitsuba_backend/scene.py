@@ -436,12 +436,10 @@ class MitsubaScene:
             spp = self.round_sample_count(spp)
             # All are loaded before the first render: to load one makes the recordings
             # stale.
-            integrators = [self._get_integrator(method) for method in seeds]
+            integrators = {method: self._get_integrator(method) for method in seeds}
             return [
-                self._render_by_method(method, integrator, seed, spp)
-                for (method, seed), integrator in zip(
-                    seeds.items(), integrators, strict=True
-                )
+                self._render_by_method(method, integrators[method], seed, spp)
+                for method, seed in seeds.items()
             ]
 
     def _render_by_method(

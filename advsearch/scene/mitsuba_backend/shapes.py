@@ -648,10 +648,7 @@ def _parse_numbers(value: object) -> Float64Array:
     A color may be a plugin, such as `{"type": "rgb", "value": [0.1, 0.2, 0.3]}`.
     """
     not_understood = np.full(1, np.nan)
-    if isinstance(value, Mapping):
-        is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
-        # None, of any other plugin, becomes NaN below.
-        value = value.get("value") if is_constant else None
+    value = _unwrap_constant(value)  # None, of another plugin, becomes NaN below
     # NumPy would convert a string or a bool to a number
     if isinstance(value, (str, bool)):
         return not_understood
@@ -663,6 +660,17 @@ def _parse_numbers(value: object) -> Float64Array:
     if is_number_or_color and np.isfinite(numbers).all():
         return numbers
     return not_understood
+
+
+def _unwrap_constant(value: object) -> object:
+    """Return the value of a plugin that is one color; of any other plugin, None.
+
+    What is no plugin is returned as it is.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
+    return value.get("value") if is_constant else None
 
 
 # ---- The surface of a Mitsuba shape: its base color, which is searched; all the rest
