@@ -360,7 +360,7 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
 def _parse_xml_root(path: str, text: str) -> ElementTree.Element:
     """Return the root of a camera in XML; the errors are those of `_parse_xml`."""
     _check_has_no_entities(path, text)
-    root = parse_text(path, text, "XML", ElementTree.fromstring)
+    root: ElementTree.Element = parse_text(path, text, "XML", ElementTree.fromstring)
     check_xml_root(path, root.tag)
     if root.tag not in ("opencv_storage", METASHAPE_FILE):
         raise FileFormatError(

@@ -286,14 +286,14 @@ class SceneDescription(SceneData):
                 around the object was requested.
         """
         spec = photograph_cameras.path
-        self._check_size_for_meters(spec)
+        size_in_meters = self._require_size(spec)
         with track_opened_files(photograph):
             pose, model = photograph_cameras.find_pose_and_model(photograph)
         # The file's pose is for other camera axes. `AXES` maps ours (left, up, ahead)
         # to these.
         to_world = pose @ AXES
         # from meters to object sizes
-        to_world[:3, 3] /= self.object.size_in_metres
+        to_world[:3, 3] /= size_in_meters
         model.check_no_fov(self.requested)  # the lens has a field of view of its own
         fov = _compute_fov_of_lens(model)
         # The pose becomes a camera of the scene, and is selected; `with_camera` also
@@ -302,13 +302,18 @@ class SceneDescription(SceneData):
         scene = replace(self, cameras=cameras).with_camera(spec)
         return replace(scene, camera_model=replace(model, name=spec))
 
-    def _check_size_for_meters(self, spec: str) -> None:
-        """Raise InputError if the object has no size for a camera file in metres."""
-        if self.object.size_in_metres is None:
+    def _require_size(self, spec: str) -> float:
+        """Return the meters of one object size, which a camera file needs.
+
+        Raises InputError: the size of the object is not known.
+        """
+        size_in_meters = self.object.size_in_metres
+        if size_in_meters is None:
             raise InputError(
                 f"`camera={spec}` is in metres, and the size of {self.object.name} is "
                 "not known; give its longest side in metres, such as `size=0.1`"
             )
+        return size_in_meters
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:

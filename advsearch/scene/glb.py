@@ -281,7 +281,11 @@ def _make_unit_normals(normals: Float32Array) -> Float32Array:
     """Return normals (V, 3) of length 1; one of length 0 becomes +z."""
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     unit_normals = normals / np.maximum(lengths, 1e-12)
-    return np.where(lengths > 0.0, unit_normals, np.eye(3)[2]).astype(np.float32)
+    upwards = np.eye(3)[2]
+    unit_or_upward: Float32Array = np.where(
+        lengths > 0.0, unit_normals, upwards
+    ).astype(np.float32)
+    return unit_or_upward
 
 
 def _add_material(

@@ -314,7 +314,7 @@ def _parse_numbers(
         FileFormatError: it has another number of values, or values that are no finite
             numbers.
     """
-    value = stated[name]
+    value = _unwrap_entry(stated[name])
     numbers = _to_flat_numbers(value)
     if len(numbers) not in counts or not np.isfinite(numbers).all():
         expected = " or ".join(map(str, counts))
@@ -324,12 +324,17 @@ def _parse_numbers(
     return numbers
 
 
-def _to_flat_numbers(value: object) -> Float64Array:
-    """Return the numbers (N,) of an entry; none if it has other values."""
+def _unwrap_entry(value: object) -> object:
+    """Return the list in a matrix of OpenCV or in a text; other values as they are."""
     if isinstance(value, Mapping):  # a matrix as OpenCV writes it
         value = value.get("data")
     if isinstance(value, str):
-        value = value.replace(",", " ").split()
+        return value.replace(",", " ").split()
+    return value
+
+
+def _to_flat_numbers(value: Any) -> Float64Array:
+    """Return the numbers (N,) of an entry; none if it has other values."""
     try:
         return np.array(value, np.float64).reshape(-1)
     except (TypeError, ValueError):

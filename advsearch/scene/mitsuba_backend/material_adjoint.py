@@ -517,12 +517,13 @@ def _sample_incoming(
     radiance = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
     # In the direction of a mirror, samples at emitters cover nothing.
     is_shared = active & is_smooth
-    radiance -= _compute_covered_emission(view, si, ray, bsdf_sample.pdf, is_shared)
+    si_next = view.scene.ray_intersect(ray, active)
+    radiance -= _compute_covered_emission(view, si, si_next, bsdf_sample.pdf, is_shared)
     return bsdf_sample, bsdf_weight * radiance, active
 
 
 def _compute_covered_emission(
-    view: FilmView, si: Any, ray: Any, bsdf_pdf: Any, active: Any
+    view: FilmView, si: Any, si_next: Any, bsdf_pdf: Any, active: Any
 ) -> Any:
     """Return the emission along rays that is covered by samples at emitters.
 
@@ -532,11 +533,10 @@ def _compute_covered_emission(
     Args:
         view: the scene.
         si: surface interactions at which the rays begin.
-        ray: the rays.
+        si_next: surface interactions at which they end.
         bsdf_pdf: densities by which their directions were sampled.
         active: lanes that are computed.
     """
-    si_next = view.scene.ray_intersect(ray, active)
     ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
     em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active)
     mis = mi.ad.integrators.common.mis_weight(bsdf_pdf, em_pdf)

@@ -535,7 +535,7 @@ def _translate_beam(part: parts.BeamLamp) -> TranslatedPart:
     return TranslatedPart({part.name: lamp}, (_make_pose_input(part.name, "to_world"),))
 
 
-def _make_beam_image(part: parts.BeamLamp) -> Float64Array:
+def _make_beam_image(part: parts.BeamLamp) -> Float32Array:
     """Return the texture (h, w, 3) of the projector of a headlamp's beam.
 
     On a plane at distance 1, at an angle a to the axis, the distance is 1 / cos a and
@@ -555,7 +555,7 @@ def _make_beam_image(part: parts.BeamLamp) -> Float64Array:
     image: Float64Array = (part.table * cosine**3 / np.pi)[..., None] * np.array(
         part.tint
     )
-    return image
+    return image.astype(np.float32)
 
 
 @translate_part.register

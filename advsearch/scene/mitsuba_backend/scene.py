@@ -450,7 +450,7 @@ class MitsubaScene:
         # opaque: a literal seed would be a constant of the recorded kernel
         opaque_seed = dr.opaque(mi.UInt32, seed)
         drjit_image = render(self._scene, self._sensor, integrator, opaque_seed)
-        image = drjit_image.torch().clone()
+        image: Tensor = drjit_image.torch().clone()
         if method == "guides":
             # Albedo and normal are the last six channels. There may be a color
             # before them.

@@ -492,7 +492,10 @@ def _apply_uv_matrix(uvs: Float32Array, to_uv: Float64Array) -> Float32Array:
     """
     mitsuba_uvs = uvs * (1.0, -1.0) + (0.0, 1.0)
     mitsuba_uvs = mitsuba_uvs @ to_uv[:2, :2].T + to_uv[:2, 2]
-    return (mitsuba_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
+    moved_uvs: Float32Array = (mitsuba_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(
+        np.float32
+    )
+    return moved_uvs
 
 
 def _paint_evenly(
