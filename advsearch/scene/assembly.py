@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Float32Array, IntArray, Mesh, Shape
+from advsearch.scene.assets import Float32Array, IntArray, Material, Mesh, Shape
 from advsearch.scene.backdrop import make_image_inputs
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
@@ -75,19 +75,26 @@ class MovingMesh:
         matrix = self.to_world.to(device) if to_world is None else to_world
         vertices = self.vertices.to(device)
         normals = self.normals.to(device)
-        # The file's normals may differ from those of its faces, for example if they are
-        # smoothed. So they are not replaced: the change of the faces' unit normals is
-        # added to them.
         if offsets is not None:
-            original = self._original_face_normals.to(device)
-            change = self._average_face_normals(vertices + offsets) - original
-            vertices = vertices + offsets
-            normals = normals + change
+            vertices, normals = self._displace(vertices, normals, offsets)
         world_vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
         # Normals are transformed by the inverse transpose, here as rows: n M^-1.
         world_normals = normals @ torch.linalg.inv(matrix[:3, :3])
         lengths = world_normals.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return world_vertices, world_normals / lengths
+
+    def _displace(
+        self, vertices: Tensor, normals: Tensor, offsets: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return vertices moved by offsets, and their normals, all (V, 3).
+
+        The file's normals may differ from those of its faces, for example if they are
+        smoothed. So they are not replaced: the change of the faces' unit normals is
+        added to them.
+        """
+        original = self._original_face_normals.to(vertices.device)
+        change = self._average_face_normals(vertices + offsets) - original
+        return vertices + offsets, normals + change
 
     def _average_face_normals(self, vertices: Tensor) -> Tensor:
         """Return the unit normals (V, 3) that follow from the faces, weighted by area.
@@ -104,11 +111,7 @@ class MovingMesh:
         faces, groups = (
             indices.to(vertices.device) for indices in self._faces_and_groups
         )
-        first, second, third = (
-            vertices.index_select(0, faces[:, corner]) for corner in range(3)
-        )
-        # as long as twice the face's area: the sum weights faces by area
-        face_normals = torch.linalg.cross(second - first, third - first)
+        face_normals = _compute_area_normals(vertices, faces)
         # Each face counts for the groups of its three corners. Both tensors have first
         # the first corners of all faces, then the second and the third ones.
         group_of_corner = groups[faces].T.reshape(-1)
@@ -143,6 +146,18 @@ class MovingMesh:
         return torch.from_numpy(faces), torch.from_numpy(groups.astype(np.int64))
 
 
+def _compute_area_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return the normals (F, 3) of faces, as long as twice the face's area.
+
+    A sum of them weights faces by area.
+    """
+    first, second, third = (
+        vertices.index_select(0, faces[:, corner]) for corner in range(3)
+    )
+    normals: Tensor = torch.linalg.cross(second - first, third - first)
+    return normals
+
+
 def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
     """Return a mesh of a scene with its inputs applied, in world space, z up.
 
@@ -151,35 +166,44 @@ def pose_mesh(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
         inputs: assembled inputs of all meshes by name, such as "object.vertices". What
             is missing keeps its base value.
     """
-    prefix = f"{part.name}."
-    values = {
-        key.removeprefix(prefix): value.detach().cpu()
-        for key, value in inputs.items()
-        if key.startswith(prefix)
-    }
-    base_vertices, base_normals = MovingMesh(part.mesh, part.to_world).transform_mesh(
-        None, None
-    )
-
-    def to_rows(tensor: Tensor) -> Float32Array:
-        rows: Float32Array = tensor.reshape(-1, 3).to(torch.float32).numpy()
-        return rows
+    values = _select_inputs_of(part.name, inputs)
+    base_mesh = MovingMesh(part.mesh, part.to_world)
+    base_vertices, base_normals = base_mesh.transform_mesh(None, None)
 
     mesh = replace(
         part.mesh,
-        vertices=to_rows(values.get("vertices", base_vertices)),
-        normals=to_rows(values.get("normals", base_normals)),
+        vertices=_to_vector_rows(values.get("vertices", base_vertices)),
+        normals=_to_vector_rows(values.get("normals", base_normals)),
     )
     color = part.base_color
     if "base_color" in values:
         color = linear_to_srgb(values["base_color"].clamp(0.0, 1.0)).numpy()
-    material_numbers = {
-        key: float(values[key]) for key in vars(part.material) if key in values
-    }
-    material = replace(part.material, **material_numbers)
+    material = _update_material(part.material, values)
     return replace(
         part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4)
     )
+
+
+def _update_material(material: Material, values: Mapping[str, Tensor]) -> Material:
+    """Return a material with those of its numbers replaced that `values` has by name."""
+    numbers = {key: float(values[key]) for key in vars(material) if key in values}
+    return replace(material, **numbers)
+
+
+def _select_inputs_of(name: str, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the inputs of the part with a name, without that name before the dot."""
+    prefix = f"{name}."
+    return {
+        key.removeprefix(prefix): value.detach().cpu()
+        for key, value in inputs.items()
+        if key.startswith(prefix)
+    }
+
+
+def _to_vector_rows(tensor: Tensor) -> Float32Array:
+    """Convert a tensor of vectors to an array (n, 3)."""
+    rows: Float32Array = tensor.reshape(-1, 3).to(torch.float32).numpy()
+    return rows
 
 
 # distance in object sizes to the side, at which an object is less than a pixel wide
@@ -224,11 +248,7 @@ class InputAssembler:
             if isinstance(part, (BeamLamp, LampGlass))
         ]
         self._photograph = description.photograph
-        # A scene may be rendered into one of several photographs. Each has a scene of
-        # its own, with its camera.
-        self._photograph_scenes = [description]
-        if description.photographs is not None:
-            self._photograph_scenes = list(description.photographs.scenes.values())
+        self._photograph_scenes = _list_photograph_scenes(description)
         self._resolution = resolution
         # inputs of the finished image by the index of the photograph; those of further
         # photographs are computed on first use, see `_get_image_inputs`
@@ -237,10 +257,16 @@ class InputAssembler:
         # one light on it, for all photographs.
         self._plane_input: dict[str, Tensor] = {}
         if resolution is not None:
-            image_inputs = make_image_inputs(description, resolution)
-            self._image_inputs_of[0] = image_inputs
-            if PLANE_INPUT in image_inputs:
-                self._plane_input = {PLANE_INPUT: image_inputs[PLANE_INPUT]}
+            self._store_image_inputs(description, resolution)
+
+    def _store_image_inputs(
+        self, description: SceneDescription, resolution: tuple[int, int]
+    ) -> None:
+        """Store the inputs of the finished image for the first photograph."""
+        image_inputs = make_image_inputs(description, resolution)
+        self._image_inputs_of[0] = image_inputs
+        if PLANE_INPUT in image_inputs:
+            self._plane_input = {PLANE_INPUT: image_inputs[PLANE_INPUT]}
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps applied.
@@ -256,14 +282,23 @@ class InputAssembler:
         # Inputs of the space, which are replaced one after the other by those of
         # Mitsuba's scene.
         parameters = dict(inputs)
-        photograph_index = 0
-        if PHOTOGRAPH_INPUT in parameters:
-            photograph_index = int(parameters.pop(PHOTOGRAPH_INPUT))
+        photograph_index = int(parameters.pop(PHOTOGRAPH_INPUT, 0))
         parameters |= self._get_image_inputs(photograph_index)
         # Lamps move with the car that carries them, whose pose is in `inputs`. From
         # `parameters` it is removed below.
         for part in self._carried:
             parameters |= _move_carried(part, inputs)
+        self._put_meshes(parameters)
+        if "camera.shift" in parameters:
+            shift = parameters.pop("camera.shift")
+            parameters["camera.shift_x"] = shift[:1]
+            parameters["camera.shift_y"] = shift[1:]
+        if "environment.data" in parameters:
+            self._put_environment(parameters, parameters.pop("environment.data"))
+        return parameters
+
+    def _put_meshes(self, parameters: dict[str, Tensor]) -> None:
+        """Replace poses and offsets of meshes by vertices and normals, in place."""
         for name, mesh in self.meshes.items():
             to_world = parameters.pop(f"{name}.to_world", None)
             offsets = parameters.pop(f"{name}.offsets", None)
@@ -271,22 +306,17 @@ class InputAssembler:
                 vertices, normals = mesh.transform_mesh(to_world, offsets)
                 parameters[f"{name}.vertices"] = vertices
                 parameters[f"{name}.normals"] = normals
-        if "camera.shift" in parameters:
-            shift = parameters.pop("camera.shift")
-            parameters["camera.shift_x"] = shift[:1]
-            parameters["camera.shift_y"] = shift[1:]
-        if "environment.data" in parameters:
-            data = parameters.pop("environment.data")
-            if self._photograph is not None:
-                parameters["ground.reflectance"] = self._photograph.compute_reflectance(
-                    data
-                )
-            # the last column before the first, and the first behind the last, so that
-            # interpolation has no seam
-            parameters["environment.padded"] = torch.cat(
-                [data[:, -1:], data, data[:, :1]], dim=1
-            )
-        return parameters
+
+    def _put_environment(self, parameters: dict[str, Tensor], data: Tensor) -> None:
+        """Add the inputs of an environment's map (H, W, 3), and of a ground in it."""
+        if self._photograph is not None:
+            reflectance = self._photograph.compute_reflectance(data)
+            parameters["ground.reflectance"] = reflectance
+        # the last column before the first, and the first behind the last, so that
+        # interpolation has no seam
+        parameters["environment.padded"] = torch.cat(
+            [data[:, -1:], data, data[:, :1]], dim=1
+        )
 
     def _hide_object(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return inputs in which the object is far away to the side."""
@@ -327,6 +357,16 @@ class InputAssembler:
         return vertices
 
 
+def _list_photograph_scenes(description: SceneDescription) -> list[SceneDescription]:
+    """Return the scene of each photograph into which a scene may be rendered.
+
+    Each has its own camera. Without a folder of photographs it is the scene itself.
+    """
+    if description.photographs is None:
+        return [description]
+    return list(description.photographs.scenes.values())
+
+
 def _move_carried(
     part: BeamLamp | LampGlass, inputs: Mapping[str, Tensor]
 ) -> dict[str, Tensor]:
@@ -342,27 +382,43 @@ def _move_carried(
         inputs: inputs of the scene, with the carrier's `to_world` and `offsets` if it
             moves.
     """
-    moved_inputs: dict[str, Tensor] = {}
     carrier_pose = inputs.get(f"{part.carrier}.to_world")
     offsets = inputs.get(f"{part.carrier}.offsets")
     if isinstance(part, LampGlass):
-        if offsets is not None:
-            # the vertex of the carrier with which each vertex of the glass moves
-            carrier_vertex = torch.from_numpy(part.vertex_of_carrier).to(offsets.device)
-            moved_inputs[f"{part.name}.offsets"] = offsets[carrier_vertex]
-        if carrier_pose is not None:
-            moved_inputs[f"{part.name}.to_world"] = carrier_pose
-    elif carrier_pose is not None:
-        car_pose = carrier_pose
-        if part.carrier == CAMERA:
-            # The camera looks out of a car, whose pose follows from the camera's.
-            car_pose = compute_car_pose(carrier_pose)
-        # The same dtype and device as the carrier's pose.
-        pose_on_carrier = torch.from_numpy(part.pose_on_carrier).to(carrier_pose)
-        moved_inputs[f"{part.name}.to_world"] = compute_carried_pose(
-            car_pose, pose_on_carrier
-        )
+        return _move_glass(part, carrier_pose, offsets)
+    if carrier_pose is None:
+        return {}
+    return _move_beam(part, carrier_pose)
+
+
+def _move_glass(
+    part: LampGlass, carrier_pose: Tensor | None, offsets: Tensor | None
+) -> dict[str, Tensor]:
+    """Return the inputs that move the glass of a lamp.
+
+    They are its carrier's pose (4, 4), and the offsets (V, 3) of the carrier's vertices
+    on which it lies. None is for what does not move.
+    """
+    moved_inputs: dict[str, Tensor] = {}
+    if offsets is not None:
+        # the vertex of the carrier with which each vertex of the glass moves
+        carrier_vertex = torch.from_numpy(part.vertex_of_carrier).to(offsets.device)
+        moved_inputs[f"{part.name}.offsets"] = offsets[carrier_vertex]
+    if carrier_pose is not None:
+        moved_inputs[f"{part.name}.to_world"] = carrier_pose
     return moved_inputs
+
+
+def _move_beam(part: BeamLamp, carrier_pose: Tensor) -> dict[str, Tensor]:
+    """Return the input that moves a beam with its carrier, which has a pose (4, 4)."""
+    car_pose = carrier_pose
+    if part.carrier == CAMERA:
+        # The camera looks out of a car, whose pose follows from the camera's.
+        car_pose = compute_car_pose(carrier_pose)
+    # The same dtype and device as the carrier's pose.
+    pose_on_carrier = torch.from_numpy(part.pose_on_carrier).to(carrier_pose)
+    beam_pose = compute_carried_pose(car_pose, pose_on_carrier)
+    return {f"{part.name}.to_world": beam_pose}
 
 
 # from a configuration (d,) to one number, at one seed
@@ -453,8 +509,19 @@ class Motion:
         aspect = resolution[1] / resolution[0]
         pose = camera_to_world(description, aspect)
         self._camera = torch.from_numpy(pose).double()
-        # Half the width of the square ground, and points (n, 3) of it that are
-        # followed: its edge, or all vertices if its texture is a photograph.
+        self._choose_ground_points(description)
+        self._environment_points = _sample_environment(description)
+        # indices of the vertices of each mesh that are followed
+        self._followed_vertices = {
+            name: torch.from_numpy(_spread_indices(len(mesh.vertices), N_VERTICES))
+            for name, mesh in assembly.meshes.items()
+        }
+
+    def _choose_ground_points(self, description: SceneDescription) -> None:
+        """Set half the width of the square ground, and points (n, 3) that are followed.
+
+        They are the ground's edge, or all vertices if its texture is a photograph.
+        """
         if description.photograph is None:
             self._ground_half_width = description.get_number("ground.size") / 2.0
             self._ground_points = _sample_square_edge(self._ground_half_width)
@@ -464,15 +531,6 @@ class Motion:
             # is half its width.
             self._ground_half_width = float(vertices.max())
             self._ground_points = torch.from_numpy(vertices).double()
-        # Points of the environment; none if the camera does not see it.
-        is_hidden = description.backdrop or description.environment is None
-        directions = _sample_sphere(0 if is_hidden else N_DIRECTIONS)
-        self._environment_points = directions * ENVIRONMENT_DISTANCE
-        # indices of the vertices of each mesh that are followed
-        self._followed_vertices = {
-            name: torch.from_numpy(_spread_indices(len(mesh.vertices), N_VERTICES))
-            for name, mesh in assembly.meshes.items()
-        }
 
     def project_points(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed points lie in the image.
@@ -487,13 +545,7 @@ class Motion:
         camera = self._camera
         if "camera.to_world" in inputs:
             camera = inputs["camera.to_world"].double()
-        mesh_points = [
-            self._assembly.get_vertices(name, inputs)[followed].double()
-            for name, followed in self._followed_vertices.items()
-        ]
-        points = torch.cat(
-            [*mesh_points, self._ground_points, self._environment_points]
-        )
+        points = self._collect_points(inputs)
         eye = camera[:3, 3]
         # The columns of the rotation are the camera's axes: this product is the points
         # in its coordinates.
@@ -509,6 +561,14 @@ class Motion:
         # A point is near the frame if it is outside by at most a fifth of half a side.
         near_frame = (positions.abs() <= 1.2 * half_size).all(dim=1)
         return positions, is_visible & near_frame
+
+    def _collect_points(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """Return the followed points (N, 3) in the world, those of meshes first."""
+        mesh_points = [
+            self._assembly.get_vertices(name, inputs)[followed].double()
+            for name, followed in self._followed_vertices.items()
+        ]
+        return torch.cat([*mesh_points, self._ground_points, self._environment_points])
 
     def _is_hidden_by_ground(self, eye: Tensor) -> Tensor:
         """Return which points of the environment, (n,), the ground hides from the eye.
@@ -543,22 +603,55 @@ class Motion:
         with torch.no_grad():
             positions, is_visible = self.project_points(make_inputs(u))
             for coordinate in coordinates:
-                for nudge in NUDGES:  # changes of u, largest first
-                    nudged = u.clone()
-                    # At the upper border of the unit cube the change goes backwards.
-                    sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
-                    nudged[coordinate] += sign * nudge
-                    new_positions, still_visible = self.project_points(
-                        make_inputs(nudged)
-                    )
-                    shifts = (new_positions - positions)[is_visible & still_visible]
-                    distances = shifts.norm(dim=1)
-                    # If no visible point has moved, all that moved may have left the
-                    # frame. Then the next, smaller change is tried.
-                    if bool((distances > 0.0).any()):
-                        speeds[coordinate] = float(distances.max()) / nudge
-                        break
+                speeds[coordinate] = self._measure_speed(
+                    make_inputs, u, coordinate, positions, is_visible
+                )
         return speeds
+
+    def _measure_speed(
+        self,
+        make_inputs: Callable[[Tensor], Mapping[str, Tensor]],
+        u: Tensor,
+        coordinate: int,
+        positions: Tensor,
+        is_visible: Tensor,
+    ) -> float:
+        """Return the speed of the fastest point in the frame by one coordinate.
+
+        Args:
+            make_inputs: maps a configuration to assembled inputs.
+            u: (d,) configuration.
+            coordinate: index of the coordinate.
+            positions, is_visible: what `project_points` returns at `u`.
+        """
+        for nudge in NUDGES:  # changes of u, largest first
+            nudged = _nudge_coordinate(u, coordinate, nudge)
+            new_positions, still_visible = self.project_points(make_inputs(nudged))
+            shifts = (new_positions - positions)[is_visible & still_visible]
+            distances = shifts.norm(dim=1)
+            # If no visible point has moved, all that moved may have left the frame.
+            # Then the next, smaller change is tried.
+            if bool((distances > 0.0).any()):
+                return float(distances.max()) / nudge
+        return 0.0
+
+
+def _nudge_coordinate(u: Tensor, coordinate: int, nudge: float) -> Tensor:
+    """Return a configuration (d,) of which one coordinate is changed by `nudge`.
+
+    At the upper border of the unit cube the change goes backwards.
+    """
+    nudged = u.clone()
+    sign = 1.0 if float(u[coordinate]) + nudge <= 1.0 else -1.0
+    nudged[coordinate] += sign * nudge
+    return nudged
+
+
+def _sample_environment(description: SceneDescription) -> Tensor:
+    """Return points (n, 3) of the environment; none if the camera does not see it."""
+    is_hidden = description.backdrop or description.environment is None
+    directions = _sample_sphere(0 if is_hidden else N_DIRECTIONS)
+    return directions * ENVIRONMENT_DISTANCE
 
 
 def _sample_square_edge(half_width: float) -> Tensor:

@@ -100,24 +100,32 @@ class Mesh:
             ("normals", self.normals, 3),
             ("uvs", self.uvs, 2),
         ):
-            if array.shape != (count, width):
-                raise InputError(
-                    f"mesh {name}: expected shape ({count}, {width}), got {array.shape}"
-                )
-            if not np.isfinite(array).all():
-                raise InputError(
-                    f"mesh {name}: found NaN or infinite values; repair the mesh"
-                )
-        if self.faces.ndim != 2 or self.faces.shape[1] != 3 or len(self.faces) == 0:
-            raise InputError(
-                "mesh faces: expected shape (F, 3) with F > 0, got "
-                f"{self.faces.shape}; export triangles"
-            )
-        if int(self.faces.max()) >= count:
-            raise InputError(
-                f"mesh faces: index {int(self.faces.max())} is past the "
-                f"last vertex {count - 1}"
-            )
+            _check_rows(name, array, (count, width))
+        _check_faces(self.faces, count)
+
+
+def _check_rows(name: str, array: Float32Array, shape: tuple[int, int]) -> None:
+    """Raise InputError if an array of a mesh has another shape, or bad values."""
+    if array.shape != shape:
+        raise InputError(
+            f"mesh {name}: expected shape ({shape[0]}, {shape[1]}), got {array.shape}"
+        )
+    if not np.isfinite(array).all():
+        raise InputError(f"mesh {name}: found NaN or infinite values; repair the mesh")
+
+
+def _check_faces(faces: npt.NDArray[np.uint32], n_vertices: int) -> None:
+    """Raise InputError if faces are no triangles of so many vertices."""
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+        raise InputError(
+            "mesh faces: expected shape (F, 3) with F > 0, got "
+            f"{faces.shape}; export triangles"
+        )
+    if int(faces.max()) >= n_vertices:
+        raise InputError(
+            f"mesh faces: index {int(faces.max())} is past the "
+            f"last vertex {n_vertices - 1}"
+        )
 
 
 @dataclass(frozen=True)
@@ -376,13 +384,15 @@ def _merge_clusters(mesh: Mesh, cluster_of: IntArray) -> tuple[IntArray, IntArra
         cluster_and_cell, return_index=True, return_inverse=True
     )
     faces = new_vertex.reshape(-1)[mesh.faces]
-    # clusters of the three corners of each face
     cluster_of_new = cluster_of[representative]
-    cluster_a, cluster_b, cluster_c = cluster_of_new[faces].T
-    is_face = (
-        (cluster_a != cluster_b) & (cluster_b != cluster_c) & (cluster_c != cluster_a)
-    )
+    is_face = _find_distinct_triples(cluster_of_new[faces])
     return representative, faces[is_face]
+
+
+def _find_distinct_triples(triples: IntArray) -> BoolArray:
+    """Return in which rows (F, 3) all three numbers differ."""
+    first, second, third = triples.T
+    return np.asarray((first != second) & (second != third) & (third != first))
 
 
 def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None:
@@ -406,34 +416,64 @@ def make_simplifier(mesh: Mesh, max_faces: int) -> Callable[[Mesh], Mesh] | None
     """
     if len(mesh.faces) <= max_faces:
         return None
+    cluster_of, representative, faces = _cluster_to_limit(mesh, max_faces)
+    distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
+    simplifier = _Simplifier(
+        cluster_of,
+        cluster_size=np.bincount(cluster_of),
+        cluster_of_new=cluster_of[representative],
+        representative=representative,
+        faces=distinct_faces,
+    )
+    return simplifier.simplify
+
+
+def _cluster_to_limit(
+    mesh: Mesh, max_faces: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Cluster a mesh by the finest grid that leaves at most `max_faces` faces.
+
+    If no grid does, it is the coarsest.
+
+    Returns:
+        (V,) the cluster of each vertex; (N,) for each new vertex the index of an old
+        one that it represents; and the faces (F, 3) of new vertices. The two sides of a
+        texture seam have a new vertex each, in one cluster.
+    """
     for grid in SIMPLIFICATION_GRIDS:  # from the finest to the coarsest
         cluster_of = _cluster_vertices(mesh, grid)
-        # For each new vertex, the index of an old one that it represents. The two sides
-        # of a texture seam have a new vertex each, in one cluster.
         representative, faces = _merge_clusters(mesh, cluster_of)
         if len(faces) <= max_faces:
             break
-    # The clusters and faces are those of the grid with which the loop has ended.
-    distinct_faces = np.unique(faces, axis=0).astype(np.uint32)
-    cluster_size = np.bincount(cluster_of)
-    cluster_of_new = cluster_of[representative]  # of each new vertex
+    return cluster_of, representative, faces
 
-    def simplify(full: Mesh) -> Mesh:
-        """Return a mesh with the same vertices elsewhere, simplified in the same way.
+
+@dataclass(frozen=True, eq=False)
+class _Simplifier:
+    """Simplifies meshes that have the same vertices elsewhere in the same manner."""
+
+    cluster_of: IntArray  # (V,) cluster of each vertex
+    cluster_size: IntArray  # number of vertices in each cluster
+    cluster_of_new: IntArray  # (N,) cluster of each new vertex
+    representative: IntArray  # (N,) for each new vertex an old one of its cluster
+    faces: npt.NDArray[np.uint32]  # (F, 3) faces of new vertices
+
+    def simplify(self, full: Mesh) -> Mesh:
+        """Return a mesh with the same vertices elsewhere, simplified.
 
         A new vertex is at the mean of its cluster's vertices, and has the normal and
         the texture coordinates of one of them.
         """
-        sums = [np.bincount(cluster_of, full.vertices[:, axis]) for axis in range(3)]
-        cluster_mean = np.stack([total / cluster_size for total in sums], axis=1)
+        sums = [
+            np.bincount(self.cluster_of, full.vertices[:, axis]) for axis in range(3)
+        ]
+        cluster_mean = np.stack([total / self.cluster_size for total in sums], axis=1)
         return Mesh(
-            cluster_mean[cluster_of_new].astype(np.float32),
-            distinct_faces,
-            full.normals[representative],
-            full.uvs[representative],
+            cluster_mean[self.cluster_of_new].astype(np.float32),
+            self.faces,
+            full.normals[self.representative],
+            full.uvs[self.representative],
         )
-
-    return simplify
 
 
 def _cluster_vertices(mesh: Mesh, grid: int) -> IntArray:
@@ -574,12 +614,17 @@ def with_size(asset: ObjectAsset, size: float | None, unit: str | None) -> Objec
         statement = f"unit={unit} for a mesh of {asset.extent:.4g}"
     else:
         return asset
+    _check_longest_side(longest_side, statement)
+    return replace(asset, size_in_metres=longest_side)
+
+
+def _check_longest_side(longest_side: float, statement: str) -> None:
+    """Raise InputError if a longest side in metres, as a user states it, is no size."""
     if not MIN_METRES <= longest_side <= MAX_METRES:
         raise InputError(
             f"{statement}: expected a longest side of {MIN_METRES:g} to {MAX_METRES:g} "
             f"metres, got {longest_side:.4g}; give it in metres, such as size=4.9"
         )
-    return replace(asset, size_in_metres=longest_side)
 
 
 def _convert_extent(asset: ObjectAsset, unit: str) -> float:
@@ -626,7 +671,23 @@ def describe_size_doubts(
     is_missing = size is None and (needs_metres or extent is not None)
     if has_user_size or not (is_unusual or is_missing):
         return ()
-    # `is_unusual` with a size, and `is_missing` without one
+    clauses = _list_size_clauses(size, extent, kind, needs_metres)
+    remedy = _describe_size_remedy(extent, usual_sizes)
+    beginning = "If that is wrong, give" if is_unusual else "Give"
+    return (f"{asset.name}: {'; '.join(clauses)}. {beginning} {remedy}",)
+
+
+def _list_size_clauses(
+    size: float | None, extent: float | None, kind: str | None, needs_metres: bool
+) -> list[str]:
+    """Return clauses about an object's size that is unusual or not known.
+
+    Args:
+        size: its longest side in metres; None if it is not known.
+        extent: the same in its file's unit; None if that suggests no unit.
+        kind: the word in `USUAL_SIZES` for it, if there is one.
+        needs_metres: whether something in the scene is in metres.
+    """
     clauses = []
     if size is not None:
         clauses.append(f"its longest side is {format_rounded(size)} m")
@@ -635,12 +696,11 @@ def describe_size_doubts(
         if extent:
             clauses.append(f"it is {format_rounded(extent)} in its file")
     if kind is not None:
+        min_size, max_size = USUAL_SIZES[kind]
         clauses.append(f"a {kind}'s is {min_size:g} to {max_size:g} m")
-    if is_missing and needs_metres:
+    if size is None and needs_metres:
         clauses.append("it is taken for 1 m, as the road is in metres")
-    remedy = _describe_size_remedy(extent, usual_sizes)
-    beginning = "If that is wrong, give" if is_unusual else "Give"
-    return (f"{asset.name}: {'; '.join(clauses)}. {beginning} {remedy}",)
+    return clauses
 
 
 def _find_usual_kind(name: str) -> str | None:

@@ -123,19 +123,40 @@ def read_backdrop(spec: str | Path) -> BackdropPhotograph:
     height, width = levels.shape[:2]
     crop = (0, 0, width, height)
     if part:
-        left, top, crop_width, crop_height = map(int, part["numbers"].split(","))
-        crop = (left, top, crop_width, crop_height)
-        if left + crop_width > width or top + crop_height > height:
-            raise InputError(
-                f"backdrop: {text} leaves the photograph, which has {width} x {height} "
-                "pixels (width x height); give a part inside it"
-            )
+        crop = _parse_crop(part["numbers"], text, (height, width))
+    _check_crop_size(crop, path)
+    return make_backdrop(levels, text, crop)
+
+
+def _parse_crop(
+    numbers: str, spec: str, size: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Return left, top, width and height of the part of a photograph that is used.
+
+    Args:
+        numbers: these numbers, as the user gives them.
+        spec: the photograph with its part, for errors.
+        size: height and width of the photograph in pixels.
+
+    Raises InputError: the part leaves the photograph.
+    """
+    height, width = size
+    left, top, crop_width, crop_height = map(int, numbers.split(","))
+    if left + crop_width > width or top + crop_height > height:
+        raise InputError(
+            f"backdrop: {spec} leaves the photograph, which has {width} x {height} "
+            "pixels (width x height); give a part inside it"
+        )
+    return left, top, crop_width, crop_height
+
+
+def _check_crop_size(crop: tuple[int, int, int, int], path: Path) -> None:
+    """Raise InputError if the part of a photograph that is used is too small."""
     if min(crop[2:]) < MIN_SIDE:
         raise InputError(
             f"backdrop: expected at least {MIN_SIDE} x {MIN_SIDE} pixels of "
             f"{path}, got {crop[2]} x {crop[3]}; take another photograph"
         )
-    return make_backdrop(levels, text, crop)
 
 
 def find_photograph_file(photograph: object) -> Path | None:
@@ -241,29 +262,55 @@ def make_image_inputs(
     if photograph is None:
         return {}
     color = photograph.resample(resolution)
-    # Blur and noise are measured in the photograph, unless the user has set them.
+    blur = _find_blur(description, color)
+    noise_setting = description.values.get("backdrop.noise")
+    noise = photograph.make_noise(resolution, noise_setting)
+    depth = _resample_depth_in_sizes(description, photograph, resolution)
+    inputs: dict[str, Tensor | None] = {
+        "backdrop.color": color,
+        "backdrop.plane": compute_plane_radiance(description),
+        "backdrop.front": photograph.resample_front(resolution),
+        "backdrop.depth": depth,
+        "backdrop.noise": noise if bool(noise.any()) else None,
+        "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
+    }
+    return {name: value for name, value in inputs.items() if value is not None}
+
+
+def _resample_depth_in_sizes(
+    description: SceneData, photograph: BackdropPhotograph, resolution: tuple[int, int]
+) -> Tensor | None:
+    """Return the depth of a photograph in object sizes; None if it has none.
+
+    Raises InputError: it has depth, and the object's size in meters is not known.
+    """
+    depth = photograph.resample_depth(resolution)
+    if depth is None:
+        return None
+    _check_has_size(description, photograph)
+    return depth / description.size_in_metres
+
+
+def _find_blur(description: SceneData, color: Tensor) -> float:
+    """Return the blur of a photograph in pixels: as the user has set it, or measured.
+
+    `color` (H, W, 3) is the photograph at the size of the image.
+    """
     blur = description.values.get("backdrop.blur")
     if blur is None:
         luminance = (color.numpy() * LUMINANCE).sum(axis=-1, dtype=np.float32)
         blur = measure_blur(luminance)
-    noise_setting = description.values.get("backdrop.noise")
-    noise = photograph.make_noise(resolution, noise_setting)
-    depth = photograph.resample_depth(resolution)
-    if depth is not None and description.object.size_in_metres is None:
+    return blur
+
+
+def _check_has_size(description: SceneData, photograph: BackdropPhotograph) -> None:
+    """Raise InputError if the size of the object in meters is not known."""
+    if description.object.size_in_metres is None:
         raise InputError(
             f"occluder: {photograph.front_spec} is in metres, and the size of "
             f"{description.object.name} is not known; give its longest side in "
             "metres, such as `size=0.1`"
         )
-    inputs: dict[str, Tensor | None] = {
-        "backdrop.color": color,
-        "backdrop.plane": compute_plane_radiance(description),
-        "backdrop.front": photograph.resample_front(resolution),
-        "backdrop.depth": None if depth is None else depth / description.size_in_metres,
-        "backdrop.noise": noise if bool(noise.any()) else None,
-        "backdrop.blur": torch.tensor([blur]) if blur >= MIN_BLUR else None,
-    }
-    return {name: value for name, value in inputs.items() if value is not None}
 
 
 def compose_over_photograph(
@@ -286,43 +333,74 @@ def compose_over_photograph(
     Returns:
         Radiance (H, W, 3).
     """
-    radiance = rendered[..., channels.RADIANCE]
-    rendered_coverage = rendered[..., channels.COVERAGE]
-    coverage = rendered_coverage
-    front = inputs.get("backdrop.front")
-    if front is not None:
-        visible_object = 1.0 - front[..., :1]
-        radiance = visible_object * radiance
-        coverage = visible_object * coverage
+    radiance, coverage = _cover_object(rendered, inputs.get("backdrop.front"))
     # fraction of each pixel in which the photograph is visible
     uncovered = (1.0 - coverage).clamp(0.0, 1.0)
     if "backdrop.plane" not in inputs:
         return radiance + uncovered * behind
 
-    # change of the plane relative to its radiance; 0 where the plane is covered
-    relative_change = rendered[..., channels.PLANE_CHANGE] / inputs["backdrop.plane"]
-    coat_change = rendered[..., channels.COAT_CHANGE]
-    if front is not None:
-        # The last channel of two is the plane's. With one, it holds for both.
-        visible_plane = 1.0 - front[..., -1:]
-        relative_change = visible_plane * relative_change
-        coat_change = visible_plane * coat_change
+    relative_change, coat_change = _compute_plane_changes(rendered, inputs)
     shade = (uncovered + relative_change).clamp_min(0.0)
     has_coat = coat_change.shape[-1] > 0
     if not has_coat:
         return radiance + shade * behind
 
-    # The reflection of the environment in the coat was rendered for the fraction of the
-    # pixel that the object does not cover: the division makes it that of a full pixel.
-    environment_in_coat = rendered[..., channels.ENVIRONMENT_IN_COAT] / (
-        1.0 - rendered_coverage
-    ).clamp_min(1e-3)
-    # The photograph contains this reflection, at most all of its light.
-    reflection = torch.minimum(environment_in_coat, behind)
     # A shadow darkens only the matt ground. `shade` has also darkened the reflection,
     # and what it has lost is added again.
-    lost_reflection = (uncovered - shade) * reflection
+    lost_reflection = (uncovered - shade) * _compute_coat_reflection(rendered, behind)
     return radiance + (shade * behind + lost_reflection + coat_change).clamp_min(0.0)
+
+
+def _cover_object(rendered: Tensor, front: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return radiance (H, W, 3) and coverage (H, W, 1) of the object's visible part.
+
+    Args:
+        rendered: (H, W, C) image with the channels of
+            `advsearch.scene.rendered_channels`.
+        front: (H, W, 1) or (H, W, 2), first channel: fraction of the object in each
+            pixel that something in front of it hides; None for nothing.
+    """
+    radiance = rendered[..., channels.RADIANCE]
+    coverage = rendered[..., channels.COVERAGE]
+    if front is None:
+        return radiance, coverage
+    visible_object = 1.0 - front[..., :1]
+    return visible_object * radiance, visible_object * coverage
+
+
+def _compute_plane_changes(
+    rendered: Tensor, inputs: Mapping[str, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return the visible changes of the plane, and of the light that its coat reflects.
+
+    The first (H, W, 3) is relative to the plane's radiance, and 0 where the plane is
+    covered. The second is radiance (H, W, 3), with no channels without a coat. The
+    arguments are those of `compose_over_photograph`.
+    """
+    relative_change = rendered[..., channels.PLANE_CHANGE] / inputs["backdrop.plane"]
+    coat_change = rendered[..., channels.COAT_CHANGE]
+    front = inputs.get("backdrop.front")
+    if front is None:
+        return relative_change, coat_change
+    # The last channel of two is the plane's. With one, it holds for both.
+    visible_plane = 1.0 - front[..., -1:]
+    return visible_plane * relative_change, visible_plane * coat_change
+
+
+def _compute_coat_reflection(rendered: Tensor, behind: Tensor) -> Tensor:
+    """Return the reflection (H, W, 3) of the environment that a photograph contains.
+
+    It was rendered for the fraction of the pixel that the object does not cover: the
+    division makes it that of a full pixel. It is at most all light of the photograph.
+
+    Args:
+        rendered: (H, W, 13) rendered image.
+        behind: (H, W, 3) radiance of the photograph.
+    """
+    uncovered = (1.0 - rendered[..., channels.COVERAGE]).clamp_min(1e-3)
+    return torch.minimum(
+        rendered[..., channels.ENVIRONMENT_IN_COAT] / uncovered, behind
+    )
 
 
 def compute_front(
@@ -345,11 +423,7 @@ def compute_front(
         (H, W, 2) float32 in [0, 1]: fraction of the object, and of the ground.
     """
     is_hidden = photograph_depth < surfaces.z_depth * (1.0 - DEPTH_TOLERANCE)
-    is_ground = torch.zeros_like(is_hidden)
-    if GROUND in surfaces.shape_names:
-        is_ground = surfaces.visible_mask(GROUND)
-    is_object = surfaces.z_depth.isfinite() & ~is_ground
-    is_covered = torch.stack([is_object, is_ground])  # (2, H n, W n)
+    is_covered = _find_covered_points(surfaces)
 
     # Fractions (2, H, W) of each pixel, for object and ground. Pooled once more they
     # are means of the pixels around; their padding cancels in the quotient below.
@@ -366,6 +440,15 @@ def compute_front(
     return front
 
 
+def _find_covered_points(surfaces: Surfaces) -> Tensor:
+    """Return the points (2, H, W) of an image that object and ground cover."""
+    is_ground = torch.zeros_like(surfaces.z_depth, dtype=torch.bool)
+    if GROUND in surfaces.shape_names:
+        is_ground = surfaces.visible_mask(GROUND)
+    is_object = surfaces.z_depth.isfinite() & ~is_ground
+    return torch.stack([is_object, is_ground])
+
+
 def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
     """Return the 8-bit levels (H, W, 3) of an opened photograph.
 
@@ -378,14 +461,18 @@ def _decode_photograph(image: Image.Image, path: Path) -> npt.NDArray[np.uint8]:
         warnings.simplefilter("ignore")  # of large images and odd metadata
         image.load()
         upright = ImageOps.exif_transpose(image)
-    if image.has_transparency_data and bool(
-        (to_8bit_levels(upright, alpha=True)[:, :, 3] < 255).any()
-    ):
+    if image.has_transparency_data and _is_transparent(upright):
         raise FileFormatError(
             f"{path}: expected a photograph, got a picture that is transparent in some "
             "pixels; save it without transparency"
         )
     return np.ascontiguousarray(to_8bit_levels(upright, alpha=False))
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    """Return whether some pixel of an image is not opaque."""
+    alpha = to_8bit_levels(image, alpha=True)[:, :, 3]
+    return bool((alpha < 255).any())
 
 
 def make_backdrop(
@@ -403,15 +490,20 @@ def make_backdrop(
     Raises:
         InputError: the levels have another shape or type.
     """
+    _check_levels(levels)
+    levels = np.ascontiguousarray(levels)
+    digest = hashlib.sha256(f"{levels.shape}".encode() + levels.tobytes()).hexdigest()
+    height, width = levels.shape[:2]
+    return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
+
+
+def _check_levels(levels: npt.NDArray[np.uint8]) -> None:
+    """Raise InputError if an array is no photograph (H, W, 3) of 8-bit levels."""
     if levels.ndim != 3 or levels.shape[2] != 3 or levels.dtype != np.uint8:
         raise InputError(
             "backdrop: expected a photograph (h, w, 3) of uint8, got an array of shape "
             f"{levels.shape} of {levels.dtype}"
         )
-    levels = np.ascontiguousarray(levels)
-    digest = hashlib.sha256(f"{levels.shape}".encode() + levels.tobytes()).hexdigest()
-    height, width = levels.shape[:2]
-    return BackdropPhotograph(spec, levels, digest, crop or (0, 0, width, height))
 
 
 # ---- The light of a photograph
@@ -429,6 +521,16 @@ def compute_photograph_gain(
     irradiance = float(compute_level_irradiance(description) @ LUMINANCE)
     if not irradiance > 0.0:
         return 1.0
+    mean_luminance = _measure_mean_luminance(photograph)
+    # a matt surface has the radiance reflectance * irradiance / pi
+    return mean_luminance * math.pi / (GREY_CARD * irradiance)
+
+
+def _measure_mean_luminance(photograph: BackdropPhotograph) -> float:
+    """Return the mean linear luminance of a photograph, at least 1e-3.
+
+    So a black photograph does not make a factor 0.
+    """
     # how many pixels have each of the 256 levels
     histograms = [
         np.bincount(photograph.levels[..., channel].reshape(-1), minlength=256)
@@ -438,10 +540,7 @@ def compute_photograph_gain(
     channel_means = np.array(
         [np.average(decoded, weights=histogram) for histogram in histograms]
     )
-    # at least 1e-3, so that a black photograph does not make the factor 0
-    mean_luminance = max(float(channel_means @ LUMINANCE), 1e-3)
-    # a matt surface has the radiance reflectance * irradiance / pi
-    return mean_luminance * math.pi / (GREY_CARD * irradiance)
+    return max(float(channel_means @ LUMINANCE), 1e-3)
 
 
 def compute_level_irradiance(description: SceneData) -> Float64Array:
@@ -561,16 +660,7 @@ def _look_up_levels(
         points: (N, 3) in world space.
     """
     height, width = photograph.full_size
-    camera = camera_to_world(description, width / height)
-    # points in the camera's coordinates: left, up and ahead
-    relative = (points - camera[:3, 3]) @ camera[:3, :3]
-    # Projection needs the aspect of the full photograph; that of the description may
-    # be that of a part.
-    full_description = replace(description, aspect=width / height)
-    no_inputs: dict[str, Tensor] = {}
-    positions, is_visible = project_points(
-        full_description, no_inputs, torch.from_numpy(relative), (height, width)
-    )
+    positions, is_visible = _project_to_photograph(description, (height, width), points)
     size = np.array([width, height])
     # Positions (x to the right, y down) are counted from the middle of the image,
     # pixels from its top left.
@@ -579,6 +669,33 @@ def _look_up_levels(
     column, row = pixels[is_inside].T
     looked_up: npt.NDArray[np.uint8] = photograph.levels[row, column]
     return looked_up
+
+
+def _project_to_photograph(
+    description: SceneData, full_size: tuple[int, int], points: Float64Array
+) -> tuple[Tensor, Tensor]:
+    """Return where points (N, 3) lie in a full photograph.
+
+    Args:
+        description: the scene with the camera of the full photograph, not of a part.
+        full_size: height and width of the photograph in pixels.
+        points: (N, 3) in world space.
+
+    Returns:
+        (N, 2) pixels from the middle of the image, and (N,) whether the camera sees the
+        point.
+    """
+    height, width = full_size
+    camera = camera_to_world(description, width / height)
+    # points in the camera's coordinates: left, up and ahead
+    relative = (points - camera[:3, 3]) @ camera[:3, :3]
+    # Projection needs the aspect of the full photograph; that of the description may
+    # be that of a part.
+    full_description = replace(description, aspect=width / height)
+    no_inputs: dict[str, Tensor] = {}
+    return project_points(
+        full_description, no_inputs, torch.from_numpy(relative), full_size
+    )
 
 
 # ---- The camera of a photograph
@@ -597,6 +714,33 @@ def make_matrix_camera(
         InputError: it is not of the form [[fx, skew, cx], [0, fy, cy], [0, 0, 1]].
     """
     matrix = np.asarray(camera_matrix, np.float64)
+    _check_camera_matrix(matrix)
+    n_coefficients = len(NUMBER_NAMES) - len(LINEAR_PARAMETERS)
+    no_distortion = [0.0] * n_coefficients
+    numbers = (*_list_linear_parameters(matrix, size), *no_distortion)
+    return CameraModel(BROWN_CONRADY, numbers, PHOTOGRAPH_CAMERA, size)
+
+
+def _list_linear_parameters(matrix: Float64Array, size: tuple[int, int]) -> list[float]:
+    """Return the `LINEAR_PARAMETERS` of a camera matrix (3, 3), in their order.
+
+    They are fx, fy, cx, cy and skew, lengths along x as fractions of the width, those
+    along y of the height. Half a pixel is added to the principal point, since our (0,
+    0) is the corner of the first pixel, not its center. `size` is height and width in
+    pixels.
+    """
+    height, width = size
+    return [
+        float(matrix[0, 0] / width),
+        float(matrix[1, 1] / height),
+        float((matrix[0, 2] + 0.5) / width),
+        float((matrix[1, 2] + 0.5) / height),
+        float(matrix[0, 1] / width),
+    ]
+
+
+def _check_camera_matrix(matrix: Float64Array) -> None:
+    """Raise InputError if an array is no intrinsic matrix of OpenCV."""
     is_camera_matrix = (
         matrix.shape == (3, 3)
         and bool(np.isfinite(matrix).all())
@@ -609,21 +753,6 @@ def make_matrix_camera(
             "camera_matrix: expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in "
             f"pixels, got {matrix.tolist()}"
         )
-    height, width = size
-    # In the order of `LINEAR_PARAMETERS`: fx, fy, cx, cy and skew, lengths along x as
-    # fractions of the width, those along y of the height. Half a pixel is added to the
-    # principal point, since our (0, 0) is the corner of the first pixel, not its
-    # center.
-    linear = (
-        matrix[0, 0] / width,
-        matrix[1, 1] / height,
-        (matrix[0, 2] + 0.5) / width,
-        (matrix[1, 2] + 0.5) / height,
-        matrix[0, 1] / width,
-    )
-    n_coefficients = len(NUMBER_NAMES) - len(LINEAR_PARAMETERS)
-    numbers = (*map(float, linear), *[0.0] * n_coefficients)
-    return CameraModel(BROWN_CONRADY, numbers, PHOTOGRAPH_CAMERA, size)
 
 
 def fit_to_photograph(
@@ -650,22 +779,11 @@ def fit_to_photograph(
     """
     _check_film(photograph, resolution)
     _check_gloss(description)
-    full_height, full_width = photograph.full_size
-    full_aspect = full_width / full_height
-    model = description.camera_model
-    if model is not None:
-        # A bundled model, such as the fisheye, depends on the shape of the image: it is
-        # replaced by that for the full photograph. Other models stay.
-        bundled_models = make_bundled_models(full_aspect)
-        model = bundled_models.get(model.name, model)
-        _check_camera_shape(photograph, model)
+    model = _find_full_camera(description, photograph)
     uncropped = replace(description, camera_model=model)
     color_settings = measure_plane_color(uncropped, photograph, gain)
     if photograph.is_cropped:
-        if model is None:
-            fov = description.get_number("camera.fov")
-            model = replace(make_pinhole(fov, full_aspect), name=PHOTOGRAPH_CAMERA)
-        model = crop_camera(model, photograph)
+        model = _crop_camera_or_pinhole(description, photograph, model)
     film_height, film_width = resolution
     return replace(
         description,
@@ -673,6 +791,47 @@ def fit_to_photograph(
         camera_model=model,
         values={**description.values, **color_settings},
     )
+
+
+def _find_full_camera(
+    description: SceneData, photograph: BackdropPhotograph
+) -> CameraModel | None:
+    """Return the lens model that took a full photograph; None for a pinhole.
+
+    Raises InputError: the camera's pictures have another shape than the photograph.
+    """
+    model = description.camera_model
+    if model is None:
+        return None
+    full_height, full_width = photograph.full_size
+    model = _adapt_bundled_model(model, full_width / full_height)
+    _check_camera_shape(photograph, model)
+    return model
+
+
+def _adapt_bundled_model(model: CameraModel, aspect: float) -> CameraModel:
+    """Return the model for the shape of a full photograph, width over height.
+
+    A bundled model, such as the fisheye, depends on the shape of the image: it is
+    replaced. Other models stay.
+    """
+    bundled_models = make_bundled_models(aspect)
+    return bundled_models.get(model.name, model)
+
+
+def _crop_camera_or_pinhole(
+    description: SceneData, photograph: BackdropPhotograph, model: CameraModel | None
+) -> CameraModel:
+    """Return the camera that sees the used part of a photograph.
+
+    `model` is the camera of the full photograph; None is for the scene's pinhole.
+    """
+    if model is None:
+        full_height, full_width = photograph.full_size
+        fov = description.get_number("camera.fov")
+        pinhole = make_pinhole(fov, full_width / full_height)
+        model = replace(pinhole, name=PHOTOGRAPH_CAMERA)
+    return crop_camera(model, photograph)
 
 
 def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraModel:
@@ -693,17 +852,22 @@ def crop_camera(model: CameraModel, photograph: BackdropPhotograph) -> CameraMod
             f"backdrop: {photograph.spec} is a part of a picture of {model.name}, which "
             "shows all around; give the full photograph"
         )
+    values = model.intrinsic_by_name  # a new dictionary
+    _crop_intrinsics(values, photograph)
+    numbers = tuple(values[name] for name in NUMBER_NAMES)
+    # Without a size: the model's own is that of the full photograph.
+    return replace(model, intrinsics=numbers, calibrated_shape=None)
+
+
+def _crop_intrinsics(values: dict[str, float], photograph: BackdropPhotograph) -> None:
+    """Change numbers of a lens, by name, to those for the used part of a photograph."""
     left, top, width, height = photograph.crop
     full_height, full_width = photograph.full_size
-    values = model.intrinsic_by_name  # a new dictionary
     values["fx"] *= full_width / width
     values["skew"] *= full_width / width
     values["cx"] = (values["cx"] * full_width - left) / width
     values["fy"] *= full_height / height
     values["cy"] = (values["cy"] * full_height - top) / height
-    numbers = tuple(values[name] for name in NUMBER_NAMES)
-    # Without a size: the model's own is that of the full photograph.
-    return replace(model, intrinsics=numbers, calibrated_shape=None)
 
 
 def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> None:
@@ -723,23 +887,42 @@ def _check_film(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> 
     rounding = max(width / film_width, height / film_height)
     if abs(film_width / film_height * height - width) <= rounding:
         return
-    # the largest part of the film's shape, in the middle of the used part
+    part = _suggest_part(photograph, resolution)
+    fitting = _suggest_resolution(photograph, resolution)
+    raise InputError(
+        f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
+        f"and the rendered picture {film_width} x {film_height}, which is another "
+        f"shape; give a part of the photograph, such as {part}, or another "
+        f"`resolution`, such as {fitting}"
+    )
+
+
+def _suggest_part(photograph: BackdropPhotograph, resolution: tuple[int, int]) -> str:
+    """Return the largest part of a photograph with a film's shape, as users give it.
+
+    It is in the middle of the used part.
+    """
+    height, width = photograph.size
+    film_height, film_width = resolution
     scale = min(width / film_width, height / film_height)
     part_width = int(film_width * scale)
     part_height = int(film_height * scale)
     left = photograph.crop[0] + (width - part_width) // 2
     top = photograph.crop[1] + (height - part_height) // 2
     path = photograph.spec.partition("#")[0]
-    # the photograph's shape, with the larger side of the film; the setting `resolution`
-    # is height x width, while this message has width x height elsewhere
-    shrinking = max(film_width, film_height) / max(width, height)
-    fitting = f"{max(round(height * shrinking), 1)}x{max(round(width * shrinking), 1)}"
-    raise InputError(
-        f"backdrop: {photograph.spec} has {width} x {height} pixels (width x height) "
-        f"and the rendered picture {film_width} x {film_height}, which is another "
-        f"shape; give a part of the photograph, such as {path}#{left},{top},"
-        f"{part_width},{part_height}, or another `resolution`, such as {fitting}"
-    )
+    return f"{path}#{left},{top},{part_width},{part_height}"
+
+
+def _suggest_resolution(
+    photograph: BackdropPhotograph, resolution: tuple[int, int]
+) -> str:
+    """Return a resolution with a photograph's shape and the larger side of a film.
+
+    The setting `resolution` is height x width, while messages have width x height.
+    """
+    height, width = photograph.size
+    shrinking = max(resolution) / max(width, height)
+    return f"{max(round(height * shrinking), 1)}x{max(round(width * shrinking), 1)}"
 
 
 def _check_gloss(description: SceneData) -> None:
@@ -756,18 +939,21 @@ def _check_gloss(description: SceneData) -> None:
         )
     if not is_glossy or has_plane(description):
         return
-    # the first condition of `has_plane` that does not hold
-    is_lit = bool((compute_level_irradiance(description) > 0.0).all())
-    if description.get_number("ground.size") == 0.0:
-        reason = "ground.size is 0"
-    elif not is_lit:
-        reason = "no environment lights the scene"
-    else:
-        reason = "the camera is not above ground.level"
+    reason = _explain_missing_plane(description)
     raise InputError(
         f"`set` ground.gloss: {reason}, so that no plane reflects the object; change "
         "that, or leave ground.gloss out"
     )
+
+
+def _explain_missing_plane(description: SceneData) -> str:
+    """Return why a scene has no plane: the first condition that fails."""
+    is_lit = bool((compute_level_irradiance(description) > 0.0).all())
+    if description.get_number("ground.size") == 0.0:
+        return "ground.size is 0"
+    if not is_lit:
+        return "no environment lights the scene"
+    return "the camera is not above ground.level"
 
 
 def _check_camera_shape(photograph: BackdropPhotograph, model: CameraModel) -> None:
@@ -828,10 +1014,7 @@ def compute_view_settings(
     distance = float(center[2])
     if distance <= 0.0:
         raise InputError("object_to_camera: puts the object behind the camera")
-    object_up = mesh_to_camera[:3, 2]  # z axis of the mesh in camera coordinates
-    world_axes = _make_world_axes(
-        object_up if up is None else np.asarray(up, np.float64)
-    )
+    world_axes = _make_world_axes(_find_world_up(mesh_to_camera, up))
     rotation = world_axes @ mesh_to_camera[:3, :3]
     # shift of the object's center from the point that the camera orbits, in the world
     orbit_center = np.array([0.0, 0.0, distance])
@@ -839,8 +1022,7 @@ def compute_view_settings(
     # The orbited point is at the height `middle[2]`: the mesh stands on the height 0,
     # and that is the height of its center.
     center_height = float(offset[2] + middle[2])
-    rotated_vertices = (vertices - middle) @ rotation.T  # relative to the center
-    lowest = center_height + float(rotated_vertices[:, 2].min())
+    lowest = center_height + _measure_lowest(vertices - middle, rotation)
     return {
         **_compute_orbit(world_axes),
         # in meters; `_check_and_map` has checked that the size is known
@@ -853,6 +1035,26 @@ def compute_view_settings(
         "pose.z": lowest,
         "ground.level": lowest,
     }
+
+
+def _find_world_up(
+    mesh_to_camera: Float64Array, up: npt.ArrayLike | None
+) -> Float64Array:
+    """Return the direction (3,) in the camera's coordinates that is up in the world.
+
+    Args:
+        mesh_to_camera: (4, 4) from the mesh's coordinates to the camera's.
+        up: (3,) the direction; None: the object's own up axis, the z axis of the mesh.
+    """
+    if up is None:
+        return mesh_to_camera[:3, 2]
+    return np.asarray(up, np.float64)
+
+
+def _measure_lowest(vertices: Float64Array, rotation: Float64Array) -> float:
+    """Return the smallest height of vertices (V, 3) under a rotation (3, 3)."""
+    rotated_vertices = vertices @ rotation.T
+    return float(rotated_vertices[:, 2].min())
 
 
 def _check_and_map(asset: ObjectAsset, object_to_camera: npt.ArrayLike) -> Float64Array:
@@ -911,23 +1113,36 @@ def _compute_orbit(world_axes: Float64Array) -> dict[str, float]:
     right, _down, ahead = world_axes.T
     outwards = -ahead
     elevation = math.degrees(math.asin(min(max(float(outwards[2]), -1.0), 1.0)))
+    _check_elevation(elevation)
+    return {
+        "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
+        "camera.elevation": elevation,
+        "camera.roll": _compute_roll(-right, outwards),
+    }
+
+
+def _check_elevation(elevation: float) -> None:
+    """Raise InputError if a camera looks straight up or down; degrees from level."""
     if abs(elevation) > MAX_ELEVATION:
         raise InputError(
             "object_to_camera: the camera looks straight up or down, more than "
             f"{MAX_ELEVATION:g} degrees from level, which no camera does that orbits "
             "the object; give another `up`"
         )
+
+
+def _compute_roll(left: Float64Array, outwards: Float64Array) -> float:
+    """Return the roll of a camera in degrees.
+
+    Args:
+        left: (3,) the camera's own left in the world's axes.
+        outwards: (3,) direction from the object to the camera.
+    """
     # directions to the left and up of a camera without roll, in the world's axes
     level_left = np.array([outwards[1], -outwards[0], 0.0])
     level_left /= np.linalg.norm(level_left)
     upright = np.cross(-outwards, level_left)
-    # The roll is the angle from there to the camera's own left.
-    left = -right
-    return {
-        "camera.azimuth": math.degrees(math.atan2(outwards[1], outwards[0])),
-        "camera.elevation": elevation,
-        "camera.roll": math.degrees(math.atan2(left @ upright, left @ level_left)),
-    }
+    return math.degrees(math.atan2(left @ upright, left @ level_left))
 
 
 def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
@@ -936,7 +1151,17 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
     Raises InputError: it is not rigid, that is a rotation and a translation alone.
     """
     matrix = np.asarray(pose, np.float64)
-    is_rigid = (
+    if not _is_rigid(matrix):
+        raise InputError(
+            "object_to_camera: expected a rotation and a translation as a (4, 4) "
+            f"matrix, got {matrix.tolist()}"
+        )
+    return matrix
+
+
+def _is_rigid(matrix: Float64Array) -> bool:
+    """Return whether a matrix is a pose (4, 4): a rotation and a translation alone."""
+    return bool(
         matrix.shape == (4, 4)
         and bool(np.isfinite(matrix).all())
         and matrix[3].tolist() == [0.0, 0.0, 0.0, 1.0]
@@ -944,12 +1169,6 @@ def _check_rigid(pose: npt.ArrayLike) -> Float64Array:
         <= ROTATION_TOLERANCE
         and np.linalg.det(matrix[:3, :3]) > 0.0
     )
-    if not is_rigid:
-        raise InputError(
-            "object_to_camera: expected a rotation and a translation as a (4, 4) "
-            f"matrix, got {matrix.tolist()}"
-        )
-    return matrix
 
 
 def _make_world_axes(up: Float64Array) -> Float64Array:

@@ -143,8 +143,13 @@ def _resample_image(image: Float32Array, resolution: tuple[int, int]) -> Tensor:
     resampled = torch.from_numpy(averaged)
     if tuple(averaged.shape[:2]) == resolution:
         return resampled
+    return _enlarge_image(resampled, resolution)
+
+
+def _enlarge_image(image: Tensor, resolution: tuple[int, int]) -> Tensor:
+    """Interpolate an image (H, W, C) bilinearly to (height, width) pixels."""
     enlarged = torch.nn.functional.interpolate(
-        resampled.permute(2, 0, 1)[None],
+        image.permute(2, 0, 1)[None],
         size=resolution,
         mode="bilinear",
         align_corners=False,

@@ -92,6 +92,7 @@ ORBSLAM_KINDS = {
     "kannalabrandt8": "kannala_brandt",
     "rectified": "none",
 }
+ORBSLAM_SIZE_NAMES = {"width": "image_width", "height": "image_height"}
 ORBSLAM_NON_LENS_KEYS = re.compile(
     r"(ORBextractor|Viewer|IMU|System|Stereo|RGBD|LoopClosing|File|Initializer|Tracking|Mapping|Preprocessing)\..*"
     r"|Camera\d?\.(fps|RGB|bf|b|overlappingBegin|overlappingEnd|name|setup|color_order)|ThDepth|DepthMapFactor"
@@ -195,14 +196,22 @@ def translate_entries(
     kitti_cameras = _find_kitti(data)
     if kitti_cameras:
         return _translate_kitti(path, camera_name, data, kitti_cameras)
-    if data and all(
-        isinstance(entry, dict) and "projection_type" in entry
-        for entry in data.values()
-    ):
+    if data and all(map(_is_opensfm_camera, data.values())):
         return _translate_opensfm(path, select_camera(path, camera_name, data))
     # the other tools write a single camera, which has no name
-    if camera_name:
-        return None
+    return None if camera_name else _translate_single(path, data)
+
+
+def _is_opensfm_camera(entry: object) -> bool:
+    """Return whether an entry is a camera of OpenSfM."""
+    return isinstance(entry, dict) and "projection_type" in entry
+
+
+def _translate_single(path: str, data: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Translate a camera of stella_vslam, RealSense or Metashape; None for others.
+
+    The arguments are those of `translate_entries`.
+    """
     stella_camera = data.get("Camera")
     if isinstance(stella_camera, dict) and "model" in stella_camera:
         return _translate_stella(stella_camera)
@@ -254,20 +263,25 @@ def _translate_orbslam(
         "distortion_model": ORBSLAM_KINDS.get(stated_type.lower(), stated_type)
     }
     other_cameras = {name for name in cameras if name != selected_camera}
-    size_names = {"width": "image_width", "height": "image_height"}
     for name, value in data.items():
-        camera, _, entry_name = name.partition(".")
-        if camera in other_cameras or ORBSLAM_NON_LENS_KEYS.fullmatch(name):
+        camera, _, _entry_name = name.partition(".")
+        is_other = camera in other_cameras or ORBSLAM_NON_LENS_KEYS.fullmatch(name)
+        if is_other or name == "Camera.type":  # the distortion model above
             continue
-        if name == "Camera.type":  # the distortion model above
-            continue
-        # Several cameras share the entries of `Camera`, such as `Camera.width`.
-        is_of_selected_camera = camera in (selected_camera, "Camera")
-        if is_of_selected_camera:
-            entries[size_names.get(entry_name, entry_name)] = value
-        else:
-            entries[name] = value
+        entries[_shorten_orbslam_name(name, selected_camera)] = value
     return entries
+
+
+def _shorten_orbslam_name(name: str, selected_camera: str) -> str:
+    """Return the name of an entry of ORB-SLAM without the selected camera before it.
+
+    Several cameras share the entries of `Camera`, such as `Camera.width`. Other entries
+    keep their names.
+    """
+    camera, _, entry_name = name.partition(".")
+    if camera in (selected_camera, "Camera"):
+        return ORBSLAM_SIZE_NAMES.get(entry_name, entry_name)
+    return name
 
 
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
@@ -332,33 +346,57 @@ def _translate_kitti(
         for name, value in data.items()
         if not KITTI_NON_LENS_KEYS.fullmatch(name)
     }
+    entries["camera_matrix"] = _read_kitti_matrix(path, data, matrix_name)
     raw_match = KITTI_RAW.fullmatch(matrix_name)
     if raw_match:
-        camera_number = raw_match[1]
-        entries["camera_matrix"] = _read_numbers(path, data, matrix_name, 9)
-        entries["distortion_coefficients"] = _read_numbers(
-            path, data, f"D_{camera_number}", 5
-        )
-    else:
-        # The projection (3, 4) is K [R | t]. A rectified camera has R = 1, so that the
-        # first three columns are K.
-        projection = _read_numbers(path, data, matrix_name, 12)
-        entries["camera_matrix"] = [
-            *projection[0:3],
-            *projection[4:7],
-            *projection[8:11],
-        ]
-    # K_02 has its size in S_02, P_rect_02 in S_rect_02, and P2 has none.
+        distortion_name = f"D_{raw_match[1]}"
+        coefficients = _read_numbers(path, data, distortion_name, count=5)
+        entries["distortion_coefficients"] = coefficients
+    return entries | _read_kitti_size(path, data, matrix_name)
+
+
+def _read_kitti_size(
+    path: str, data: Mapping[str, Any], matrix_name: str
+) -> dict[str, Any]:
+    """Return `image_size` of a camera of KITTI; empty if other entries have the size.
+
+    K_02 has its size in S_02, P_rect_02 in S_rect_02, and P2 has none.
+
+    Args:
+        path: the file, for messages.
+        data: all entries of the file.
+        matrix_name: name of the camera's matrix, such as "P_rect_02".
+
+    Raises:
+        FileFormatError: the file has no size of the image.
+    """
     size_name = re.sub(r"^[KP]_", "S_", matrix_name)
     if size_name != matrix_name and size_name in data:
-        entries["image_size"] = _read_numbers(path, data, size_name, 2)
-    elif "image_width" not in data or "image_height" not in data:
+        return {"image_size": _read_numbers(path, data, size_name, count=2)}
+    _check_has_size_entries(path, data)
+    return {}
+
+
+def _read_kitti_matrix(
+    path: str, data: Mapping[str, Any], matrix_name: str
+) -> list[float]:
+    """Return the camera matrix of KITTI's camera, nine numbers row by row."""
+    if KITTI_RAW.fullmatch(matrix_name):
+        return _read_numbers(path, data, matrix_name, 9)
+    # The projection (3, 4) is K [R | t]. A rectified camera has R = 1, so that the
+    # first three columns are K.
+    projection = _read_numbers(path, data, matrix_name, 12)
+    return [*projection[0:3], *projection[4:7], *projection[8:11]]
+
+
+def _check_has_size_entries(path: str, data: Mapping[str, Any]) -> None:
+    """Raise FileFormatError if a file of KITTI does not state the size of the image."""
+    if "image_width" not in data or "image_height" not in data:
         raise FileFormatError(
             f"{path}: KITTI's calibration has no size of the pictures; add it in two "
             "lines, as in image_width: 1242 and image_height: 375 (also 1241 x 376, "
             "1226 x 370, 1224 x 370)"
         )
-    return entries
 
 
 def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -369,10 +407,7 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
     are the same as a pinhole, and are translated to "none".
     """
     entries = {REALSENSE_NAMES.get(name, name): value for name, value in data.items()}
-    # "distortion.brown_conrady" and "Brown Conrady" become "brown_conrady".
-    stated_model = str(data.get("model", "none"))
-    model_name = stated_model.rpartition(".")[2].strip().lower()
-    model = re.sub(r"[-\s]+", "_", model_name)
+    model = _simplify_realsense_model(str(data.get("model", "none")))
     coefficients = data.get("coeffs")
     is_undistorted = isinstance(coefficients, list) and not any(coefficients)
     if model in ("kannala_brandt4", "kannala_brandt"):
@@ -385,6 +420,15 @@ def _translate_realsense(data: Mapping[str, Any]) -> dict[str, Any]:
             model = "none"
     entries["distortion_model"] = model
     return entries
+
+
+def _simplify_realsense_model(stated_model: str) -> str:
+    """Return the name of a distortion model of RealSense in one spelling.
+
+    "distortion.brown_conrady" and "Brown Conrady" become "brown_conrady".
+    """
+    name = stated_model.rpartition(".")[2].strip().lower()
+    return re.sub(r"[-\s]+", "_", name)
 
 
 def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
@@ -404,9 +448,7 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
         for name, value in camera.items()
         if name not in OPENSFM_TRANSLATED_KEYS
     }
-    width, height = (
-        parse_number(path, side, camera.get(side)) for side in ("width", "height")
-    )
+    width, height = _parse_side_lengths(path, camera)
     entries |= {
         "distortion_model": stated_type if kind is None else kind,
         "image_width": width,
@@ -415,6 +457,16 @@ def _translate_opensfm(path: str, camera: Mapping[str, Any]) -> dict[str, Any]:
     if kind not in (None, "equirectangular"):
         entries |= _scale_opensfm_lengths(path, camera, width, height)
     return entries
+
+
+def _parse_side_lengths(path: str, entries: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the entries `width` and `height` of a camera; `path` is for messages.
+
+    Raises FileFormatError: one of them is missing, or is no number.
+    """
+    width = parse_number(path, "width", entries.get("width"))
+    height = parse_number(path, "height", entries.get("height"))
+    return width, height
 
 
 def _scale_opensfm_lengths(
@@ -464,30 +516,50 @@ def _translate_metashape(path: str, data: Mapping[str, Any]) -> dict[str, Any]:
         name: parse_number(path, name, data.get(name, 0.0))
         for name in ("f", "cx", "cy", "b1", "b2", "k4", "p1", "p2")
     }
-    width, height = (
-        parse_number(path, side, data.get(side)) for side in ("width", "height")
-    )
+    width, height = _parse_side_lengths(path, data)
+    translated_names = (*value_by_name, "projection", "width", "height")
     entries = {
-        name: entry
-        for name, entry in data.items()
-        if name not in (*value_by_name, "projection", "width", "height")
+        name: entry for name, entry in data.items() if name not in translated_names
     }
     # A type that is not supported keeps its name, and is rejected later.
     kind = METASHAPE_KINDS.get(stated_type, stated_type)
     entries |= {"distortion_model": kind, "image_width": width, "image_height": height}
     if kind == "equirectangular":
         return entries
-    entries["camera_matrix"] = _make_metashape_matrix(value_by_name, width, height)
-    entries |= {"p1": value_by_name["p2"], "p2": value_by_name["p1"]}
+    return entries | _name_metashape_lens(path, kind, value_by_name, (width, height))
+
+
+def _name_metashape_lens(
+    path: str, kind: str, value_by_name: Mapping[str, float], size: tuple[float, float]
+) -> dict[str, Any]:
+    """Return the entries of the lens of a camera of Metashape, by OpenCV's names.
+
+    Args:
+        path: the file, for messages.
+        kind: kind of the model, which is no panorama.
+        value_by_name: Metashape's numbers.
+        size: width and height of the image in pixels.
+    """
+    entries: dict[str, Any] = {
+        "camera_matrix": _make_metashape_matrix(value_by_name, *size),
+        "p1": value_by_name["p2"],
+        "p2": value_by_name["p1"],
+    }
     if kind == "fisheye":
         entries["k4"] = value_by_name["k4"]
-    elif value_by_name["k4"]:
+    else:
+        _check_no_fourth_term(path, value_by_name["k4"])
+    return entries
+
+
+def _check_no_fourth_term(path: str, k4: float) -> None:
+    """Raise FileFormatError if a camera that is no fisheye has a fourth radial term."""
+    if k4:
         raise FileFormatError(
-            f"{path}: k4: expected 0, got {value_by_name['k4']:g}: the fourth radial "
+            f"{path}: k4: expected 0, got {k4:g}: the fourth radial "
             "term of Metashape is not OpenCV's; leave k4 out of the fit and optimize "
             "the cameras again"
         )
-    return entries
 
 
 def _make_metashape_matrix(

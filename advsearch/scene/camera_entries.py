@@ -136,13 +136,8 @@ class CameraEntries:
         Raises:
             FileFormatError: the list has another length, or a value is no finite number.
         """
-        # OpenCV writes a matrix as a mapping. Its keys are noted if they are not of
-        # OpenCV's format.
         if isinstance(entry, Mapping):
-            self._unread_matrix_keys += [
-                f"{name}.{key}" for key in entry if key not in MATRIX_KEYS
-            ]
-            entry = entry.get("data")
+            entry = self._read_matrix_data(name, entry)
         values = _flatten(entry)
         if len(values) not in counts:
             expected = " or ".join(map(str, counts))
@@ -151,6 +146,17 @@ class CameraEntries:
                 f"{len(values)}"
             )
         return [parse_number(self.path, name, value) for value in values]
+
+    def _read_matrix_data(self, name: str, matrix: Mapping[Any, Any]) -> object:
+        """Return the `data` of a matrix, which OpenCV writes as a mapping.
+
+        Its keys are noted if they are not of OpenCV's format. `name` is that of the
+        entry.
+        """
+        self._unread_matrix_keys += [
+            f"{name}.{key}" for key in matrix if key not in MATRIX_KEYS
+        ]
+        return matrix.get("data")
 
     def find_unread(self, prefix: str = "") -> list[str]:
         """Return the names of entries that were not read and need a note.
@@ -170,17 +176,20 @@ class CameraEntries:
         ):
             name = normalize_key(spelling)
             value = self._keys.peek(name)
-            if not self._is_image_changing_entry(name, value):
+            if self._is_image_changing_entry(name, value):
+                self._check_is_neutral(prefix + spelling, value)
+            else:
                 unread.append(prefix + spelling)
-                continue
-            is_neutral = has_no_effect(value)
-            if not is_neutral:
-                raise FileFormatError(
-                    f"{self.path}: expected no {format_name(prefix + spelling)}, got "
-                    f"{format_name(str(value))}: it changes the picture and is not "
-                    "read; calibrate with one of the models in docs/cameras.md"
-                )
         return unread
+
+    def _check_is_neutral(self, spelling: str, value: object) -> None:
+        """Raise FileFormatError for an entry that changes the image and is not read."""
+        if not has_no_effect(value):
+            raise FileFormatError(
+                f"{self.path}: expected no {format_name(spelling)}, got "
+                f"{format_name(str(value))}: it changes the picture and is not "
+                "read; calibrate with one of the models in docs/cameras.md"
+            )
 
     def _is_image_changing_entry(self, name: str, value: object) -> bool:
         """Return whether an entry describes the image of this camera.
@@ -217,9 +226,7 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
             has not named one.
     """
     names = list(map(str, cameras))
-    listing = ", ".join(names[:8])
-    if len(names) > 8:
-        listing += ", ..."
+    listing = _list_first_names(names)
     example = f"{path}#{names[0]}"
     if camera_name and camera_name not in names:
         raise FileFormatError(
@@ -232,6 +239,13 @@ def select_camera(path: str, camera_name: str, cameras: Mapping[str, Any]) -> An
             f"picture, as in {example}"
         )
     return cameras[camera_name or names[0]]
+
+
+def _list_first_names(names: Sequence[str]) -> str:
+    """Return the first eight names of a list, for messages."""
+    max_names = 8
+    listing = ", ".join(names[:max_names])
+    return f"{listing}, ..." if len(names) > max_names else listing
 
 
 def has_no_effect(value: object) -> bool:
@@ -333,27 +347,11 @@ def make_camera_model(
     """
     path = spec.partition("#")[0]
     height, width = size
-    if not all(side == int(side) and 1 <= side <= MAX_SIDE for side in size):
-        raise FileFormatError(
-            f"{path}: expected a width and a height from 1 to {MAX_SIDE} pixels, got "
-            f"{width:g} x {height:g}"
-        )
-    if kind == EQUIRECTANGULAR:
-        pixel_values = {
-            "fx": width,
-            "fy": height,
-            "cx": width / 2.0,
-            "cy": height / 2.0,
-        }
-        pixel_offset = 0.0
-    value_by_name = {name: pixel_values.get(name, 0.0) for name in NUMBER_NAMES}
-    value_by_name["cx"] = value_by_name["cx"] + pixel_offset
-    value_by_name["cy"] = value_by_name["cy"] + pixel_offset
+    _check_side_lengths(path, size)
+    value_by_name = _complete_numbers(kind, size, pixel_values, pixel_offset)
     _check_numbers(path, value_by_name, width, height)
-    # Lengths are divided by a side of the image; coefficients have no unit.
-    unit_by_name = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
     numbers = tuple(
-        number / unit_by_name.get(name, 1.0) for name, number in value_by_name.items()
+        number / _get_unit(name, size) for name, number in value_by_name.items()
     )
     return CameraModel(
         kind=kind,
@@ -361,6 +359,52 @@ def make_camera_model(
         name=spec,
         calibrated_shape=(int(height), int(width)),
     )
+
+
+def _complete_numbers(
+    kind: str,
+    size: tuple[float, float],
+    pixel_values: Mapping[str, float],
+    pixel_offset: float,
+) -> dict[str, float]:
+    """Return the numbers of a camera in pixels, by all `NUMBER_NAMES`.
+
+    The arguments are those of `make_camera_model`.
+    """
+    if kind == EQUIRECTANGULAR:
+        pixel_values = _make_panorama_numbers(size)
+        pixel_offset = 0.0
+    value_by_name = {name: pixel_values.get(name, 0.0) for name in NUMBER_NAMES}
+    value_by_name["cx"] += pixel_offset
+    value_by_name["cy"] += pixel_offset
+    return value_by_name
+
+
+def _check_side_lengths(path: str, size: tuple[float, float]) -> None:
+    """Raise FileFormatError if a height and a width are no numbers of pixels."""
+    height, width = size
+    if not all(side == int(side) and 1 <= side <= MAX_SIDE for side in size):
+        raise FileFormatError(
+            f"{path}: expected a width and a height from 1 to {MAX_SIDE} pixels, got "
+            f"{width:g} x {height:g}"
+        )
+
+
+def _make_panorama_numbers(size: tuple[float, float]) -> dict[str, float]:
+    """Return the numbers of a panorama of a size (height, width), by name."""
+    height, width = size
+    return {"fx": width, "fy": height, "cx": width / 2.0, "cy": height / 2.0}
+
+
+def _get_unit(name: str, size: tuple[float, float]) -> float:
+    """Return the length in pixels that is 1 for a number of a model.
+
+    Lengths are divided by a side (height, width) of the image; coefficients have no
+    unit.
+    """
+    height, width = size
+    unit_by_name = {"fx": width, "fy": height, "cx": width, "cy": height, "skew": width}
+    return unit_by_name.get(name, 1.0)
 
 
 def _check_numbers(
@@ -379,41 +423,68 @@ def _check_numbers(
         height: height of the image in pixels.
     """
 
-    def check(name: str, is_valid: bool, expected: str, hint: str = "") -> None:
-        """Raise the error of a number that is not valid."""
-        if not is_valid:
-            raise FileFormatError(
-                f"{path}: {name}: expected {expected}, got "
-                f"{value_by_name[name]:g}{hint}"
-            )
-
+    check = _NumberCheck(path, value_by_name)
     for name, side in (("fx", width), ("fy", height)):
+        check.check_focal_length(name, side)
+    for name, side in (("cx", width), ("cy", height)):
+        check.check_center(name, side)
+    check.check_skew()
+    for name in COEFFICIENTS:
+        check.check_coefficient(name)
+
+
+@dataclass(frozen=True)
+class _NumberCheck:
+    """Checks of the numbers of a camera in pixels."""
+
+    path: str  # the file, for messages
+    value_by_name: Mapping[str, float]
+
+    def check_focal_length(self, name: str, side: float) -> None:
+        """Check a focal length along a side of the image."""
         min_focal = side / MAX_FOCAL_RATIO
         max_focal = side * MAX_FOCAL_RATIO
-        check(
+        self._require(
             name,
-            min_focal <= value_by_name[name] <= max_focal,
+            min_focal <= self.value_by_name[name] <= max_focal,
             f"a focal length from {min_focal:g} to {max_focal:g} pixels for a side of "
             f"{side:g}",
         )
-    for name, side in (("cx", width), ("cy", height)):
-        check(
+
+    def check_center(self, name: str, side: float) -> None:
+        """Check a coordinate of the principal point along a side of the image."""
+        self._require(
             name,
-            0.0 < value_by_name[name] < side,
+            0.0 < self.value_by_name[name] < side,
             f"a principal point inside the picture, up to {side:g}",
         )
-    check(
-        "skew",
-        abs(value_by_name["skew"]) <= value_by_name["fx"],
-        f"less than fx, {value_by_name['fx']:g}",
-    )
-    for name in COEFFICIENTS:
-        check(
+
+    def check_skew(self) -> None:
+        """Check the skew."""
+        self._require(
+            "skew",
+            abs(self.value_by_name["skew"]) <= self.value_by_name["fx"],
+            f"less than fx, {self.value_by_name['fx']:g}",
+        )
+
+    def check_coefficient(self, name: str) -> None:
+        """Check a coefficient of the distortion."""
+        self._require(
             name,
-            abs(value_by_name[name]) <= MAX_COEFFICIENT,
+            abs(self.value_by_name[name]) <= MAX_COEFFICIENT,
             f"a coefficient from -{MAX_COEFFICIENT:g} to {MAX_COEFFICIENT:g}",
             "; is it in the order of OpenCV?",
         )
+
+    def _require(
+        self, name: str, is_valid: bool, expected: str, hint: str = ""
+    ) -> None:
+        """Raise FileFormatError if a number is not valid."""
+        if not is_valid:
+            raise FileFormatError(
+                f"{self.path}: {name}: expected {expected}, got "
+                f"{self.value_by_name[name]:g}{hint}"
+            )
 
 
 # ---- Mounted cameras: ``--camera dashcam``, ``--camera robot`` ----

@@ -15,7 +15,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
@@ -212,26 +212,48 @@ def make_camera(spec: str, entries: Mapping[str, Any]) -> CameraModel:
         return _read_opencv(spec, CameraEntries(path, translated))
     if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
         return _read_nerfstudio(spec, camera_name, data)
-    cameras = {
+    cameras = _find_kalibr_cameras(data)
+    if cameras:
+        return _read_kalibr_chain(spec, data, cameras)
+    _check_no_camera_name(path, camera_name)
+    if "intrinsics" in data and "camera_model" in data:
+        return _read_kalibr(spec, CameraEntries(path, data))
+    return _read_opencv(spec, CameraEntries(path, _flatten_groups(data)))
+
+
+def _find_kalibr_cameras(data: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return those entries of a file that are cameras of Kalibr, by name."""
+    return {
         name: entry
         for name, entry in data.items()
         if isinstance(entry, dict) and "intrinsics" in entry
     }
-    if cameras:
-        other_entries = {
-            name: entry for name, entry in data.items() if name not in cameras
-        }
-        camera = CameraEntries(path, select_camera(path, camera_name, cameras))
-        unread_outside = CameraEntries(path, other_entries).find_unread()
-        return _read_kalibr(spec, camera, unread_outside)
+
+
+def _read_kalibr_chain(
+    spec: str, data: Mapping[str, Any], cameras: Mapping[str, Any]
+) -> CameraModel:
+    """Return the model of one of the cameras in a file of Kalibr.
+
+    Args:
+        spec: the file, and perhaps the camera in it.
+        data: all entries of the file.
+        cameras: those of them that are cameras, by name.
+    """
+    path, _, camera_name = spec.partition("#")
+    other_entries = {name: entry for name, entry in data.items() if name not in cameras}
+    camera = CameraEntries(path, select_camera(path, camera_name, cameras))
+    unread_outside = CameraEntries(path, other_entries).find_unread()
+    return _read_kalibr(spec, camera, unread_outside)
+
+
+def _check_no_camera_name(path: str, camera_name: str) -> None:
+    """Raise FileFormatError if a user names a camera in a file of a single one."""
     if camera_name:
         raise FileFormatError(
             f"{path}: expected several cameras, as {camera_name!r} is requested, got "
             f"one; leave #{camera_name} out"
         )
-    if "intrinsics" in data and "camera_model" in data:
-        return _read_kalibr(spec, CameraEntries(path, data))
-    return _read_opencv(spec, CameraEntries(path, _flatten_groups(data)))
 
 
 def read_camera_entries(path: str) -> dict[str, Any]:
@@ -292,22 +314,34 @@ def _parse_file(path: str, text: str) -> dict[str, Any]:
     """
     if text.lstrip().startswith("<"):
         return _parse_xml(path, text)
-    if path.lower().endswith(".json"):
-        data = parse_text(path, text, "JSON", parse_json)
-    else:
-        # OpenCV's YAML begins with a directive, and has tags, that are not standard.
-        text = re.sub(r"\A%YAML[^\n]*\n", "", text)
-        text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
-        # only the first document
-        text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
-        data = parse_text(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
+    is_json = path.lower().endswith(".json")
+    data = (
+        parse_text(path, text, "JSON", parse_json)
+        if is_json
+        else _parse_yaml(path, text)
+    )
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
-        got = "an empty file" if data is None else f"a {type(data).__name__}"
-        raise FileFormatError(
-            f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, "
-            f"got {got}; docs/cameras.md shows one of each"
-        )
+        _reject_content(path, data)
     return data
+
+
+def _parse_yaml(path: str, text: str) -> Any:
+    """Parse the first document of a YAML file, also of OpenCV's kind."""
+    # OpenCV's YAML begins with a directive, and has tags, that are not standard.
+    text = re.sub(r"\A%YAML[^\n]*\n", "", text)
+    text = re.sub(r"!!opencv-(nd-)?matrix", "", text)
+    # only the first document
+    text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
+    return parse_text(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
+
+
+def _reject_content(path: str, data: object) -> NoReturn:
+    """Raise FileFormatError for a file that is no mapping of names."""
+    got = "an empty file" if data is None else f"a {type(data).__name__}"
+    raise FileFormatError(
+        f"{path}: expected a camera of OpenCV, Kalibr, ROS, COLMAP or nerfstudio, "
+        f"got {got}; docs/cameras.md shows one of each"
+    )
 
 
 def _parse_xml(path: str, text: str) -> dict[str, Any]:
@@ -319,27 +353,39 @@ def _parse_xml(path: str, text: str) -> dict[str, Any]:
     Raises FileFormatError: it is no XML of these two, or declares entities, by which a
     small file could become very large.
     """
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise FileFormatError(
-            f"{path}: declares a document type or entities, which no camera needs; "
-            "remove it"
-        )
-    root = parse_text(path, text, "XML", ElementTree.fromstring)
+    root = _parse_xml_root(path, text)
+    return {element.tag: _convert_element(element) for element in root}
+
+
+def _parse_xml_root(path: str, text: str) -> ElementTree.Element:
+    """Return the root of a camera in XML; the errors are those of `_parse_xml`."""
+    _check_has_no_entities(path, text)
+    root: ElementTree.Element = parse_text(path, text, "XML", ElementTree.fromstring)
     check_xml_root(path, root.tag)
     if root.tag not in ("opencv_storage", METASHAPE_FILE):
         raise FileFormatError(
             f"{path}: expected a camera of OpenCV in <opencv_storage>, got "
             f"<{root.tag[:40]}>; docs/cameras.md has the formats that are read"
         )
-    entries = dict[str, Any]()
-    for element in root:
-        inner = {entry.tag: (entry.text or "").strip() for entry in element}
-        matrix = element.findtext("data")
-        if matrix is not None:
-            entries[element.tag] = matrix.split()
-        else:
-            entries[element.tag] = inner or (element.text or "").strip()
-    return entries
+    return root
+
+
+def _check_has_no_entities(path: str, text: str) -> None:
+    """Raise FileFormatError if the text of an XML file declares types or entities."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise FileFormatError(
+            f"{path}: declares a document type or entities, which no camera needs; "
+            "remove it"
+        )
+
+
+def _convert_element(element: ElementTree.Element) -> object:
+    """Return the words of a matrix, the entries of a group, or a text."""
+    inner = {entry.tag: (entry.text or "").strip() for entry in element}
+    matrix = element.findtext("data")
+    if matrix is not None:
+        return matrix.split()
+    return inner or (element.text or "").strip()
 
 
 # ---- Formats ----
@@ -360,36 +406,60 @@ def _read_colmap(
         lines: the lines of the file that are neither blank nor comments.
     """
     words_by_id = {line.split()[0]: line.split() for line in lines}
+    _check_lines_differ(path, words_by_id, lines)
+    _, name, *values = select_camera(path, camera_name, words_by_id)
+    _check_colmap_model(path, name)
+    kind, parameters = COLMAP_MODELS[name]
+    numbers = _parse_colmap_numbers(path, name, parameters, values)
+    size = (numbers.pop("height"), numbers.pop("width"))
+    if "f" in numbers:
+        numbers["fy"] = numbers["fx"] = numbers.pop("f")
+    # Without a pixel offset: COLMAP measures from the corner of the image.
+    return make_camera_model(spec, kind, size, numbers)
+
+
+def _check_lines_differ(
+    path: str, words_by_id: Mapping[str, list[str]], lines: Sequence[str]
+) -> None:
+    """Raise FileFormatError if two lines of COLMAP are of one camera."""
     if len(words_by_id) < len(lines):
         raise FileFormatError(
             f"{path}: expected each camera once, got one with the same number twice; "
             "correct the file"
         )
-    _, name, *values = select_camera(path, camera_name, words_by_id)
+
+
+def _check_colmap_model(path: str, name: str) -> None:
+    """Raise FileFormatError if a name is not that of a model of COLMAP that is read."""
     if name not in COLMAP_MODELS:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP_MODELS)}, got "
             f"{name[:40]}, which is another projection; calibrate with one of these "
             "(colmap model_converter cannot convert it), or undistort the pictures"
         )
-    kind, parameters = COLMAP_MODELS[name]
+
+
+def _parse_colmap_numbers(
+    path: str, name: str, parameters: str, values: Sequence[str]
+) -> dict[str, float]:
+    """Return the numbers of a line of COLMAP by name, with the width and the height.
+
+    Args:
+        path: the file, for messages.
+        name: name of the model.
+        parameters: names of the model's numbers, separated by blanks.
+        values: the numbers of the line.
+    """
     keys = ["width", "height", *parameters.split()]
     if len(values) != len(keys):
         raise FileFormatError(
             f"{path}: {name}: expected {' '.join(keys)}, got {len(values)} numbers; "
             "correct the line"
         )
-    numbers = {
+    return {
         key: parse_number(path, key, value)
         for key, value in zip(keys, values, strict=True)
     }
-    size = (numbers.pop("height"), numbers.pop("width"))
-    if "f" in numbers:
-        focal_length = numbers.pop("f")
-        numbers["fy"] = focal_length
-        numbers["fx"] = focal_length
-    # Without a pixel offset: COLMAP measures from the corner of the image.
-    return make_camera_model(spec, kind, size, numbers)
 
 
 def _read_nerfstudio(
@@ -413,18 +483,36 @@ def _read_nerfstudio(
     width = entries.get_number("w")
     height = entries.get_number("h")
     kind = _read_projection(path, entries)
-    # The angles of view are among the `SCENE_KEYS`, so that `entries` lacks them.
-    numbers = _read_focal_lengths(path, data, entries, width, height)
-    numbers["cx"] = entries.get_number("cx", width / 2.0)
-    numbers["cy"] = entries.get_number("cy", height / 2.0)
-    if kind == FISHEYE:
-        numbers |= _read_optional_numbers(entries, COEFFICIENTS[:4])
-    else:
-        numbers |= _read_optional_numbers(entries, ("k1", "k2", "k3", "p1", "p2"))
+    numbers = _read_nerfstudio_numbers(data, entries, kind, (height, width))
     model = make_camera_model(spec, kind, (height, width), numbers)
     unread = entries.find_unread()
     frame_entries = CameraEntries(path, _select_other_entries(frames))
     return add_notes(model, [*unread, *frame_entries.find_unread("frames.")])
+
+
+def _read_nerfstudio_numbers(
+    data: Mapping[str, Any],
+    entries: CameraEntries,
+    kind: str,
+    size: tuple[float, float],
+) -> dict[str, float]:
+    """Return the numbers of a camera of nerfstudio in pixels, by name.
+
+    Args:
+        data: all entries of the file.
+        entries: entries of the camera.
+        kind: kind of its model.
+        size: height and width of the image in pixels.
+    """
+    height, width = size
+    # The angles of view are among the `SCENE_KEYS`, so that `entries` lacks them.
+    numbers = _read_focal_lengths(entries.path, data, entries, width, height)
+    numbers["cx"] = entries.get_number("cx", width / 2.0)
+    numbers["cy"] = entries.get_number("cy", height / 2.0)
+    is_fisheye = kind == FISHEYE
+    names = COEFFICIENTS[:4] if is_fisheye else ("k1", "k2", "k3", "p1", "p2")
+    numbers |= _read_optional_numbers(entries, names)
+    return numbers
 
 
 def _list_frames(data: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -455,18 +543,23 @@ def _read_projection(path: str, entries: CameraEntries) -> str:
         FileFormatError: the model is not supported.
     """
     name = str(entries.get("cameramodel") or "PINHOLE").upper()
-    if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
-        raise FileFormatError(
-            f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
-            f"got {format_name(name)}, which is another projection; calibrate with one "
-            "of these"
-        )
+    _check_nerfstudio_model(path, name)
     if entries.get("isfisheye"):  # whatever the name is
         return FISHEYE
     if name == "PERSPECTIVE":
         return BROWN_CONRADY
     kind, _ = COLMAP_MODELS[name]
     return kind
+
+
+def _check_nerfstudio_model(path: str, name: str) -> None:
+    """Raise FileFormatError if a camera model is none of those of nerfstudio's files."""
+    if name not in (*COLMAP_MODELS, "PERSPECTIVE"):
+        raise FileFormatError(
+            f"{path}: expected one of the camera models {', '.join(COLMAP_MODELS)}, "
+            f"got {format_name(name)}, which is another projection; calibrate with one "
+            "of these"
+        )
 
 
 def _read_focal_lengths(
@@ -495,13 +588,24 @@ def _read_focal_lengths(
     fy_by_angle = _compute_focal_length(path, data.get("camera_angle_y"), height)
     # Without an angle there is no default, and the length is required.
     fx = entries.get_number("fl_x", default=fx_by_angle)
+    _check_focal_lengths_agree(path, fx, fx_by_angle)
+    default_fy = fx if fy_by_angle is None else fy_by_angle
+    return {"fx": fx, "fy": entries.get_number("fl_y", default=default_fy)}
+
+
+def _check_focal_lengths_agree(path: str, fx: float, fx_by_angle: float | None) -> None:
+    """Raise FileFormatError if a focal length contradicts that of an angle of view.
+
+    Args:
+        path: the file, for messages.
+        fx: focal length along x in pixels.
+        fx_by_angle: that of the angle of view; None if the file has no angle.
+    """
     if fx_by_angle is not None and abs(fx - fx_by_angle) > MAX_FOCAL_MISMATCH * fx:
         raise FileFormatError(
             f"{path}: fl_x: expected {fx_by_angle:g}, as camera_angle_x states, got "
             f"{fx:g}; leave one out"
         )
-    default_fy = fx if fy_by_angle is None else fy_by_angle
-    return {"fx": fx, "fy": entries.get_number("fl_y", default=default_fy)}
 
 
 def _select_lens(
@@ -564,6 +668,22 @@ def _read_kalibr(
     """
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
+    _check_kalibr_model(path, model)
+    kind = _find_kind(path, entries.get("distortionmodel"))
+    intrinsics = entries.parse_numbers(
+        "intrinsics", entries.get("intrinsics"), counts=(4,)
+    )
+    names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
+    resolution = entries.require("resolution")
+    width, height = entries.parse_numbers("resolution", resolution, counts=(2,))
+    numbers = _read_distortion(entries, names, counts=(0, 4))
+    numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
+    camera = make_camera_model(spec, kind, (height, width), numbers, FIRST_PIXEL_CENTER)
+    return add_notes(camera, [*unread, *entries.find_unread()])
+
+
+def _check_kalibr_model(path: str, model: str) -> None:
+    """Raise FileFormatError if a camera model of Kalibr is no pinhole."""
     if model != "pinhole":
         advice = (
             describe_projection(model)
@@ -573,16 +693,6 @@ def _read_kalibr(
             f"{path}: expected the camera_model pinhole of Kalibr, got {model[:40]}"
             f"{advice}"
         )
-    kind = _find_kind(path, entries.get("distortionmodel"))
-    intrinsics = entries.parse_numbers("intrinsics", entries.get("intrinsics"), (4,))
-    names = ("k1", "k2", "k3", "k4") if kind == FISHEYE else ("k1", "k2", "p1", "p2")
-    width, height = entries.parse_numbers(
-        "resolution", entries.require("resolution"), (2,)
-    )
-    numbers = _read_distortion(entries, names, (0, 4))
-    numbers |= zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True)
-    camera = make_camera_model(spec, kind, (height, width), numbers, FIRST_PIXEL_CENTER)
-    return add_notes(camera, [*unread, *entries.find_unread()])
 
 
 def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
@@ -601,9 +711,7 @@ def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
     path = entries.path
     kind = _find_opencv_kind(path, entries)
     if kind == EQUIRECTANGULAR:
-        # Binning and a region are not read here: `find_unread` rejects them.
-        panorama = make_camera_model(spec, kind, _read_size(entries), {})
-        return add_notes(panorama, entries.find_unread())
+        return _read_opencv_panorama(spec, entries)
     matrix = _read_camera_matrix(path, entries)
     height, width = _read_size(entries)
     unread_roi_keys = _check_roi(entries, (height, width))
@@ -617,6 +725,17 @@ def _read_opencv(spec: str, entries: CameraEntries) -> CameraModel:
     model = replace(model, calibrated_shape=binned_size)
     rectified_keys = _find_rectified(entries, matrix)
     return add_notes(model, unread_roi_keys + entries.find_unread(), rectified_keys)
+
+
+def _read_opencv_panorama(spec: str, entries: CameraEntries) -> CameraModel:
+    """Return the model of a panorama, which has a size and no other numbers.
+
+    Binning and a region are not read here: `find_unread` rejects them. The arguments
+    are those of `_read_opencv`.
+    """
+    size = _read_size(entries)
+    panorama = make_camera_model(spec, EQUIRECTANGULAR, size, pixel_values={})
+    return add_notes(panorama, entries.find_unread())
 
 
 def _find_opencv_kind(path: str, entries: CameraEntries) -> str:
@@ -652,19 +771,8 @@ def _read_camera_matrix(path: str, entries: CameraEntries) -> list[float]:
     Raises:
         FileFormatError: it is missing, all zeros, or no camera matrix.
     """
-    if entries.get(*CAMERA_MATRIX_KEYS) is None and entries.get("fx") is not None:
-        fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
-        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    else:
-        matrix = entries.parse_numbers(
-            "camera_matrix", entries.require("camera_matrix", CAMERA_MATRIX_KEYS), (9,)
-        )
-    if not any(matrix):
-        raise FileFormatError(
-            f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
-            "which ROS writes for a camera that is not calibrated; calibrate it, and "
-            "use the file that this writes"
-        )
+    matrix = _read_matrix_numbers(entries)
+    _check_is_calibrated(path, matrix)
     # A camera matrix is fx, skew, cx, 0, fy, cy, 0, 0, 1. Open3D and ARKit write it by
     # columns: fx, 0, 0, skew, fy, 0, cx, cy, 1.
     lacks_center_in_rows = not (matrix[1] or matrix[2] or matrix[5])
@@ -672,12 +780,36 @@ def _read_camera_matrix(path: str, entries: CameraEntries) -> list[float]:
     is_by_columns = lacks_center_in_rows and has_center_in_last_row
     if is_by_columns:
         matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]
+    _check_matrix_zeros(path, matrix)
+    return matrix
+
+
+def _read_matrix_numbers(entries: CameraEntries) -> list[float]:
+    """Return the nine numbers of a camera matrix, in the order of the file."""
+    if entries.get(*CAMERA_MATRIX_KEYS) is None and entries.get("fx") is not None:
+        fx, fy, cx, cy = (entries.get_number(name) for name in ("fx", "fy", "cx", "cy"))
+        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    matrix = entries.require("camera_matrix", CAMERA_MATRIX_KEYS)
+    return entries.parse_numbers("camera_matrix", matrix, counts=(9,))
+
+
+def _check_is_calibrated(path: str, matrix: Sequence[float]) -> None:
+    """Raise FileFormatError for a camera matrix of zeros."""
+    if not any(matrix):
+        raise FileFormatError(
+            f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, "
+            "which ROS writes for a camera that is not calibrated; calibrate it, and "
+            "use the file that this writes"
+        )
+
+
+def _check_matrix_zeros(path: str, matrix: Sequence[float]) -> None:
+    """Raise FileFormatError if a matrix, row by row, is not that of a camera."""
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(
             f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got "
             "other numbers"
         )
-    return matrix
 
 
 def _name_matrix_entries(matrix: Sequence[float]) -> dict[str, float]:
@@ -710,6 +842,14 @@ def _read_distortion(
         values = entries.parse_numbers("distortion_coefficients", distortion, counts)
         # The list may have fewer coefficients than there are names.
         coefficients = dict(zip(names, values, strict=False))
+    _check_stated_distortion(entries, coefficients)
+    return coefficients
+
+
+def _check_stated_distortion(
+    entries: CameraEntries, coefficients: Mapping[str, float]
+) -> None:
+    """Raise FileFormatError for coefficients of a model that is "none"."""
     model = entries.get("distortionmodel")
     is_undistorted = isinstance(model, str) and model.strip().lower() == "none"
     if is_undistorted and any(coefficients.values()):
@@ -717,7 +857,6 @@ def _read_distortion(
             f"{entries.path}: expected no distortion, as its distortion_model is none, "
             "got coefficients"
         )
-    return coefficients
 
 
 def _read_opencv_distortion(entries: CameraEntries, kind: str) -> dict[str, float]:
@@ -726,7 +865,7 @@ def _read_opencv_distortion(entries: CameraEntries, kind: str) -> dict[str, floa
     Raises FileFormatError: the sensor is tilted, which `CameraModel` cannot express.
     """
     if kind == FISHEYE:
-        return _read_distortion(entries, COEFFICIENTS[:4], (0, 4))
+        return _read_distortion(entries, COEFFICIENTS[:4], counts=(0, 4))
     coefficients = _read_distortion(
         entries, OPENCV_COEFFICIENTS, OPENCV_COEFFICIENT_COUNTS
     )
@@ -766,13 +905,18 @@ def _find_rectified(entries: CameraEntries, matrix: Sequence[float]) -> list[str
         value = entries.get(normalize_key(name), short_name)  # either of its names
         if has_no_effect(value):  # missing, or all zeros
             continue
-        numbers = entries.parse_numbers(name, value, (len(expected),))
-        if any(
-            abs(a - b) > 1e-6 * max(1.0, abs(b))
-            for a, b in zip(numbers, expected, strict=True)
-        ):
+        numbers = entries.parse_numbers(name, value, counts=(len(expected),))
+        if _differ(numbers, expected):
             differing_names.append(name)
     return differing_names
+
+
+def _differ(numbers: Sequence[float], expected: Sequence[float]) -> bool:
+    """Return whether numbers differ from expected ones by more than rounding."""
+    return any(
+        abs(a - b) > 1e-6 * max(1.0, abs(b))
+        for a, b in zip(numbers, expected, strict=True)
+    )
 
 
 def _check_roi(entries: CameraEntries, size: tuple[float, float]) -> list[str]:
@@ -796,15 +940,24 @@ def _check_roi(entries: CameraEntries, size: tuple[float, float]) -> list[str]:
     roi = CameraEntries(entries.path, {str(key): value[key] for key in value})
     numbers = _read_optional_numbers(roi, ("x_offset", "y_offset", "height", "width"))
     roi.get("dorectify")  # marks it as read: it changes nothing in a full image
-    offset = (numbers["x_offset"], numbers["y_offset"])
-    roi_size = (numbers["height"], numbers["width"])
-    is_full_image = offset == (0.0, 0.0) and roi_size in ((0.0, 0.0), size)
-    if not is_full_image:
+    if not _is_full_image(numbers, size):
         raise FileFormatError(
             f"{entries.path}: expected a camera_info of full pictures, got one of a "
             "part (roi); set it to 0"
         )
     return roi.find_unread("roi.")
+
+
+def _is_full_image(numbers: Mapping[str, float], size: tuple[float, float]) -> bool:
+    """Return whether a region of interest of ROS is the full image.
+
+    Args:
+        numbers: offsets and size of the region in pixels, by ROS's names.
+        size: height and width of the image in pixels.
+    """
+    offset = (numbers["x_offset"], numbers["y_offset"])
+    roi_size = (numbers["height"], numbers["width"])
+    return offset == (0.0, 0.0) and roi_size in ((0.0, 0.0), size)
 
 
 def _find_kind(path: str, model: object) -> str:
@@ -828,7 +981,7 @@ def _read_size(entries: CameraEntries) -> tuple[float, float]:
     """Return the height and width of the image in pixels."""
     size = entries.get(*SIZE_KEYS)
     if size is not None:
-        width, height = entries.parse_numbers("image_size", size, (2,))
+        width, height = entries.parse_numbers("image_size", size, counts=(2,))
         return height, width
     width = entries.get_number("image_width", aliases=WIDTH_KEYS)
     return entries.get_number("image_height", aliases=HEIGHT_KEYS), width

@@ -264,16 +264,12 @@ class CameraModel:
             The solutions (N,), and which of them have converged.
         """
 
-        def distort_to_column(radii: Tensor) -> Tensor:
-            """Return distorted radii as (N, 1), for `_evaluate_with_jacobian`."""
-            return self._distort_radius(radii)[..., None]
-
         lower = torch.zeros_like(target)
         upper = torch.full_like(target, self._find_upper_bound(target, max_value))
         radius = torch.minimum(target, upper)
         for _ in range(MAX_STEPS):
             # one derivative (N,), since the values have one column
-            values, (slope,) = _evaluate_with_jacobian(distort_to_column, radius)
+            values, (slope,) = _evaluate_with_jacobian(self._distort_to_column, radius)
             residual = values[..., 0] - target
             is_solved = (residual.abs() <= TOLERANCE) | (upper - lower <= TOLERANCE)
             if bool(is_solved.all()):
@@ -288,6 +284,10 @@ class CameraModel:
         # other. Its residual may be larger, hence the factor of 1e3. The tolerance is
         # absolute for small targets and relative for large ones.
         return radius, residual <= 1e3 * TOLERANCE * (1.0 + target)
+
+    def _distort_to_column(self, radii: Tensor) -> Tensor:
+        """Return distorted radii as (N, 1), for `_evaluate_with_jacobian`."""
+        return self._distort_radius(radii)[..., None]
 
     def _find_upper_bound(self, target: Tensor, max_value: float) -> float:
         """Return a common upper bound of the solutions of `_invert_radial`.
@@ -339,13 +339,7 @@ class CameraModel:
             )
             if bool(converged.all()):
                 break
-            updated = undistorted - step
-            radius = updated.norm(dim=-1, keepdim=True)
-            # 1 inside the circle, and less outside, so that points move onto the circle
-            shrinking = max_radius / radius.clamp_min(max_radius)
-            updated = torch.where(
-                torch.isfinite(radius), updated * shrinking, undistorted
-            )
+            updated = _step_within(undistorted, step, max_radius)
             undistorted = torch.where(converged[..., None], undistorted, updated)
         return undistorted, converged
 
@@ -366,14 +360,10 @@ class CameraModel:
         Beyond it the image point moves back towards the center, so that two directions
         have the same image point. It is infinite if that never happens.
         """
-        # radial(r) = r n(s) / d(s) with s = r^2. The numerator of its derivative, as a
-        # polynomial in s, is (n + 2 s n') d - 2 s n d'. The lens folds at the smallest
-        # positive root of that, or at a pole, a root of d.
+        # The lens folds at the smallest positive root of the derivative, or at a pole of
+        # the distortion, a root of its denominator.
         numerator, denominator = self._polynomials
-        doubled_s = Polynomial([0.0, 2.0])  # 2 s
-        slope_numerator = (
-            numerator + doubled_s * numerator.deriv()
-        ) * denominator - doubled_s * (numerator * denominator.deriv())
+        slope_numerator = _differentiate_radial(numerator, denominator)
         roots = np.concatenate([slope_numerator.roots(), denominator.roots()])
         is_real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)
         positive_roots = roots.real[is_real & (roots.real > 0.0)]
@@ -443,23 +433,22 @@ class CameraModel:
         of the size remain.
         """
         edges = self._compute_edge_tangents()
-        # 17 points on each side of the rectangle
-        grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
-        ones = torch.ones_like(grid)
-        x = torch.cat([grid, grid, ones, -ones])
-        y = torch.cat([ones, -ones, grid, grid])
-        border = torch.stack([x, y], dim=-1) * torch.tensor(edges, dtype=torch.float64)
+        border = _make_rectangle_border(edges)
         for fraction in torch.linspace(1.0, 0.02, 50).tolist():  # 1, 0.98, ..., 0.02
             points = torch.cat(
                 [fraction * border, torch.ones_like(border[:, :1])], dim=-1
             )
-            coordinates, is_visible = self.project(points)
-            # a point on the image's border may be outside by rounding
-            is_in_image = (coordinates >= -1e-6) & (coordinates <= 1.0 + 1e-6)
-            if bool((is_visible & is_in_image.all(dim=-1)).all()):
+            if self._is_all_visible(points):
                 break
         # If no step has all of the border in the image, this is the last fraction.
         return fraction * edges[0], fraction * edges[1]
+
+    def _is_all_visible(self, points: Tensor) -> bool:
+        """Return whether all points (N, 3) are in the image."""
+        coordinates, is_visible = self.project(points)
+        # a point on the image's border may be outside by rounding
+        is_in_image = (coordinates >= -1e-6) & (coordinates <= 1.0 + 1e-6)
+        return bool((is_visible & is_in_image.all(dim=-1)).all())
 
     def _compute_edge_tangents(self) -> list[float]:
         """Return the tangents at which the image ends along x and along y.
@@ -521,16 +510,19 @@ class CameraModel:
         """
         if self.black_fraction == 0.0:
             return self.reading_notes
+        return (*self.reading_notes, self._describe_black_part())
+
+    def _describe_black_part(self) -> str:
+        """Return a sentence about the part of the image that the lens leaves black."""
         name = self.name or "the lens"
         black_part = f"{100.0 * self.black_fraction:.2g} % of the picture"
-        sentence = f"{name}: {black_part} lies outside the lens's circle and is black."
         if self.fold_angle_radians < math.radians(self.max_angle_degrees):
-            sentence = (
+            return (
                 f"{name}: the lens folds at {math.degrees(self.fold_angle_radians):.1f} "
                 f"degrees from its axis, and {black_part}, which only directions "
                 "beyond that would fill, is black."
             )
-        return (*self.reading_notes, sentence)
+        return f"{name}: {black_part} lies outside the lens's circle and is black."
 
     def describe_scaling(self, resolution: tuple[int, int]) -> tuple[str, ...]:
         """Return a note if an image has another size than the camera's pictures.
@@ -557,6 +549,45 @@ class CameraModel:
             f"height): its focal lengths and its principal point are scaled to {width} "
             f"x {height}{stretch_text}.",
         )
+
+
+def _differentiate_radial(numerator: Polynomial, denominator: Polynomial) -> Polynomial:
+    """Return the numerator of the derivative of a radial distortion.
+
+    The distortion is radial(r) = r n(s) / d(s) with s = r^2. The numerator of its
+    derivative by r, as a polynomial in s, is (n + 2 s n') d - 2 s n d'.
+
+    Args:
+        numerator: n.
+        denominator: d.
+    """
+    doubled_s = Polynomial([0.0, 2.0])  # 2 s
+    slope: Polynomial = (
+        numerator + doubled_s * numerator.deriv()
+    ) * denominator - doubled_s * (numerator * denominator.deriv())
+    return slope
+
+
+def _step_within(points: Tensor, step: Tensor, max_radius: float) -> Tensor:
+    """Return points (N, 2) minus steps, cut at a circle around 0.
+
+    A step that is not finite is not taken.
+    """
+    updated = points - step
+    radius = updated.norm(dim=-1, keepdim=True)
+    # 1 inside the circle, and less outside, so that points move onto the circle
+    shrinking = max_radius / radius.clamp_min(max_radius)
+    return torch.where(torch.isfinite(radius), updated * shrinking, points)
+
+
+def _make_rectangle_border(half_sides: list[float]) -> Tensor:
+    """Return points (N, 2) on the border of a rectangle around 0, 17 on each side."""
+    grid = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
+    ones = torch.ones_like(grid)
+    x = torch.cat([grid, grid, ones, -ones])
+    y = torch.cat([ones, -ones, grid, grid])
+    border = torch.stack([x, y], dim=-1)
+    return border * torch.tensor(half_sides, dtype=torch.float64)
 
 
 def make_pinhole(fov: float, aspect: float) -> CameraModel:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -66,23 +66,36 @@ def read_depth(spec: str | Path) -> Float32Array:
     path = Path(scaled["path"] if scaled else spec)
     metres = float(scaled["metres"]) if scaled else 1.0
     channels = _read_channels(path)
-    # A grey picture may be stored as three equal channels. NaN differs from itself.
+    _check_channels_agree(channels, path)
+    depth = channels[..., 0].astype(np.float64) * metres
+    # 0 is how cameras of depth write that they do not know it
+    depth[~np.isfinite(depth) | (depth == 0.0)] = np.inf
+    _check_depth_range(depth, path)
+    return depth.astype(np.float32)
+
+
+def _check_channels_agree(channels: np.ndarray, path: Path) -> None:
+    """Raise FileFormatError if a picture (H, W, c) has several depths for a pixel.
+
+    A grey picture may be stored as three equal channels.
+    """
+    # NaN differs from itself.
     differs_from_first = channels != channels[..., :1]
     if differs_from_first[np.isfinite(channels)].any():
         raise FileFormatError(
             f"{path}: expected one depth for each pixel, got channels that differ; "
             "save depth as grey"
         )
-    depth = channels[..., 0].astype(np.float64) * metres
-    # 0 is how cameras of depth write that they do not know it
-    depth[~np.isfinite(depth) | (depth == 0.0)] = np.inf
+
+
+def _check_depth_range(depth: np.ndarray, path: Path) -> None:
+    """Raise FileFormatError if known depths, metres, are below 0 or too large."""
     known = depth[np.isfinite(depth)]
     if known.size and not 0.0 < known.min() <= known.max() <= MAX_DEPTH:
         raise FileFormatError(
             f"{path}: expected depths of 0 to {MAX_DEPTH:g} metres, got "
             f"{known.min():g} to {known.max():g}; check the metres of a level"
         )
-    return depth.astype(np.float32)
 
 
 def _read_channels(path: Path) -> np.ndarray:
@@ -110,32 +123,56 @@ def _read_array(path: Path) -> np.ndarray:
     """
     data = read_existing_bytes(path, EXPECTED, LARGEST_FILE)
     stream = io.BytesIO(data)
+    shape, is_by_columns, dtype = _read_array_header(path, stream)
+    _check_array_form(path, shape, dtype)
+    height, width = shape
+    check_pixels(path, width, height, MAX_PIXELS)
+    content = data[stream.tell() :]
+    _check_array_length(path, content, (height, width), dtype)
+    order: Literal["F", "C"] = "F" if is_by_columns else "C"
+    numbers: np.ndarray = np.frombuffer(content, dtype)
+    return numbers.reshape((height, width), order=order)
+
+
+def _read_array_header(
+    path: Path, stream: io.BytesIO
+) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order and type of an .npy file; the order is whether by columns.
+
+    Raises FileFormatError: the header cannot be read.
+    """
     try:
         version = np.lib.format.read_magic(stream)
         read_header = {
             (1, 0): np.lib.format.read_array_header_1_0,
             (2, 0): np.lib.format.read_array_header_2_0,
         }[version]
-        shape, is_by_columns, dtype = read_header(stream)
-        has_form = len(shape) == 2 and min(shape) > 0 and dtype.kind in "fiu"
+        header: tuple[tuple[int, ...], bool, np.dtype[Any]] = read_header(stream)
     except (ValueError, KeyError, EOFError, SyntaxError, RecursionError) as error:
         raise FileFormatError(
             f"{path}: expected an array of NumPy, got a file that is corrupt or of "
             "another version; save it again"
         ) from error
+    return header
+
+
+def _check_array_form(path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    """Raise FileFormatError if an array is not (height, width) of numbers."""
+    has_form = len(shape) == 2 and min(shape) > 0 and dtype.kind in "fiu"
     if not has_form:
         raise FileFormatError(
             f"{path}: expected an array (height, width) of numbers, got one of shape "
             f"{str(shape)[:40]} of {str(dtype)[:40]}"
         )
-    height, width = shape
-    check_pixels(path, width, height, MAX_PIXELS)
-    content = data[stream.tell() :]
+
+
+def _check_array_length(
+    path: Path, content: bytes, size: tuple[int, int], dtype: np.dtype[Any]
+) -> None:
+    """Raise FileFormatError if a file has not as many numbers as its header states."""
+    height, width = size
     if len(content) != height * width * dtype.itemsize:
         raise FileFormatError(
             f"{path}: expected {height} x {width} numbers, got a file of another "
             "length; save it again"
         )
-    order: Literal["F", "C"] = "F" if is_by_columns else "C"
-    numbers: np.ndarray = np.frombuffer(content, dtype)
-    return numbers.reshape((height, width), order=order)

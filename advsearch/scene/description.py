@@ -41,7 +41,7 @@ from advsearch.scene.camera_entries import (
     CameraPreset,
 )
 from advsearch.scene.camera_files import read_camera
-from advsearch.scene.camera_model import make_bundled_models
+from advsearch.scene.camera_model import CameraModel, make_bundled_models
 from advsearch.scene.formation import (
     CARD_DISPLAY_VALUE,
     CARD_REFLECTANCE,
@@ -73,7 +73,7 @@ from advsearch.scene.parts import (
 )
 from advsearch.scene.places.environments import import_place
 from advsearch.scene.places.place_file import is_place_file
-from advsearch.scene.rig import AXES, PhotographCameras, read_rig
+from advsearch.scene.rig import AXES, PhotographCameras, RigCamera, read_rig
 from advsearch.scene.scene_data import NO_ENVIRONMENT as NO_ENVIRONMENT
 from advsearch.scene.scene_data import OBJECT as OBJECT
 from advsearch.scene.scene_data import SceneData
@@ -123,19 +123,20 @@ class SceneDescription(SceneData):
 
         Raises InputError: the scene has a part of that name.
         """
-        part_by_name = {existing.name: existing for existing in self.parts}
-        if part.name in (OBJECT, "environment", "ground", "camera", *part_by_name):
-            is_plugin = isinstance(part_by_name.get(part.name), PluginPart)
-            alternative = (
-                f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]"
-                if is_plugin
-                else ""
-            )
-            raise InputError(
-                f"`controls` {part.name}: the scene has something of that name "
-                f"already; choose another name, as in light:{part.name}-2{alternative}"
-            )
+        self._check_name_is_free(part.name)
         return replace(self, parts=(*self.parts, part))
+
+    def _check_name_is_free(self, name: str) -> None:
+        """Raise InputError if the scene has a part of a name, or reserves it."""
+        part_by_name = {part.name: part for part in self.parts}
+        if name in (OBJECT, "environment", "ground", "camera", *part_by_name):
+            alternative = ""
+            if isinstance(part_by_name.get(name), PluginPart):
+                alternative = f", or vary what is there: mitsuba:{name}.KEY=[low, high]"
+            raise InputError(
+                f"`controls` {name}: the scene has something of that name "
+                f"already; choose another name, as in light:{name}-2{alternative}"
+            )
 
     def with_values(self, **replaced: float | None) -> SceneDescription:
         """Return the scene with some settings replaced.
@@ -199,6 +200,21 @@ class SceneDescription(SceneData):
         Raises InputError: the user requests a ground other than the plane, several
         cameras (a rig), or drops on the lens.
         """
+        self._check_plane_settings(photograph)
+        if self.rig:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `camera={self.rig_spec}` contradict "
+                "each other: a photograph was taken by one camera; name one of them, "
+                f"{self.rig_spec}#NAME"
+            )
+        if self.get_number("camera.drops") > 0.0:
+            raise InputError(
+                f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
+                "other: drops would show the photograph; leave one of the two out"
+            )
+
+    def _check_plane_settings(self, photograph: BackdropPhotograph) -> None:
+        """Raise InputError if the user requests another ground than a photograph's."""
         other_grounds = sorted(
             name
             for name in self.requested - PLANE_SETTINGS
@@ -210,17 +226,6 @@ class SceneDescription(SceneData):
                 "each other: the ground of a photograph is a plane that takes the "
                 f"shadow, with {', '.join(sorted(PLANE_SETTINGS))}; leave one of the "
                 "two out"
-            )
-        if self.rig:
-            raise InputError(
-                f"`backdrop={photograph.spec}` and `camera={self.rig_spec}` contradict "
-                "each other: a photograph was taken by one camera; name one of them, "
-                f"{self.rig_spec}#NAME"
-            )
-        if self.get_number("camera.drops") > 0.0:
-            raise InputError(
-                f"`backdrop={photograph.spec}` and `set` camera.drops contradict each "
-                "other: drops would show the photograph; leave one of the two out"
             )
 
     def with_measured_view(
@@ -281,31 +286,34 @@ class SceneDescription(SceneData):
                 around the object was requested.
         """
         spec = photograph_cameras.path
-        if self.object.size_in_metres is None:
-            raise InputError(
-                f"`camera={spec}` is in metres, and the size of {self.object.name} is "
-                "not known; give its longest side in metres, such as `size=0.1`"
-            )
+        size_in_meters = self._require_size(spec)
         with track_opened_files(photograph):
             pose, model = photograph_cameras.find_pose_and_model(photograph)
         # The file's pose is for other camera axes. `AXES` maps ours (left, up, ahead)
         # to these.
         to_world = pose @ AXES
         # from meters to object sizes
-        to_world[:3, 3] /= self.object.size_in_metres
+        to_world[:3, 3] /= size_in_meters
         model.check_no_fov(self.requested)  # the lens has a field of view of its own
-        # Focal lengths are in widths and heights of the image, so that half a side's
-        # angle has the tangent 0.5 / focal. The field of view is along the larger side.
-        tangents = (
-            0.5 / model.intrinsic_by_name["fx"],
-            0.5 / model.intrinsic_by_name["fy"],
-        )
-        fov = 2.0 * math.degrees(math.atan(max(tangents)))
+        fov = _compute_fov_of_lens(model)
         # The pose becomes a camera of the scene, and is selected; `with_camera` also
         # checks the settings. Then it gets its lens, which `with_camera` has removed.
         cameras = {**self.cameras, spec: PosedCamera(to_world, fov)}
         scene = replace(self, cameras=cameras).with_camera(spec)
         return replace(scene, camera_model=replace(model, name=spec))
+
+    def _require_size(self, spec: str) -> float:
+        """Return the meters of one object size, which a camera file needs.
+
+        Raises InputError: the size of the object is not known.
+        """
+        size_in_meters = self.object.size_in_metres
+        if size_in_meters is None:
+            raise InputError(
+                f"`camera={spec}` is in metres, and the size of {self.object.name} is "
+                "not known; give its longest side in metres, such as `size=0.1`"
+            )
+        return size_in_meters
 
     @staticmethod
     def load_object(spec: str | Path) -> ObjectAsset:
@@ -335,6 +343,12 @@ class SceneDescription(SceneData):
         is_lens = camera not in (ORBIT_CAMERA, *self.cameras)
         if is_lens:
             return scene._with_lens(camera)
+        if camera != ORBIT_CAMERA:
+            self._check_no_orbit_settings(camera)
+        return replace(scene, camera=camera)
+
+    def _check_no_orbit_settings(self, camera: str) -> None:
+        """Raise InputError if settings are requested that a camera has itself."""
         # The exposure is allowed with any camera. The others are those of the camera
         # around the object.
         camera_settings = sorted(
@@ -342,13 +356,12 @@ class SceneDescription(SceneData):
             for name in self.requested
             if name.startswith("camera.") and name != "camera.exposure"
         )
-        if camera != ORBIT_CAMERA and camera_settings:
+        if camera_settings:
             raise InputError(
                 f"`camera={camera}` and `set` {camera_settings[0]} contradict each "
                 "other: the camera of the file has a place and a field of view of its "
                 "own; leave one of the two out"
             )
-        return replace(scene, camera=camera)
 
     def _with_lens(self, camera: str) -> SceneDescription:
         """Return the scene with the lens of a camera file or a bundled camera model.
@@ -364,6 +377,22 @@ class SceneDescription(SceneData):
             InputError: a field of view was requested, and the lens has its own.
             UnknownNameError: there is no such model.
         """
+        self._check_lens_exists(camera)
+        scene = self
+        # empty for a bundled model, and for a file with one camera
+        rig = read_rig(camera) if is_path(camera) else ()
+        if rig:
+            model = rig[0].camera_model
+            scene = self._with_rig(rig, camera)
+        else:
+            model = _load_lens(camera)
+        # A camera of a rig may have a field of view, and no model of a lens.
+        if model is not None:
+            model.check_no_fov(self.requested)
+        return replace(scene, camera_model=model)
+
+    def _check_lens_exists(self, camera: str) -> None:
+        """Raise UnknownNameError if there is no file and no bundled model of a name."""
         if not is_path(camera) and camera not in make_bundled_models():
             known = (ORBIT_CAMERA, *self.cameras, *make_bundled_models(), *PRESETS)
             raise UnknownNameError(
@@ -372,24 +401,12 @@ class SceneDescription(SceneData):
                 known,
                 "Or give the path of a camera file, such as calib.yaml.",
             )
-        scene = self
-        # empty for a bundled model, and for a file with one camera
-        rig = read_rig(camera) if is_path(camera) else ()
-        if rig:
-            first_camera = rig[0]
-            model = first_camera.camera_model
-            scene = replace(scene, rig=rig, rig_spec=camera)
-            if first_camera.fov is not None:
-                scene = scene.with_values(camera__fov=first_camera.fov)
-        elif is_path(camera):
-            with track_opened_files(camera.partition("#")[0]):
-                model = read_camera(camera)
-        else:
-            model = make_bundled_models()[camera]
-        # A camera of a rig may have a field of view, and no model of a lens.
-        if model is not None:
-            model.check_no_fov(self.requested)
-        return replace(scene, camera_model=model)
+
+    def _with_rig(self, rig: tuple[RigCamera, ...], spec: str) -> SceneDescription:
+        """Return the scene with several cameras, of the file `spec`."""
+        scene = replace(self, rig=rig, rig_spec=spec)
+        fov = rig[0].fov
+        return scene if fov is None else scene.with_values(camera__fov=fov)
 
     def _with_mounted_camera(self, name: str) -> SceneDescription:
         """Return the scene as a mounted camera sees it, by its name in `PRESETS`.
@@ -402,12 +419,7 @@ class SceneDescription(SceneData):
         Raises InputError: the object's size in metres is not known.
         """
         preset = PRESETS[name]
-        if self.object.size_in_metres is None:
-            raise InputError(
-                f"`camera={name}` is {preset.height:g} m high, and the "
-                f"size of {self.object.name} is not known; give its longest side in "
-                "metres, such as `size=0.1`"
-            )
+        self._check_size_for_preset(name, preset)
         preset_values = {
             setting: value
             for setting, value in self._make_preset_values(preset).items()
@@ -419,13 +431,28 @@ class SceneDescription(SceneData):
         )
         if "camera.distance" in self.requested:
             return scene
-        fov = torch.tensor(scene.get_number("camera.fov"), dtype=torch.float64)
+        return scene._with_preset_distance(preset)
+
+    def _check_size_for_preset(self, name: str, preset: CameraPreset) -> None:
+        """Raise InputError if the object has no size for a camera at a height in
+        meters.
+        """
+        if self.object.size_in_metres is None:
+            raise InputError(
+                f"`camera={name}` is {preset.height:g} m high, and the "
+                f"size of {self.object.name} is not known; give its longest side in "
+                "metres, such as `size=0.1`"
+            )
+
+    def _with_preset_distance(self, preset: CameraPreset) -> SceneDescription:
+        """Return the scene with a mounted camera at its distance, or farther away."""
+        fov = torch.tensor(self.get_number("camera.fov"), dtype=torch.float64)
         # the distance from which the object fits into the image, in object sizes
         framing_distance = float(
-            geometry.compute_framing_distance(scene, fov, scene.aspect)
+            geometry.compute_framing_distance(self, fov, self.aspect)
         )
-        distance = max(preset.distance, framing_distance * scene.size_in_metres)
-        return scene.with_values(camera__distance=distance)
+        distance = max(preset.distance, framing_distance * self.size_in_metres)
+        return self.with_values(camera__distance=distance)
 
     def _make_preset_values(self, preset: CameraPreset) -> dict[str, float]:
         """Return the settings of a mounted camera by name, except for its distance.
@@ -434,26 +461,32 @@ class SceneDescription(SceneData):
         ground stands on a table: then this ground is the table top, with the size of a
         table, and the floor is `TABLE_HEIGHT` below it.
         """
-        is_on_plain_ground = (
-            self.get_number("ground.size") > 0.0
-            and self.photograph is None
-            and not is_paved(self)
-        )
-        is_on_table = is_on_plain_ground and self.size_in_metres <= MAX_TABLETOP_SIZE
+        is_on_table = self._is_on_table()
         preset_values = {"camera.fov": preset.fov}
         # A requested elevation takes the place of the height: only one can be set.
         if "camera.elevation" not in self.requested:
-            place = find_place(self)
-            floor = 0.0 if place is None else place.file.floor
-            if is_on_table:
-                floor = -TABLE_HEIGHT
             # The preset's height is above the floor, the setting above the ground.
+            floor = -TABLE_HEIGHT if is_on_table else self._find_place_floor()
             preset_values["camera.height"] = preset.height + floor
         if preset.in_lane:  # azimuth 0 is in the lane of the object
             preset_values["camera.azimuth"] = 0.0
         if is_on_table:
             preset_values["ground.size"] = TABLE_SIDE / self.size_in_metres
         return preset_values
+
+    def _find_place_floor(self) -> float:
+        """Return the height of the place's floor, meters; 0 without a place."""
+        place = find_place(self)
+        return 0.0 if place is None else place.file.floor
+
+    def _is_on_table(self) -> bool:
+        """Return whether the object is so small that its plain ground is a table."""
+        is_on_plain_ground = (
+            self.get_number("ground.size") > 0.0
+            and self.photograph is None
+            and not is_paved(self)
+        )
+        return is_on_plain_ground and self.size_in_metres <= MAX_TABLETOP_SIZE
 
     @property
     def things(self) -> Mapping[str, ThingPart]:
@@ -528,25 +561,28 @@ class SceneDescription(SceneData):
             has_user_size=self.size is not None,
             needs_metres=is_paved(self),
         )
-        front = self.object.front
-        front_remarks: tuple[str, ...] = ()
-        stands_on_road = self.is_in_lane or has_lanes(self)
-        if front is not None and stands_on_road:
-            # how the front was found, which matters on a road
-            front_remarks = (front.reason,)
-        traffic_remarks: tuple[str, ...] = ()
-        if self._drives_against_traffic:
-            traffic_remarks = (make_traffic_remark(self),)
         notes = (
             *self.object.notes,
-            *front_remarks,
+            *self._front_remarks,
             *size_remarks,
             *light_notes,
             *camera_notes,
-            *traffic_remarks,
+            *self._traffic_remarks,
             *self.remarks,
         )
         return tuple(dict.fromkeys(note for note in notes if note))
+
+    @property
+    def _front_remarks(self) -> tuple[str, ...]:
+        """How the object's front was found, which matters on a road."""
+        front = self.object.front
+        stands_on_road = self.is_in_lane or has_lanes(self)
+        return () if front is None or not stands_on_road else (front.reason,)
+
+    @property
+    def _traffic_remarks(self) -> tuple[str, ...]:
+        """A remark if the object drives against the traffic."""
+        return (make_traffic_remark(self),) if self._drives_against_traffic else ()
 
     @property
     def _drives_against_traffic(self) -> bool:
@@ -617,15 +653,8 @@ class SceneDescription(SceneData):
         requested: dict[str, float | str] = {}
         for name in self.requested & self.values.keys():
             value = self.values[name]
-            if value is None:
-                continue
-            setting = settings.find_parameter(name)
-            is_choice = setting is not None and bool(setting.options)
-            if setting is not None and is_choice:
-                option_index = int(value)
-                requested[name] = setting.options[option_index]
-            else:
-                requested[name] = value
+            if value is not None:
+                requested[name] = _to_user_value(name, value)
         return requested
 
     @property
@@ -662,6 +691,36 @@ class SceneDescription(SceneData):
                 "one of the avenue, or leave camera.ev out, and exposure is metered"
             )
         return unit / (1.2 * math.pow(2.0, exposure_value))
+
+
+def _load_lens(camera: str) -> CameraModel:
+    """Return the lens of a camera file with one camera, or a bundled camera model.
+
+    `camera` is the path of the file, or the name of the model.
+    """
+    if not is_path(camera):
+        return make_bundled_models()[camera]
+    with track_opened_files(camera.partition("#")[0]):
+        return read_camera(camera)
+
+
+def _compute_fov_of_lens(model: CameraModel) -> float:
+    """Return the field of view of a lens along the larger side, in degrees."""
+    # Focal lengths are in widths and heights of the image, so that half a side's angle
+    # has the tangent 0.5 / focal. The field of view is along the larger side.
+    tangents = (
+        0.5 / model.intrinsic_by_name["fx"],
+        0.5 / model.intrinsic_by_name["fy"],
+    )
+    return 2.0 * math.degrees(math.atan(max(tangents)))
+
+
+def _to_user_value(name: str, value: float) -> float | str:
+    """Return the value of a setting as users write it: of a choice the option."""
+    setting = settings.find_parameter(name)
+    if setting is None or not setting.options:
+        return value
+    return setting.options[int(value)]
 
 
 def load_description(
@@ -710,21 +769,11 @@ def load_description(
 
     lit_by = environment_spec or _choose_environment(imported, is_mitsuba=is_mitsuba)
     check_ground(setting_values, lit_by)
-    if lit_by != NO_ENVIRONMENT:
-        check_single_environment(
-            imported.surroundings, f"`environment={_spec_text(lit_by)}`"
-        )
+    _check_environment(imported, lit_by)
     # what stands around the object has a ground of its own
     if source.is_scene and not {"ground.size", "ground.kind"} & set(setting_values):
         values["ground.size"] = 0.0
-    requested = set(setting_values)
-    if environment_spec is not None:
-        requested.add(ENVIRONMENT)
-    camera = ORBIT_CAMERA
-    # A Mitsuba scene is seen by its first camera, if it has one and settings describe
-    # no other.
-    if is_mitsuba and not _describes_orbit(setting_values):
-        camera = next(iter(imported.cameras), ORBIT_CAMERA)
+    camera = _choose_camera(imported, setting_values, is_mitsuba=is_mitsuba)
     described = SceneDescription(
         object=imported.object,
         environment=_load_environment(lit_by),
@@ -735,21 +784,65 @@ def load_description(
         facing=facing,
         size=size,
         unit=unit,
-        requested=frozenset(requested),
+        requested=_list_requested(setting_values, environment_spec),
         parts=imported.surroundings,
         cameras=imported.cameras,
         camera=camera,
         # The light of a Mitsuba scene counts as it is, without metering.
         metered=not is_mitsuba,
     )
-    # Things stand on the ground, and lamps are carried by things.
-    described = with_requested_ground(described)
-    described = add_things(described, things, _load_thing)
-    described = add_solid_remarks(described)
-    described = add_lamps(described)
+    described = _add_surroundings(described, things)
     check_mesh_names(described, values)
     _check_material_settings(described.object, setting_values)
     return described
+
+
+def _choose_camera(
+    imported: ImportedScene,
+    setting_values: settings.SettingValues,
+    *,
+    is_mitsuba: bool,
+) -> str:
+    """Return the name of the camera that sees a scene.
+
+    A Mitsuba scene is seen by its first camera, if it has one and settings describe no
+    other.
+    """
+    if is_mitsuba and not _describes_orbit(setting_values):
+        return next(iter(imported.cameras), ORBIT_CAMERA)
+    return ORBIT_CAMERA
+
+
+def _check_environment(
+    imported: ImportedScene, lit_by: str | Path | EnvironmentAsset
+) -> None:
+    """Raise InputError if a scene with an environment map has a second environment."""
+    if lit_by != NO_ENVIRONMENT:
+        check_single_environment(
+            imported.surroundings, f"`environment={_spec_text(lit_by)}`"
+        )
+
+
+def _list_requested(
+    setting_values: settings.SettingValues,
+    environment_spec: str | Path | EnvironmentAsset | None,
+) -> frozenset[str]:
+    """Return the names of what the user requests: settings, and an environment."""
+    environment_names = () if environment_spec is None else (ENVIRONMENT,)
+    return frozenset((*setting_values, *environment_names))
+
+
+def _add_surroundings(
+    described: SceneDescription, things: str | None
+) -> SceneDescription:
+    """Return a scene with its ground, the things next to the object, and lamps.
+
+    Things stand on the ground, and lamps are carried by things.
+    """
+    described = with_requested_ground(described)
+    described = add_things(described, things, _load_thing)
+    described = add_solid_remarks(described)
+    return add_lamps(described)
 
 
 class _Source(NamedTuple):
@@ -970,6 +1063,16 @@ def check_ground(
             "`set` ground.kind=photograph: the scene has no environment map to show; "
             "give it one, or leave it out"
         )
+    _check_no_table_settings(kind, requested)
+
+
+def _check_no_table_settings(kind: object, requested: settings.SettingValues) -> None:
+    """Raise InputError if settings of a table are set with a ground that is none.
+
+    Args:
+        kind: the kind of ground, for the message.
+        requested: the user's settings by name.
+    """
     table_settings = [name for name in settings.TABLE_SETTINGS if name in requested]
     if table_settings:
         raise InputError(
@@ -1001,15 +1104,26 @@ def _load_object(
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
-        # `up` is "y", "z" or None: others were rejected before. These branches do not
-        # change it, but give it a type that `import_object` accepts.
-        known_up: Literal["y", "z"] | None = None
-        if up == "y":
-            known_up = "y"
-        elif up == "z":
-            known_up = "z"
         with track_opened_files(spec):
-            return import_object(Path(spec), up=known_up, facing=facing)
+            return import_object(Path(spec), up=_narrow_up_axis(up), facing=facing)
+    _check_bundled_axes(spec, up, facing)
+    return library.load_object(str(spec))
+
+
+def _narrow_up_axis(up: str | None) -> Literal["y", "z"] | None:
+    """Return an axis as it is, with the type that `import_object` accepts.
+
+    It is "y", "z" or None: others were rejected before.
+    """
+    if up == "y":
+        return "y"
+    if up == "z":
+        return "z"
+    return None
+
+
+def _check_bundled_axes(spec: str | Path, up: str | None, facing: str | None) -> None:
+    """Raise InputError if axes of a bundled object are given."""
     if up is not None:
         raise InputError(
             "up: bundled objects stand upright already; leave `up` out, or give a "
@@ -1020,7 +1134,6 @@ def _load_object(
             f"facing: {spec} is bundled and faces +x; leave `facing` out, "
             "or turn it: `set` pose.yaw"
         )
-    return library.load_object(str(spec))
 
 
 def is_path(spec: str | Path) -> bool:

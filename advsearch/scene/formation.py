@@ -21,6 +21,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import (
+    BoolArray,
     EnvironmentAsset,
     Float32Array,
     Float64Array,
@@ -157,13 +158,7 @@ class _SrgbDisplay(torch.autograd.Function):
         """
         (radiance,) = ctx.saved_tensors
         if torch.is_grad_enabled():
-            # For a second derivative autograd differentiates the plain formula. The
-            # saved radiance is the input itself, so that it requires a gradient.
-            image = linear_to_srgb(radiance * ctx.gain)
-            (gradient,) = torch.autograd.grad(
-                image, radiance, cotangent, create_graph=True
-            )
-            return gradient, None
+            return _differentiate_display(radiance, ctx.gain, cotangent), None
         linear = radiance * ctx.gain
         is_inside = (linear >= 0.0) & (linear <= 1.0)
         is_dark = linear <= LINEAR_LIMIT
@@ -174,6 +169,17 @@ class _SrgbDisplay(torch.autograd.Function):
         gradient = torch.where(is_dark, cotangent * 12.92, gradient)
         gradient = torch.where(is_inside, gradient, 0.0)
         return gradient.mul_(ctx.gain), None
+
+
+def _differentiate_display(radiance: Tensor, gain: float, cotangent: Tensor) -> Tensor:
+    """Return the derivative of an sRGB image by the radiance, with a graph.
+
+    For a second derivative autograd differentiates the plain formula. The saved
+    radiance is the input itself, so that it requires a gradient.
+    """
+    image = linear_to_srgb(radiance * gain)
+    (gradient,) = torch.autograd.grad(image, radiance, cotangent, create_graph=True)
+    return gradient
 
 
 @lru_cache(maxsize=64)
@@ -277,20 +283,7 @@ def compute_metered_gain(scene: SceneData) -> float:
     object. Camera, pose and light are the default ones. If the object is not visible,
     the card lies flat on the ground. If no light arrives, the factor is 1.
     """
-    default_values = {
-        name: value
-        for name, value in resolve_settings({}).items()
-        if name.startswith(METERED_DEFAULTS)
-    }
-    # The gain must not depend on the camera in use: here it is a pinhole on an orbit,
-    # with a square image.
-    default_scene = replace(
-        scene,
-        values={**scene.values, **default_values},
-        aspect=1.0,
-        camera=ORBIT_CAMERA,
-        camera_model=None,
-    )
+    default_scene = _make_default_view(scene)
     normals = compute_visible_normals(default_scene)
     if not len(normals):  # the object is not visible
         normals = np.array([[0.0, 0.0, 1.0]])
@@ -300,6 +293,25 @@ def compute_metered_gain(scene: SceneData) -> float:
         return 1.0
     # The card is diffuse: its radiance is reflectance * irradiance / pi.
     return CARD_DISPLAY_VALUE * math.pi / (CARD_REFLECTANCE * irradiance)
+
+
+def _make_default_view(scene: SceneData) -> SceneData:
+    """Return a scene with the default camera, pose and light, in a square image.
+
+    The gain must not depend on the camera in use: here it is a pinhole on an orbit.
+    """
+    default_values = {
+        name: value
+        for name, value in resolve_settings({}).items()
+        if name.startswith(METERED_DEFAULTS)
+    }
+    return replace(
+        scene,
+        values={**scene.values, **default_values},
+        aspect=1.0,
+        camera=ORBIT_CAMERA,
+        camera_model=None,
+    )
 
 
 def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
@@ -314,25 +326,49 @@ def compute_irradiance(scene: SceneData, normals: Float64Array) -> Float64Array:
     """
     vertices = scene.base_vertices
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    # Unit directions (W, 3) to the light, and radiance times solid angle (W, 3). The
-    # latter times the cosine at the surface is irradiance.
     directions, power = _compute_distant_light(scene, center)
+    irradiances = _sum_irradiance(normals, directions, power)
+    irradiances = _add_lamp_light(irradiances, scene, normals, center)
+    # The object's own emission is left out: it does not light the object from outside.
+    for name in scene.surrounding_meshes:
+        part = scene.meshes[name]
+        if part.emission is not None:
+            directions, power = _compute_emitted_light(part, part.emission, center)
+            irradiances = irradiances + _sum_irradiance(normals, directions, power)
+    return irradiances
+
+
+def _sum_irradiance(
+    normals: Float64Array, directions: Float64Array, power: Float64Array
+) -> Float64Array:
+    """Return the irradiance (N, 3) of surfaces with unit normals (N, 3).
+
+    Args:
+        normals: normals of the surfaces.
+        directions: (W, 3) unit directions to the light.
+        power: (W, 3) irradiance that it causes on a surface turned towards it.
+    """
     cosines = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
     # by `einsum`, not by BLAS, whose last bits depend on the number of threads
-    irradiances = np.asarray(np.einsum("nw,wc->nc", cosines, power))
+    return np.asarray(np.einsum("nw,wc->nc", cosines, power))
+
+
+def _add_lamp_light(
+    irradiances: Float64Array,
+    scene: SceneData,
+    normals: Float64Array,
+    center: Float64Array,
+) -> Float64Array:
+    """Return irradiances (N, 3) at a point (3,) plus those of lamps.
+
+    `normals` (N, 3) are unit normals of the surfaces.
+    """
     for lamp in list_lamps(scene).values():
         to_lamp, lamp_irradiance = lamp.compute_lighting(center)
         if lamp_irradiance.any():  # lamps that a search sets are dark by default
             distance = max(float(np.linalg.norm(to_lamp)), 1e-12)
             cosine = np.maximum(normals @ (to_lamp / distance), 0.0)
             irradiances = irradiances + cosine[:, None] * lamp_irradiance
-    # The object's own emission is left out: it does not light the object from outside.
-    for name in scene.surrounding_meshes:
-        part = scene.meshes[name]
-        if part.emission is not None:
-            directions, power = _compute_emitted_light(part, part.emission, center)
-            cosines = np.maximum(np.einsum("nk,fk->nf", normals, directions), 0.0)
-            irradiances = irradiances + np.einsum("nf,fc->nc", cosines, power)
     return irradiances
 
 
@@ -358,20 +394,30 @@ def _compute_distant_light(
     ground_irradiance = (power[is_up] * directions[is_up, 2:]).sum(axis=0)
     albedo = srgb_to_linear(np.array(scene.ground_color, np.float32))
     reflected_radiance = albedo * ground_irradiance / math.pi
+    hits_ground = ~is_up & _find_ground_hits(scene, center, directions)
+    power = np.where(
+        hits_ground[:, None], reflected_radiance * solid_angle[:, None], power
+    )
+    return directions, power
+
+
+def _find_ground_hits(
+    scene: SceneData, center: Float64Array, directions: Float64Array
+) -> BoolArray:
+    """Return which directions (N, 3) from a point (3,) meet a plain ground.
+
+    The result has no meaning for directions that point up.
+    """
     # (N, 2) distances along x and y from the middle of the ground at which a direction
-    # meets the height 0. They have no meaning for directions that point up, which are
-    # left out below.
+    # meets the height 0
     distance = center[2] / np.maximum(-directions[:, 2:], 1e-9)
     offset = np.abs(center[:2] + directions[:, :2] * distance)
     # A photographed or paved ground is a part of the environment map: the light from
     # below is in its lower half.
     has_plain_ground = scene.photograph is None and not is_paved(scene)
     is_on_square = (offset <= scene.get_number("ground.size") / 2.0).all(axis=1)
-    hits_ground = has_plain_ground & ~is_up & is_on_square
-    power = np.where(
-        hits_ground[:, None], reflected_radiance * solid_angle[:, None], power
-    )
-    return directions, power
+    hits_ground: BoolArray = has_plain_ground & is_on_square
+    return hits_ground
 
 
 def compute_environment_light(
@@ -411,6 +457,20 @@ def _compute_emitted_light(
     offset = corners.mean(axis=1) - point
     squared_distance = (offset * offset).sum(axis=1)
     direction = offset / np.maximum(np.sqrt(squared_distance), 1e-12)[:, None]
+    mean_radiance = _measure_face_radiance(part, emission)
+    # The direction points to the face, so that a face turned to the point has a
+    # negative product. The back of a face emits nothing.
+    projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
+    # the form factor of a disk: area / (distance^2 + area / pi)
+    disk_divisor = squared_distance + np.linalg.norm(area, axis=1) / math.pi
+    return direction, mean_radiance * (projected_area / disk_divisor)[:, None]
+
+
+def _measure_face_radiance(part: MeshPart, emission: Float32Array) -> Float32Array:
+    """Return the mean radiance (F, 3) float32 of the faces of a mesh.
+
+    `emission` is the radiance map (H, W, 3) of its texture coordinates.
+    """
     # (F, P, 2) of P points on each face
     uv = np.einsum("pk,fkc->fpc", FACE_SAMPLE_WEIGHTS, part.mesh.uvs[part.mesh.faces])
     # In columns and rows, which are integers at texel centers. v points up, and rows
@@ -418,13 +478,7 @@ def _compute_emitted_light(
     height, width = emission.shape[:2]
     column = uv[..., 0] * width - 0.5
     row = (1.0 - uv[..., 1]) * height - 0.5
-    mean_radiance = look_up_texture(emission, column, row).mean(axis=1)
-    # The direction points to the face, so that a face turned to the point has a
-    # negative product. The back of a face emits nothing.
-    projected_area = np.maximum(-(area * direction).sum(axis=1), 0.0)
-    # the form factor of a disk: area / (distance^2 + area / pi)
-    disk_divisor = squared_distance + np.linalg.norm(area, axis=1) / math.pi
-    return direction, mean_radiance * (projected_area / disk_divisor)[:, None]
+    return np.asarray(look_up_texture(emission, column, row).mean(axis=1))
 
 
 def _choose_metering_shape(frame: Frame) -> tuple[float, tuple[int, int]]:
@@ -473,14 +527,7 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     faces = faces[is_ahead]
     frame = Frame.from_fov(scene.get_number("camera.fov"), scene.aspect)
     pixel_width, shape = _choose_metering_shape(frame)
-    tangents = points[faces][..., :2] / points[faces][..., 2:]
-    # The image is mirrored and upside down: its columns go to the left and its rows up,
-    # as the camera's coordinates do. That changes no normal. The frame is symmetric, so
-    # that the image begins at the same tangents in these directions.
-    from_first_corner = tangents - (frame.left, frame.low)
-    # The raster's coordinates are 0 at the center of its first pixel, not at the
-    # border.
-    pixel_coordinates = from_first_corner / pixel_width - 0.5
+    pixel_coordinates = _locate_in_raster(points[faces], frame, pixel_width)
     face, row, column, weights = rasterize_triangles(pixel_coordinates, shape)
     # 1 / depth, unlike depth, may be interpolated linearly over the image
     nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)
@@ -490,8 +537,34 @@ def compute_visible_normals(scene: SceneData) -> Float64Array:
     normals = _interpolate_normals(scene, corners, weights[visible])
     # from the camera to the middle of the visible face, in world space
     from_camera = points[corners].mean(axis=1) @ camera_axes.T
-    is_back_facing = (normals * from_camera).sum(axis=1, keepdims=True) > 0.0
-    return np.asarray(np.where(is_back_facing, -normals, normals))
+    return _turn_against(normals, from_camera)
+
+
+def _turn_against(normals: Float64Array, directions: Float64Array) -> Float64Array:
+    """Return normals (N, 3), reversed where they point along directions (N, 3)."""
+    is_along = (normals * directions).sum(axis=1, keepdims=True) > 0.0
+    return np.asarray(np.where(is_along, -normals, normals))
+
+
+def _locate_in_raster(
+    points: Float64Array, frame: Frame, pixel_width: float
+) -> Float64Array:
+    """Return positions (..., 2) of points (..., 3) in the raster of an image, in pixels.
+
+    The image is mirrored and upside down: its columns go to the left and its rows up,
+    as the camera's coordinates do. That changes no normal. The frame is symmetric, so
+    that the image begins at the same tangents in these directions.
+
+    Args:
+        points: points in the camera's coordinates: left, up and ahead.
+        frame: frame of the image.
+        pixel_width: width of a pixel at distance 1.
+    """
+    tangents = points[..., :2] / points[..., 2:]
+    from_first_corner = tangents - (frame.left, frame.low)
+    # The raster's coordinates are 0 at the center of its first pixel, not at the
+    # border.
+    return np.asarray(from_first_corner / pixel_width - 0.5)
 
 
 def _interpolate_normals(
@@ -532,14 +605,22 @@ def _compute_unrotated_light(
     # The fourth channel, of ones, becomes the solid angle.
     ones = np.ones((height, width, 1))
     padded_radiance = np.concatenate([environment.radiance, ones], axis=2)
-    weighted_texels = padded_radiance * solid_angle[:, None, None]
-    # Blocks are summed over their rows, and then over their columns.
-    row_sums = np.add.reduceat(weighted_texels, rows, axis=0)
-    sums = np.add.reduceat(row_sums, columns, axis=1).reshape(-1, 4)
-    block_power = sums[:, :3]
-    block_solid_angle = sums[:, 3]
+    sums = _sum_over_blocks(padded_radiance * solid_angle[:, None, None], rows, columns)
     directions = _compute_block_directions(rows, columns, (height, width))
-    return directions, block_solid_angle, block_power
+    return directions, sums[:, 3], sums[:, :3]
+
+
+def _sum_over_blocks(
+    texels: Float64Array, rows: IntArray, columns: IntArray
+) -> Float64Array:
+    """Return the sums (blocks, c) of a map (H, W, c) over blocks of texels.
+
+    `rows` and `columns` are the first ones of each block. Blocks are summed over their
+    rows, and then over their columns.
+    """
+    row_sums = np.add.reduceat(texels, rows, axis=0)
+    sums = np.add.reduceat(row_sums, columns, axis=1)
+    return np.asarray(sums.reshape(-1, texels.shape[2]))
 
 
 def _compute_texel_solid_angles(height: int, width: int) -> Float64Array:
@@ -656,18 +737,7 @@ def divide_exposure(
     # (H,) when each row opens, in seconds. The time of reading is divided into one part
     # for each row, and each row opens in the middle of its part.
     row_opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    if shutter < moment_duration:
-        # A row is exposed for less than a moment, and belongs to only one: that in
-        # which the middle of its exposure is.
-        row_middle = row_opens + shutter / 2.0
-        moment = (row_middle / moment_duration).long().clamp_max(count - 1)
-        weights = torch.nn.functional.one_hot(moment, count).T.double()
-    else:
-        # (M, H) seconds for which moment and row overlap
-        moment_ends = moment_starts + moment_duration
-        overlap_start = torch.maximum(moment_starts[:, None], row_opens)
-        overlap_end = torch.minimum(moment_ends[:, None], row_opens + shutter)
-        weights = (overlap_end - overlap_start).clamp_min(0.0)
+    weights = _weigh_moments(shutter, moment_starts, moment_duration, row_opens)
     weights = weights / weights.sum(dim=0)
     if is_from_bottom:
         row_dimension = 1
@@ -676,10 +746,33 @@ def divide_exposure(
     offsets = moment_starts + moment_duration / 2.0 - (shutter + rolling) / 2.0
     # A row overlaps with shutter / moment_duration moments, each of which takes this
     # fraction of its samples. Without a shutter one moment takes all of them.
-    sample_fraction = 1.0
-    if shutter:
-        sample_fraction = min(1.0, moment_duration / shutter)
+    sample_fraction = min(1.0, moment_duration / shutter) if shutter else 1.0
     return offsets, weights.float(), sample_fraction
+
+
+def _weigh_moments(
+    shutter: float, moment_starts: Tensor, moment_duration: float, row_opens: Tensor
+) -> Tensor:
+    """Return weights (M, H) of moments in rows, not yet 1 in sum.
+
+    Args:
+        shutter: seconds for which each row is exposed.
+        moment_starts: (M,) when each moment begins, in seconds.
+        moment_duration: how long each lasts, in seconds.
+        row_opens: (H,) when each row opens, in seconds.
+    """
+    if shutter < moment_duration:
+        # A row is exposed for less than a moment, and belongs to only one: that in
+        # which the middle of its exposure is.
+        row_middle = row_opens + shutter / 2.0
+        moment = (row_middle / moment_duration).long().clamp_max(len(moment_starts) - 1)
+        weights: Tensor = torch.nn.functional.one_hot(moment, len(moment_starts))
+        return weights.T.double()
+    # (M, H) seconds for which moment and row overlap
+    moment_ends = moment_starts + moment_duration
+    overlap_start = torch.maximum(moment_starts[:, None], row_opens)
+    overlap_end = torch.minimum(moment_ends[:, None], row_opens + shutter)
+    return (overlap_end - overlap_start).clamp_min(0.0)
 
 
 # ----------------------------------------------------------------------------------

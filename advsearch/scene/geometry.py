@@ -56,6 +56,7 @@ MIN_SPHERE_DISTANCE = 0.02
 # Sine of the largest elevation, for a height that would need a steeper one.
 MAX_ELEVATION_SINE = math.sin(math.radians(89.0))
 MIN_DEPTH = 1e-3  # depth up to which points are not projected
+NO_OVERLAP = (math.inf, -math.inf)  # interval of shifts at which there is no overlap
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
@@ -158,6 +159,23 @@ def compute_framing_distance(
         - compute_center(description)
     ).to(fov.device)
     edge_tangents = _compute_edge_tangents(description, fov, aspect)
+    from_default_view = _compute_default_framing_distance(offsets, edge_tangents)
+    elevation = float(SETTINGS["camera.elevation"].default or 0.0)
+    from_all_around = _compute_framing_distance_all_around(
+        offsets, elevation, edge_tangents
+    )
+    return torch.maximum(from_default_view, from_all_around).clamp_min(
+        float(offsets.norm(dim=1).max()) + MIN_SPHERE_DISTANCE
+    )
+
+
+def _compute_default_framing_distance(offsets: Tensor, edge_tangents: Tensor) -> Tensor:
+    """Return the distance () from which the object fills the image by default.
+
+    Args:
+        offsets: (V, 3) from the middle of the object to its vertices.
+        edge_tangents: (2,) of the angles to the edges of the image.
+    """
     azimuth, elevation, roll = (
         float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW
     )
@@ -166,15 +184,10 @@ def compute_framing_distance(
     (half_width, half_height) = edge_tangents * FRAME_FILL
     # A camera at the distance d sees a vertex at the tangent left / (d - outwards).
     # That is at most half_width if d >= outwards + left / half_width.
-    from_default_view = (
+    distance = (
         outwards + torch.maximum(left.abs() / half_width, up.abs() / half_height)
     ).max()
-    from_all_around = _compute_framing_distance_all_around(
-        offsets, elevation, edge_tangents
-    )
-    return torch.maximum(from_default_view, from_all_around).clamp_min(
-        float(offsets.norm(dim=1).max()) + MIN_SPHERE_DISTANCE
-    )
+    return distance
 
 
 def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float64Array:
@@ -188,13 +201,8 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
         roll: rotation of the image, counter-clockwise, degrees.
     """
     azimuth = math.radians(azimuth)
-    elevation = math.radians(elevation)
     roll = math.radians(roll)
-    horizontal = math.cos(elevation)
-    vertical = math.sin(elevation)
-    outwards = np.array(
-        [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), vertical]
-    )
+    outwards = _compute_orbit_direction(azimuth, math.radians(elevation))
     left = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
     upright = np.cross(-outwards, left)
     rolled_axes = (
@@ -202,6 +210,15 @@ def compute_camera_axes(azimuth: float, elevation: float, roll: float) -> Float6
         math.cos(roll) * upright - math.sin(roll) * left,
     )
     return np.stack([*rolled_axes, outwards])
+
+
+def _compute_orbit_direction(azimuth: float, elevation: float) -> Float64Array:
+    """Return the unit vector (3,) at an azimuth and an elevation, in radians."""
+    horizontal = math.cos(elevation)
+    vertical = math.sin(elevation)
+    return np.array(
+        [horizontal * math.cos(azimuth), horizontal * math.sin(azimuth), vertical]
+    )
 
 
 def compute_center(description: SceneData) -> Float64Array:
@@ -291,28 +308,40 @@ def camera_to_world(
     if description.camera != ORBIT_CAMERA:
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
-    get_number = description.get_number
-    requested_distance = description.values["camera.distance"]
-    if requested_distance is not None:
-        distance = requested_distance / description.size_in_metres
-    else:
-        fov = torch.tensor(get_number("camera.fov"), dtype=torch.float64)
-        distance = float(compute_framing_distance(description, fov, aspect))
-    elevation = get_number("camera.elevation")
-    height = description.values.get("camera.height")
-    if height is not None:
-        center_height = float(compute_center(description)[2])
-        # sine of the elevation: height above the center, over distance
-        sine = (height / description.size_in_metres - center_height) / distance
-        sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
-        elevation = math.degrees(math.asin(sine))
-    azimuth = description.azimuth_zero + get_number("camera.azimuth")
+    distance = _compute_orbit_distance(description, aspect)
+    elevation = _compute_orbit_elevation(description, distance)
+    azimuth = description.azimuth_zero + description.get_number("camera.azimuth")
     # left, up, and from the object to the camera, which looks the other way
-    axes = compute_camera_axes(azimuth, elevation, get_number("camera.roll"))
+    roll = description.get_number("camera.roll")
+    axes = compute_camera_axes(azimuth, elevation, roll)
     return make_pose(
         np.stack([axes[0], axes[1], -axes[2]], axis=1),
         compute_center(description) + distance * axes[2],
     )
+
+
+def _compute_orbit_distance(description: SceneData, aspect: float) -> float:
+    """Return the distance of the camera on an orbit, in object sizes.
+
+    `aspect` is width over height of the image.
+    """
+    requested_distance = description.values["camera.distance"]
+    if requested_distance is not None:
+        return requested_distance / description.size_in_metres
+    fov = torch.tensor(description.get_number("camera.fov"), dtype=torch.float64)
+    return float(compute_framing_distance(description, fov, aspect))
+
+
+def _compute_orbit_elevation(description: SceneData, distance: float) -> float:
+    """Return the elevation in degrees of the camera on an orbit at a distance."""
+    height = description.values.get("camera.height")
+    if height is None:
+        return description.get_number("camera.elevation")
+    center_height = float(compute_center(description)[2])
+    # sine of the elevation: height above the center, over distance
+    sine = (height / description.size_in_metres - center_height) / distance
+    sine = min(max(sine, -MAX_ELEVATION_SINE), MAX_ELEVATION_SINE)
+    return math.degrees(math.asin(sine))
 
 
 def project_points(
@@ -342,26 +371,47 @@ def project_points(
     points = points * torch.tensor([-1.0, -1.0, 1.0]).to(points)
     model = description.camera_model
     if model is not None:
-        if "camera.lens" in inputs:
-            # A lens model computes with plain floats, without derivatives.
-            model = model.with_intrinsics(inputs["camera.lens"].detach())
-        positions, is_visible = model.project(points)
-        # from [0, 1] over the image to pixels from its middle
-        return (positions - 0.5) * image_size, is_visible
+        return _project_by_lens(model, inputs, points, image_size)
+    return _project_by_pinhole(description, inputs, points, image_size)
+
+
+def _project_by_lens(
+    model: CameraModel, inputs: Mapping[str, Tensor], points: Tensor, size: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Project points (N, 3), to the right, down and ahead, by the model of a lens.
+
+    `size` (2,) is width and height of the image in pixels. The result is that of
+    `project_points`.
+    """
+    if "camera.lens" in inputs:
+        # A lens model computes with plain floats, without derivatives.
+        model = model.with_intrinsics(inputs["camera.lens"].detach())
+    positions, is_visible = model.project(points)
+    # from [0, 1] over the image to pixels from its middle
+    return (positions - 0.5) * size, is_visible
+
+
+def _project_by_pinhole(
+    description: SceneData, inputs: Mapping[str, Tensor], points: Tensor, size: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Project points (N, 3), to the right, down and ahead, by a pinhole.
+
+    The arguments are those of `_project_by_lens`, and the scene.
+    """
     fov = (
         inputs.get("camera.fov", torch.tensor(description.get_number("camera.fov")))
         .double()
         .reshape(())
     )
     # in pixels; the field of view is that of the larger side
-    focal = max(size) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
+    focal = float(size.max()) / 2.0 / torch.tan(torch.deg2rad(fov) / 2.0)
     depth = points[:, 2]
     positions = focal * points[:, :2] / depth.clamp_min(MIN_DEPTH)[:, None]
     for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
         if name in inputs:
             # The frame is shifted to the right or down, so that points in it move to
             # the left or up.
-            positions[:, axis] -= image_size[axis] * inputs[name].double().reshape(())
+            positions[:, axis] -= size[axis] * inputs[name].double().reshape(())
     return positions, depth > MIN_DEPTH
 
 
@@ -439,12 +489,7 @@ def compute_real_harmonics(height: int, width: int) -> Tensor:
     which is sqrt(4 pi) times the factors of Ramamoorthi and Hanrahan 2001, section 3.
     The last axis has the degrees 0 (one), 1 (y, z, x) and 2 (five).
     """
-    theta = (torch.arange(height) + 0.5) * math.pi / height
-    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
-    # (height, width) unit vectors: theta is the angle from +z
-    x = theta.sin()[:, None] * phi.cos()[None]
-    y = theta.sin()[:, None] * phi.sin()[None]
-    z = theta.cos()[:, None].expand(height, width)
+    x, y, z = _compute_texel_directions(height, width)
     root3 = math.sqrt(3.0)
     root15 = math.sqrt(15.0)
     root5 = math.sqrt(5.0)
@@ -458,6 +503,19 @@ def compute_real_harmonics(height: int, width: int) -> Tensor:
     return torch.stack(
         [*lower_degrees, *degree_two, root15 / 2.0 * (x * x - y * y)], dim=-1
     )
+
+
+def _compute_texel_directions(height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return x, y and z (height, width) of unit vectors to the texels of a map.
+
+    Row 0 of the equirectangular map is around +z, and columns run from +x over +y.
+    """
+    theta = (torch.arange(height) + 0.5) * math.pi / height  # the angle from +z
+    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
+    x = theta.sin()[:, None] * phi.cos()[None]
+    y = theta.sin()[:, None] * phi.sin()[None]
+    z = theta.cos()[:, None].expand(height, width)
+    return x, y, z
 
 
 def make_euler_rotation(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
@@ -499,13 +557,17 @@ def make_vector_rotation(degrees: Tensor) -> Tensor:
     cosine_factor = torch.where(
         is_small, 0.5 - squared_angle / 24.0, (1.0 - torch.cos(angle)) / angle.square()
     )
-    x, y, z = vector
-    zero = torch.zeros_like(x)
-    # the matrix of the cross product with the vector
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    cross = _make_cross_matrix(vector)
     return (
         torch.eye(3).to(degrees) + sine_factor * cross + cosine_factor * (cross @ cross)
     )
+
+
+def _make_cross_matrix(vector: Tensor) -> Tensor:
+    """Return the matrix (3, 3) of the cross product with a vector (3,)."""
+    x, y, z = vector
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 HIDDEN_SCALE = 1e-3  # scale of an occluder that is hidden behind the camera
@@ -568,34 +630,60 @@ def find_overlap_interval(
     Returns:
         The first and the last t; (inf, -inf) if they never overlap.
     """
-    never = (math.inf, -math.inf)
     has_common_height = min(first.upper, second.upper) > max(first.lower, second.lower)
     if not has_common_height:
-        return never
+        return NO_OVERLAP
     normals = _compute_edge_normals(first, second)
-    # positions (corners, k) of the corners along each normal
-    first_positions = first.outline @ normals.T
-    second_positions = second.outline @ normals.T
-    # (k,) how far the first has to move along each normal until its projection begins
-    # to overlap that of the second, and until it no longer overlaps
-    distance_to_begin = second_positions.min(axis=0) - first_positions.max(axis=0)
-    distance_to_end = second_positions.max(axis=0) - first_positions.min(axis=0)
+    distances = _measure_overlap_distances(first, second, normals)
     # (k,) how far a shift of 1 moves the first along each normal
     speeds = normals @ direction
     # Along a normal at a right angle to the shift the first does not move. If its
     # projection does not overlap before the shift, it never does.
     is_still = speeds == 0.0
+    distance_to_begin, distance_to_end = distances
     is_separated = (distance_to_begin >= 0.0) | (distance_to_end <= 0.0)
     if (is_still & is_separated).any():
-        return never
+        return NO_OVERLAP
+    return _intersect_overlaps(distances[:, ~is_still], speeds[~is_still])
+
+
+def _measure_overlap_distances(
+    first: Footprint, second: Footprint, normals: Float64Array
+) -> Float64Array:
+    """Return how far a footprint has to move along normals (k, 2) to overlap another.
+
+    Returns:
+        (2, k) distances until the projection of the first on each normal begins to
+        overlap that of the second, and until it no longer overlaps.
+    """
+    # positions (corners, k) of the corners along each normal
+    first_positions = first.outline @ normals.T
+    second_positions = second.outline @ normals.T
+    distance_to_begin = second_positions.min(axis=0) - first_positions.max(axis=0)
+    distance_to_end = second_positions.max(axis=0) - first_positions.min(axis=0)
+    return np.stack([distance_to_begin, distance_to_end])
+
+
+def _intersect_overlaps(
+    distances: Float64Array, speeds: Float64Array
+) -> tuple[float, float]:
+    """Return the interval of shifts at which projections overlap on all normals.
+
+    Args:
+        distances: (2, k) how far the first footprint has to move along each normal
+            until the overlap begins, and until it ends.
+        speeds: (k,) how far a shift of 1 moves it along each normal, not 0.
+
+    Returns:
+        The first and the last shift; (inf, -inf) if there is none.
+    """
     # Distance over speed is the shift. A negative speed swaps the shifts at which an
     # overlap begins and ends, and so they are sorted.
-    distances = np.stack([distance_to_begin, distance_to_end])
-    shifts = np.sort(distances[:, ~is_still] / speeds[~is_still], axis=0)
+    shifts = np.sort(distances / speeds, axis=0)
     # All projections overlap after the last begin and before the first end.
     start = float(shifts[0].max())
     end = float(shifts[1].min())
-    return (start, end) if start < end else never
+    return (start, end) if start < end else NO_OVERLAP
 
 
 def _compute_edge_normals(first: Footprint, second: Footprint) -> Float64Array:

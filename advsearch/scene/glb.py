@@ -13,7 +13,7 @@ from __future__ import annotations
 import io
 import json
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.pictures import encode_levels
-from advsearch.scene.assets import Float32Array, Float64Array, Shape
+from advsearch.scene.assets import Float32Array, Float64Array, Material, Shape
 from advsearch.scene.color import linear_to_srgb
 
 # ---- The buffer of a binary glTF file, and the file around it ----
@@ -33,6 +33,11 @@ UNSIGNED_SHORT = 5123
 # Targets of buffer views: vertex attributes, and indices.
 ARRAY_BUFFER = 34962
 ELEMENT_ARRAY_BUFFER = 34963
+COMPONENT_TYPES = {
+    np.dtype(np.uint32): UNSIGNED_INT,
+    np.dtype(np.uint16): UNSIGNED_SHORT,
+}
+"""Types of components by NumPy's types of integers; all others are `FLOAT`."""
 
 
 def find_mime_type(image_file: bytes) -> str:
@@ -88,11 +93,7 @@ class GlbBuffer:
             bounds: whether minimum and maximum are written too, which glTF requires of
                 positions.
         """
-        integer_types = {
-            np.dtype(np.uint32): UNSIGNED_INT,
-            np.dtype(np.uint16): UNSIGNED_SHORT,
-        }
-        component_type = integer_types.get(values.dtype, FLOAT)
+        component_type = COMPONENT_TYPES.get(values.dtype, FLOAT)
         target = ARRAY_BUFFER if component_type == FLOAT else ELEMENT_ARRAY_BUFFER
         view = self.add_view(np.ascontiguousarray(values).tobytes(), target)
         entry: dict[str, Any] = {
@@ -168,19 +169,8 @@ def encode_web_glb(
     """
     buffer = GlbBuffer()
     document = _make_document(buffer, [*adversarial, *clean], _encode_jpeg)
-    # (4, 3) vectors: the camera's axes to the left, up and ahead, then its position.
-    # These are the columns of the pose.
-    pose_columns = camera[:3].T.astype(np.float32)
-    # glTF's cameras look along their -z, with +x to the right. So the axes to the left
-    # and ahead are reversed.
-    signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
-    # glTF stores a matrix column by column, so that its columns are rows here.
-    transposed_matrix = np.eye(4)
-    transposed_matrix[:, :3] = _to_y_up(pose_columns * signs)
     document["cameras"] = [CAMERA_ENTRY]
-    document["nodes"].append(
-        {"name": "camera", "camera": 0, "matrix": transposed_matrix.ravel().tolist()}
-    )
+    document["nodes"].append(_make_camera_node(camera))
     n_adversarial = len(adversarial)
     camera_node = len(document["nodes"]) - 1
     document["scenes"] = [
@@ -190,6 +180,21 @@ def encode_web_glb(
     if note:
         document["asset"]["extras"] = {"note": note}
     return buffer.to_bytes(document)
+
+
+def _make_camera_node(camera: Float64Array) -> dict[str, Any]:
+    """Return the node of a camera with a pose (4, 4), which looks along its +z."""
+    # (4, 3) vectors: the camera's axes to the left, up and ahead, then its position.
+    # These are the columns of the pose.
+    pose_columns = camera[:3].T.astype(np.float32)
+    # glTF's cameras look along their -z, with +x to the right. So the axes to the left
+    # and ahead are reversed.
+    signs = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
+    # glTF stores a matrix column by column, so that its columns are rows here.
+    transposed_matrix = np.eye(4)
+    transposed_matrix[:, :3] = _to_y_up(pose_columns * signs)
+    matrix = transposed_matrix.ravel().tolist()
+    return {"name": "camera", "camera": 0, "matrix": matrix}
 
 
 def _make_document(
@@ -207,7 +212,22 @@ def _make_document(
         meshes: meshes, each of which gets a node.
         encode_image: encodes an image (H, W, 3) as a JPEG or PNG file.
     """
-    document: dict[str, Any] = {
+    document = _make_empty_document(meshes)
+    for index, shape in enumerate(meshes):
+        primitive = {**_add_geometry(buffer, shape), "material": index}
+        document["meshes"].append({"name": shape.name, "primitives": [primitive]})
+        document["materials"].append(
+            _add_material(document, buffer, shape, encode_image)
+        )
+    extensions = _list_extensions(document["materials"])
+    if extensions:
+        document["extensionsUsed"] = extensions
+    return document
+
+
+def _make_empty_document(meshes: Sequence[Shape]) -> dict[str, Any]:
+    """Return a document with the nodes of meshes, but not yet the meshes themselves."""
+    return {
         "asset": {"version": "2.0", "generator": "advsearch"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
@@ -227,20 +247,13 @@ def _make_document(
         ],
         "images": [],
     }
-    for index, shape in enumerate(meshes):
-        primitive = {**_add_geometry(buffer, shape), "material": index}
-        document["meshes"].append({"name": shape.name, "primitives": [primitive]})
-        document["materials"].append(
-            _add_material(document, buffer, shape, encode_image)
-        )
-    extensions = {
-        name
-        for material in document["materials"]
-        for name in material.get("extensions", ())
-    }
-    if extensions:
-        document["extensionsUsed"] = sorted(extensions)
-    return document
+
+
+def _list_extensions(materials: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the sorted names of the extensions that materials use."""
+    return sorted(
+        {name for material in materials for name in material.get("extensions", ())}
+    )
 
 
 def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
@@ -251,10 +264,7 @@ def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
     Indices have 16 bits if that suffices.
     """
     mesh = shape.mesh
-    lengths = np.linalg.norm(mesh.normals, axis=1, keepdims=True)
-    normals = np.where(
-        lengths > 0.0, mesh.normals / np.maximum(lengths, 1e-12), np.eye(3)[2]
-    ).astype(np.float32)
+    normals = _make_unit_normals(mesh.normals)
     uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
     attributes = {
         "POSITION": buffer.add_accessor(_to_y_up(mesh.vertices), "VEC3", bounds=True),
@@ -265,6 +275,17 @@ def _add_geometry(buffer: GlbBuffer, shape: Shape) -> dict[str, Any]:
     index_type = np.uint32 if is_large else np.uint16
     indices = buffer.add_accessor(mesh.faces.reshape(-1).astype(index_type), "SCALAR")
     return {"attributes": attributes, "indices": indices}
+
+
+def _make_unit_normals(normals: Float32Array) -> Float32Array:
+    """Return normals (V, 3) of length 1; one of length 0 becomes +z."""
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    unit_normals = normals / np.maximum(lengths, 1e-12)
+    upwards = np.eye(3)[2]
+    unit_or_upward: Float32Array = np.where(
+        lengths > 0.0, unit_normals, upwards
+    ).astype(np.float32)
+    return unit_or_upward
 
 
 def _add_material(
@@ -291,16 +312,36 @@ def _add_material(
         normals = encode_image(_to_bytes(shape.normal_map))
         material["normalTexture"] = _add_texture(document, buffer, normals)
     if shape.emission is not None:
-        # A texture's values are at most 1: the texture has the emission divided by its
-        # maximum, and an extension has the maximum.
-        strength = float(shape.emission.max())
-        material["emissiveFactor"] = [1.0, 1.0, 1.0]
-        relative = linear_to_srgb(shape.emission / np.float32(strength))
-        emission = encode_image(_to_bytes(relative))
-        material["emissiveTexture"] = _add_texture(document, buffer, emission)
-        extensions = material.setdefault("extensions", {})
-        extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
+        _add_emission_texture(document, buffer, material, shape.emission, encode_image)
     return material
+
+
+def _add_emission_texture(
+    document: dict[str, Any],
+    buffer: GlbBuffer,
+    material: dict[str, Any],
+    emission: Float32Array,
+    encode_image: Callable[[ByteImage], bytes],
+) -> None:
+    """Add light (H, W, 3) to a material; the others are those of `_add_material`."""
+    strength = float(emission.max())
+    relative = linear_to_srgb(emission / np.float32(strength))
+    image = encode_image(_to_bytes(relative))
+    _set_emission(material, _add_texture(document, buffer, image), strength)
+
+
+def _set_emission(
+    material: dict[str, Any], texture: dict[str, int], strength: float
+) -> None:
+    """Set the light of a material.
+
+    A texture's values are at most 1: the texture has the emission divided by its
+    maximum, and an extension has the maximum, `strength`.
+    """
+    material["emissiveFactor"] = [1.0, 1.0, 1.0]
+    material["emissiveTexture"] = texture
+    extensions = material.setdefault("extensions", {})
+    extensions["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
 
 
 def _add_texture(
@@ -342,6 +383,14 @@ def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
         "roughnessFactor": surface.roughness,
         "metallicFactor": surface.metallic,
     }
+    extensions = _make_extensions(surface)
+    if extensions:
+        material["extensions"] = extensions
+    return material
+
+
+def _make_extensions(surface: Material) -> dict[str, Any]:
+    """Return the extensions of a material for what differs from glTF's default."""
     extensions: dict[str, Any] = {}
     if surface.specular != DEFAULT_SPECULAR:
         extensions["KHR_materials_specular"] = {
@@ -352,9 +401,7 @@ def _make_material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
             "clearcoatFactor": surface.clearcoat,
             "clearcoatRoughnessFactor": COAT_ROUGHNESS,
         }
-    if extensions:
-        material["extensions"] = extensions
-    return material
+    return extensions
 
 
 def _to_y_up(vectors: Float32Array) -> Float32Array:

@@ -296,6 +296,14 @@ def make_first_plan(
         InputError: an estimator is unknown, or not valid where it was forced by name.
     """
     forced = dict(forced or {})
+    _check_forced(forced, groups)
+    return GradientPlan(
+        tuple(_plan_group(group, steps, forced, image_size) for group in groups), spp
+    )
+
+
+def _check_forced(forced: Mapping[str, str], groups: Sequence[Group]) -> None:
+    """Raise UnknownNameError for a forced estimator or a group that does not exist."""
     known_names = {name for group in groups for name in (group.name, group.control)}
     for name, estimator in forced.items():
         if estimator not in ESTIMATORS:
@@ -304,9 +312,6 @@ def make_first_plan(
     for name in forced:
         if name not in (ALL_GROUPS, *known_names):
             raise UnknownNameError("control in `estimators`", name, sorted(known_names))
-    return GradientPlan(
-        tuple(_plan_group(group, steps, forced, image_size) for group in groups), spp
-    )
 
 
 def _plan_group(
@@ -333,6 +338,14 @@ def _plan_group(
             group, estimator="none", reason="a discrete choice has no derivative"
         )
     group = replace(group, step=_choose_step(group, image_size))
+    return _choose_estimator(group, forced)
+
+
+def _choose_estimator(group: Group, forced: Mapping[str, str]) -> Group:
+    """Return a group with its preferred or forced estimator, of those that are valid.
+
+    `forced` has estimators by the name of a group, of a control, or "*".
+    """
     forced_by_name = forced.get(group.name) or forced.get(group.control)
     if forced_by_name is not None:
         _check_is_valid(group, forced_by_name)
@@ -340,22 +353,31 @@ def _plan_group(
             group, estimator=forced_by_name, reason="forced by name", is_forced=True
         )
     forced_for_all = forced.get(ALL_GROUPS)
+    if forced_for_all is not None and _is_valid_for(group, forced_for_all):
+        return replace(
+            group, estimator=forced_for_all, reason="forced for all", is_forced=True
+        )
+    return replace(
+        group, estimator=group.valid[0], reason=_explain_preference(group.valid)
+    )
+
+
+def _is_valid_for(group: Group, estimator: str) -> bool:
+    """Return whether an estimator is valid for a group, though it may not list it."""
     # Some estimators are valid for every group, and are not listed in `valid`. They are
     # not forced on a group that only changes the finished image ("image"), whose
     # derivative needs no render.
     is_always_valid = (
-        forced_for_all in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
+        estimator in ALWAYS_VALID_ESTIMATORS and "image" not in group.valid
     )
-    if forced_for_all is not None and (
-        forced_for_all in group.valid or is_always_valid
-    ):
-        return replace(
-            group, estimator=forced_for_all, reason="forced for all", is_forced=True
-        )
-    reason = "the only valid estimator"
-    if len(group.valid) > 1:
-        reason = f"preferred among {', '.join(group.valid)}; not measured"
-    return replace(group, estimator=group.valid[0], reason=reason)
+    return estimator in group.valid or is_always_valid
+
+
+def _explain_preference(valid: Sequence[str]) -> str:
+    """Return why the first of the valid estimators is used, as a text."""
+    if len(valid) > 1:
+        return f"preferred among {', '.join(valid)}; not measured"
+    return "the only valid estimator"
 
 
 def _choose_step(group: Group, image_size: float) -> float:
@@ -409,18 +431,31 @@ def forbid_second_derivatives(backward: Backward) -> Backward:
         # gradients are enabled here only with `create_graph`, for a second derivative
         if not torch.is_grad_enabled():
             return derivatives
-        # A guarded value depends, for autograd, on all that the derivative depends on:
-        # differentiating it again reaches the guard, which raises the error.
-        arguments = (cotangent, *ctx.saved_tensors)
-        guarded = []
-        for value in derivatives:
-            # An identity returns the cotangent itself, whose derivative is right.
-            if value is not None and value is not cotangent:
-                value = _OnceDifferentiable.apply(value, *arguments)  # type: ignore[no-untyped-call]
-            guarded.append(value)
-        return tuple(guarded)
+        return _guard_derivatives(derivatives, cotangent, ctx.saved_tensors)
 
     return once
+
+
+def _guard_derivatives(
+    derivatives: Sequence[Tensor | None], cotangent: Tensor, saved: Sequence[Tensor]
+) -> tuple[Tensor | None, ...]:
+    """Return derivatives that raise an error if they are differentiated again.
+
+    A guarded value depends, for autograd, on all that the derivative depends on:
+    differentiating it again reaches the guard, which raises the error.
+
+    Args:
+        derivatives: what a backward pass has returned.
+        cotangent: its cotangent. An identity returns that itself, whose derivative is
+            right, so that it is not guarded.
+        saved: tensors that the forward pass has saved.
+    """
+    guarded: list[Tensor | None] = []
+    for value in derivatives:
+        if value is not None and value is not cotangent:
+            value = _OnceDifferentiable.apply(value, cotangent, *saved)  # type: ignore[no-untyped-call]
+        guarded.append(value)
+    return tuple(guarded)
 
 
 class _OnceDifferentiable(torch.autograd.Function):

@@ -13,11 +13,12 @@ import numpy as np
 import torch
 
 from advsearch.scene import settings
-from advsearch.scene.assets import EnvironmentAsset, Float64Array
+from advsearch.scene.assets import BoolArray, EnvironmentAsset, Float64Array
 from advsearch.scene.geometry import camera_to_world, compute_center
 from advsearch.scene.parts import MeshPart, Place
 from advsearch.scene.photographed_ground import compute_irradiance
 from advsearch.scene.places.place_file import load_bundled_place, make_place_parts
+from advsearch.scene.places.schema import PictureEntry
 from advsearch.scene.scene_data import AnyScene, SceneData
 
 # shares of linear red, green and blue in luminance (Rec. ITU-R BT.709)
@@ -62,15 +63,20 @@ def is_against_traffic(scene: SceneData, camera: Float64Array) -> bool:
         camera[:2, 3] - compute_center(scene)[:2]
     ) * scene.size_in_metres
     height = float(camera[2, 3]) * scene.size_in_metres
-    place = find_place(scene)
-    width = LANE_WIDTH
-    if place is not None and place.file.lane_width is not None:
-        width = place.file.lane_width
+    width = _find_lane_width(scene)
     return bool(
         distance_ahead > 0.0
         and abs(distance_aside) <= width / 2.0
         and height <= MAX_CAR_CAMERA_HEIGHT
     )
+
+
+def _find_lane_width(scene: SceneData) -> float:
+    """Return the width of the lane in which the object stands, metres."""
+    site = find_place(scene)
+    if site is None or site.file.lane_width is None:
+        return LANE_WIDTH
+    return site.file.lane_width
 
 
 def make_traffic_remark(scene: SceneData) -> str:
@@ -150,10 +156,7 @@ def load_requested_place(scene: SceneData) -> Place | None:
     """
     kind = find_ground_kind(scene)
     if kind is not None:
-        if kind not in PLACE_BY_GROUND_KIND:
-            return None
-        bundled_name, variant = PLACE_BY_GROUND_KIND[kind]
-        return load_bundled_place(bundled_name, variant)
+        return _load_place_of_kind(kind)
     if scene.environment is None:
         return None
     has_table_settings = not scene.requested.isdisjoint(settings.TABLE_SETTINGS)
@@ -162,6 +165,14 @@ def load_requested_place(scene: SceneData) -> Place | None:
         return None
     surroundings: Place | None = scene.environment.place
     return surroundings
+
+
+def _load_place_of_kind(kind: str) -> Place | None:
+    """Return the bundled place of a kind of ground; None for a kind that is no place."""
+    if kind not in PLACE_BY_GROUND_KIND:
+        return None
+    bundled_name, variant = PLACE_BY_GROUND_KIND[kind]
+    return load_bundled_place(bundled_name, variant)
 
 
 def with_requested_ground(scene: AnyScene) -> AnyScene:
@@ -183,14 +194,17 @@ def with_requested_ground(scene: AnyScene) -> AnyScene:
         if len(other_parts) == len(scene.parts):
             return scene
         return replace(scene, parts=other_parts)
+    laid_parts = _make_parts_of(place, scene)
+    return replace(scene, parts=(*other_parts, *laid_parts))
+
+
+def _make_parts_of(place: Place, scene: SceneData) -> tuple[MeshPart, ...]:
+    """Return the parts of a place; its lamps are on if the environment is dark."""
     environment = scene.environment
     radiance_unit = None if environment is None else environment.candelas
     # Nothing but lamps depends on darkness.
     is_dark = bool(place.file.lamps) and _is_dark(environment)
-    place_parts = make_place_parts(
-        place, scene.size_in_metres, radiance_unit, is_dark=is_dark
-    )
-    return replace(scene, parts=(*other_parts, *place_parts))
+    return make_place_parts(place, scene.size_in_metres, radiance_unit, is_dark=is_dark)
 
 
 def _is_dark(environment: EnvironmentAsset | None) -> bool:
@@ -306,17 +320,21 @@ def find_valid_range(
     max_scale_distance = (MAX_SCALE_ERROR - 1.0) * _reach_of_area(
         surroundings.nearest_distance, camera.view_azimuth
     )
-    # length of the ground in front of the camera that is below the image's lower border
-    hidden_ground_distance = math.inf
-    if camera.lower_angle > 0.0:
-        # Beyond 90 degrees the distance is negative; at 180 it would be infinite.
-        lower_angle = math.radians(min(camera.lower_angle, 179.0))
-        hidden_ground_distance = camera.height / math.tan(lower_angle)
+    hidden_ground_distance = _compute_hidden_ground(camera)
     # The ground ends where the camera stands, at its azimuth from the object.
     ground_distance = _reach_of_area(surroundings.ground_extent, camera.azimuth)
     max_distance = min(max_scale_distance, ground_distance + hidden_ground_distance)
     max_height = MAX_SCALE_ERROR * surroundings.height
     return max(0.0, max_distance), max_height
+
+
+def _compute_hidden_ground(camera: CameraView) -> float:
+    """Return the length of the ground before a camera that is below its image."""
+    if not camera.lower_angle > 0.0:
+        return math.inf
+    # Beyond 90 degrees the distance is negative; at 180 it would be infinite.
+    lower_angle = math.radians(min(camera.lower_angle, 179.0))
+    return camera.height / math.tan(lower_angle)
 
 
 def _reach_of_area(area: Box | float, azimuth: float) -> float:
@@ -352,39 +370,57 @@ def find_surroundings(scene: SceneData) -> Surroundings | None:
         return None
     place = find_place(scene)
     extent: Box | float = math.inf if place is None else bound_ground(place)
-    # the place whose picture is in the environment's map
-    bundled = PLACE_BY_GROUND_KIND.get(environment.ground or "")
-    captured_site = (
-        environment.place if bundled is None else load_bundled_place(*bundled)
-    )
-    picture = None if captured_site is None else captured_site.file.picture
+    picture = _find_map_picture(environment)
     # The near part of the place is geometry, and the far part a picture, whose limits
     # the place's file states.
     if place is not None and picture is not None:
-        # a `Box`: from and to in x, and in y
-        nearest_things: Box = (*picture.x, *picture.y)
-        return Surroundings(
-            height=picture.height,
-            nearest_distance=nearest_things,
-            ground_extent=extent,
-            rotation=scene.get_number("environment.rotation"),
-        )
-    # A photographed map over a ground: the limits are the height of its camera, and the
-    # radius of the empty floor around it.
+        return _bound_picture(scene, picture, extent)
     if environment.photographed and (is_paved(scene) or scene.photograph is not None):
-        height = scene.capture_height * scene.size_in_metres
-        radius = scene.values.get("ground.radius")
-        if radius is None:
-            radius = DEFAULT_EMPTY_RADIUS * height
-        return Surroundings(
-            height=height, nearest_distance=radius, ground_extent=extent
-        )
+        return _bound_photographed_map(scene, extent)
     if not is_paved(scene):
         return None
     # Any other map is taken for infinitely far: only the end of the ground counts.
     return Surroundings(
         height=math.inf, nearest_distance=math.inf, ground_extent=extent
     )
+
+
+def _bound_picture(
+    scene: SceneData, picture: PictureEntry, extent: Box | float
+) -> Surroundings:
+    """Return the limits of a picture around a ground of an extent, metres."""
+    # a `Box`: from and to in x, and in y
+    nearest_things: Box = (*picture.x, *picture.y)
+    return Surroundings(
+        height=picture.height,
+        nearest_distance=nearest_things,
+        ground_extent=extent,
+        rotation=scene.get_number("environment.rotation"),
+    )
+
+
+def _find_map_picture(environment: EnvironmentAsset) -> PictureEntry | None:
+    """Return what is known of the picture of a place in an environment's map."""
+    bundled = PLACE_BY_GROUND_KIND.get(environment.ground or "")
+    captured_site = (
+        environment.place if bundled is None else load_bundled_place(*bundled)
+    )
+    if captured_site is None:
+        return None
+    picture: PictureEntry | None = captured_site.file.picture
+    return picture
+
+
+def _bound_photographed_map(scene: SceneData, extent: Box | float) -> Surroundings:
+    """Return the limits of a photographed map over a ground of an extent, metres.
+
+    They are the height of its camera, and the radius of the empty floor around it.
+    """
+    height = scene.capture_height * scene.size_in_metres
+    radius = scene.values.get("ground.radius")
+    if radius is None:
+        radius = DEFAULT_EMPTY_RADIUS * height
+    return Surroundings(height=height, nearest_distance=radius, ground_extent=extent)
 
 
 def bound_ground(place: Place) -> Box:
@@ -415,27 +451,11 @@ def make_camera_view(
     # An object of unknown size counts as 1 m large.
     x, y, z = pose[:3, 3] * scene.size_in_metres
     forward = pose[:3, 2]
-    if fov is None:
-        fov = scene.get_number("camera.fov")
-    half_fov = math.radians(fov) / 2.0
-    # The field of view is along the larger side. In a wide image the height is smaller
-    # than that by the aspect.
-    height_to_larger_side = min(1.0, 1.0 / scene.aspect)
-    half_height_angle = math.degrees(
-        math.atan(math.tan(half_fov) * height_to_larger_side)
-    )
-    # A lens that the user has chosen has a name. It may have any field of view, and so
-    # show the ground straight below the camera.
-    if scene.camera_model is not None and scene.camera_model.name:
-        half_height_angle = 90.0
+    half_height_angle = _compute_half_height_angle(scene, fov)
     azimuth = math.degrees(math.atan2(y, x))
-    view_azimuth = azimuth + 180.0  # straight down counts as towards the object
-    if math.hypot(forward[0], forward[1]) > 1e-6:
-        view_azimuth = math.degrees(math.atan2(forward[1], forward[0]))
-    # how far above the horizon the middle of the image is
-    view_elevation = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
+    view_azimuth = _compute_view_azimuth(forward, azimuth)
     # how far below the horizon the lower border of the image is
-    lower_angle = half_height_angle - view_elevation
+    lower_angle = half_height_angle - _compute_view_elevation(forward)
     return CameraView(
         azimuth=azimuth,
         view_azimuth=view_azimuth,
@@ -443,6 +463,44 @@ def make_camera_view(
         height=float(z),
         lower_angle=lower_angle,
     )
+
+
+def _compute_view_elevation(forward: Float64Array) -> float:
+    """Return how far above the horizon a camera looks, degrees.
+
+    `forward` (3,) is the unit vector of its axis. Its z may be beyond 1 by rounding.
+    """
+    sine = float(np.clip(forward[2], -1.0, 1.0))
+    return math.degrees(math.asin(sine))
+
+
+def _compute_view_azimuth(forward: Float64Array, azimuth: float) -> float:
+    """Return the azimuth, degrees, in which a camera looks; `azimuth` is its own.
+
+    `forward` is its direction (3,). Straight down counts as towards the object.
+    """
+    if math.hypot(forward[0], forward[1]) > 1e-6:
+        return math.degrees(math.atan2(forward[1], forward[0]))
+    return azimuth + 180.0
+
+
+def _compute_half_height_angle(scene: SceneData, fov: float | None) -> float:
+    """Return half of the angle of view along an image's height, in degrees.
+
+    `fov` is the field of view along the larger side, degrees; None is the scene's.
+    """
+    # A lens that the user has chosen has a name. It may have any field of view, and so
+    # show the ground straight below the camera.
+    if scene.camera_model is not None and scene.camera_model.name:
+        return 90.0
+    if fov is None:
+        fov = scene.get_number("camera.fov")
+    half_fov = math.radians(fov) / 2.0
+    # The field of view is along the larger side. In a wide image the height is smaller
+    # than that by the aspect.
+    height_to_larger_side = min(1.0, 1.0 / scene.aspect)
+    half_tangent = math.tan(half_fov) * height_to_larger_side
+    return math.degrees(math.atan(half_tangent))
 
 
 def get_camera_position(view: CameraView) -> Float64Array:
@@ -511,11 +569,7 @@ def _list_range_remarks(
         views: positions and directions of its camera, at least one.
     """
     limits = [find_valid_range(surroundings, view) for view in views]
-    views_beyond = [
-        view
-        for view, (max_distance, max_height) in zip(views, limits, strict=True)
-        if view.distance > max_distance or view.height > max_height
-    ]
+    views_beyond = _select_views_beyond(views, limits)
     if not views_beyond:
         return ()
     unit = "m" if scene.object.size_in_metres is not None else "object sizes"
@@ -529,6 +583,17 @@ def _list_range_remarks(
         "around is more than twice too large or too high, or the ground ends in sight: "
         "predictions from there are about the picture, not about a real place",
     )
+
+
+def _select_views_beyond(
+    views: Sequence[CameraView], limits: Sequence[tuple[float, float]]
+) -> list[CameraView]:
+    """Return the views that are beyond their largest distance or height."""
+    return [
+        view
+        for view, (max_distance, max_height) in zip(views, limits, strict=True)
+        if view.distance > max_distance or view.height > max_height
+    ]
 
 
 def _describe_limits(limits: Sequence[tuple[float, float]], unit: str) -> str:
@@ -577,23 +642,36 @@ def list_outside_remarks(
         (axis, limits) for axis, limits in place.file.valid if limits is not None
     ]
     positions = np.array([get_camera_position(view) for view in views])
-    is_outside = np.zeros(len(views), bool)
-    for axis, (lower, upper) in axis_limits:
-        coordinate = positions[:, "xyz".index(axis)]
-        is_outside |= (coordinate < lower) | (coordinate > upper)
+    is_outside = _find_outside(positions, axis_limits)
     if not is_outside.any():
         return ()
     box = " and ".join(
         f"{axis} {lower:g} to {upper:g} m" for axis, (lower, upper) in axis_limits
     )
-    first_position = _describe_position(positions[int(is_outside.argmax())])
-    outside_views = f"the camera is outside, at {first_position}"
-    if len(views) > 1:
-        outside_views = (
-            f"{100.0 * is_outside.mean():.0f} % of the views are outside, the "
-            f"first at {first_position}"
-        )
+    outside_views = _describe_outside_views(positions, is_outside)
     return (
         f"{scene.environment_name}: the place holds for a camera at {box} from the "
         f"object; {outside_views}. Predictions from there are not about a real place",
+    )
+
+
+def _find_outside(
+    positions: Float64Array, axis_limits: Sequence[tuple[str, tuple[float, float]]]
+) -> BoolArray:
+    """Return which positions (N, 3) are outside of limits along named axes."""
+    is_outside = np.zeros(len(positions), bool)
+    for axis, (lower, upper) in axis_limits:
+        coordinate = positions[:, "xyz".index(axis)]
+        is_outside |= (coordinate < lower) | (coordinate > upper)
+    return is_outside
+
+
+def _describe_outside_views(positions: Float64Array, is_outside: BoolArray) -> str:
+    """Return a clause about the cameras, at positions (N, 3), that are outside."""
+    first_position = _describe_position(positions[int(is_outside.argmax())])
+    if len(positions) == 1:
+        return f"the camera is outside, at {first_position}"
+    return (
+        f"{100.0 * is_outside.mean():.0f} % of the views are outside, the "
+        f"first at {first_position}"
     )

@@ -141,12 +141,24 @@ def make_candela_table(kind: str) -> Float32Array:
         np.degrees(np.arctan(side_tangent)),
         np.degrees(np.arctan2(up_tangent, np.hypot(1.0, side_tangent))),
     )
-    # 0.2 of half the width is a tenth of the width
     fade = np.minimum(
-        (TABLE_HALF_WIDTH - np.abs(side_tangent)) / (0.2 * TABLE_HALF_WIDTH),
-        (half_height - np.abs(up_tangent)) / (0.2 * half_height),
+        _compute_border_fade(side_tangent, TABLE_HALF_WIDTH),
+        _compute_border_fade(up_tangent, half_height),
     )
     return np.asarray(candela * fade.clip(0.0, 1.0), np.float32)
+
+
+def _compute_border_fade(tangent: Float64Array, half_size: float) -> Float64Array:
+    """Return factors that fall to 0 in the outer tenth at each border of a table.
+
+    Further inside they are above 1.
+
+    Args:
+        tangent: positions along one axis, from the middle of the table.
+        half_size: half the width or height of the table.
+    """
+    # 0.2 of half the size is a tenth of the size
+    return np.asarray((half_size - np.abs(tangent)) / (0.2 * half_size))
 
 
 def add_lamps(scene: AnyScene) -> AnyScene:
@@ -163,17 +175,7 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     other_parts = tuple(
         part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass))
     )
-    # "off", "low" or "high" beam of each car
-    kind_by_carrier = {
-        OBJECT: get_lamp_kind(scene, "object.lamps"),
-        CAMERA: get_lamp_kind(scene, "camera.lamps"),
-    }
-    for part in other_parts:
-        if isinstance(part, ThingPart):
-            kind_by_carrier[part.name] = part.lamps
-    kind_by_lit_carrier = {
-        carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS_OFF
-    }
+    kind_by_lit_carrier = _find_lit_carriers(scene, other_parts)
     if not kind_by_lit_carrier:
         had_lamps = len(other_parts) < len(scene.parts)
         return replace(scene, parts=other_parts) if had_lamps else scene
@@ -187,13 +189,40 @@ def add_lamps(scene: AnyScene) -> AnyScene:
     lamps: list[ScenePart] = []
     for carrier, kind in kind_by_lit_carrier.items():
         lamps += _make_lamps(scene, carrier, kind, radiance_unit, weight)
+    _check_lamp_names(other_parts, lamps)
+    return replace(scene, parts=(*other_parts, *lamps))
+
+
+def _find_lit_carriers(
+    scene: SceneData, other_parts: Sequence[ScenePart]
+) -> dict[str, str]:
+    """Return the beam, "low" or "high", of each car whose lamps are on, by its name.
+
+    `other_parts` are all parts but lamps.
+    """
+    # "off", "low" or "high" beam of each car
+    kind_by_carrier = {
+        OBJECT: get_lamp_kind(scene, "object.lamps"),
+        CAMERA: get_lamp_kind(scene, "camera.lamps"),
+    }
+    for part in other_parts:
+        if isinstance(part, ThingPart):
+            kind_by_carrier[part.name] = part.lamps
+    return {
+        carrier: kind for carrier, kind in kind_by_carrier.items() if kind != LAMPS_OFF
+    }
+
+
+def _check_lamp_names(
+    other_parts: Sequence[ScenePart], lamps: Sequence[ScenePart]
+) -> None:
+    """Raise InputError if another part has the name of a lamp."""
     duplicates = {part.name for part in other_parts} & {lamp.name for lamp in lamps}
     if duplicates:
         raise InputError(
             f"things: lamps of the scene are called {', '.join(sorted(duplicates))}; "
             "give yours another name="
         )
-    return replace(scene, parts=(*other_parts, *lamps))
 
 
 def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
@@ -206,9 +235,7 @@ def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
     Raises InputError: the environment's light has no unit, or the object's size in
     metres is not known.
     """
-    # the setting that switched the lamps on, for the message; all other cars are things
-    setting_by_carrier = {OBJECT: "`set` object.lamps", CAMERA: "`set` camera.lamps"}
-    setting = setting_by_carrier.get(carrier, "things: lamps")
+    setting = _name_lamp_setting(carrier)
     radiance_unit = None if scene.environment is None else scene.environment.candelas
     if radiance_unit is None:
         raise InputError(
@@ -223,6 +250,15 @@ def _get_radiance_unit(scene: SceneData, carrier: str) -> float:
             "such as `size=4.5`"
         )
     return radiance_unit
+
+
+def _name_lamp_setting(carrier: str) -> str:
+    """Return what switches on the lamps of a car, for messages.
+
+    Cars other than the object and the camera's own are things.
+    """
+    setting_by_carrier = {OBJECT: "`set` object.lamps", CAMERA: "`set` camera.lamps"}
+    return setting_by_carrier.get(carrier, "things: lamps")
 
 
 def get_lamp_kind(scene: SceneData, setting: str) -> str:
@@ -261,20 +297,10 @@ def _make_lamps(
         front_power = HEADLAMP_CANDELA / radiance_unit * WHITE
         rear_power = TAILLAMP_CANDELA / radiance_unit * RED
         headlamp_glass = _make_glass(
-            part,
-            "headlamps",
-            facing=1.0,
-            units_per_metre=units_per_metre,
-            power=front_power,
+            part, "headlamps", 1.0, units_per_metre, front_power
         )
         yield headlamp_glass
-        yield _make_glass(
-            part,
-            "taillamps",
-            facing=-1.0,
-            units_per_metre=units_per_metre,
-            power=rear_power,
-        )
+        yield _make_glass(part, "taillamps", -1.0, units_per_metre, rear_power)
         positions = _find_beam_positions(headlamp_glass.mesh.vertices, units_per_metre)
     yield from _make_beams(scene, carrier, kind, positions, radiance_unit, weight)
 
@@ -389,42 +415,63 @@ def _make_glass(
             straight ahead.
     """
     mesh = part.mesh
-    named_faces = [
-        faces
-        for name, faces in mesh.materials.items()
-        if MATERIAL_NAMES[lamp_type].search(name) and len(faces)
-    ]
-    if named_faces:
-        glass = _lift_faces(
-            mesh, np.concatenate(named_faces), GLASS_OFFSET * units_per_metre
-        )
-    else:
-        glass = _make_disks(mesh, lamp_type, facing, units_per_metre)
-    corners_in_metres = glass.vertices[glass.faces] / units_per_metre
-    # (F,) square meters of each face for a viewer straight ahead, below 0 if it faces
-    # the other way. An area vector is along the normal, with twice the area as length.
-    facing_area = facing * compute_area_vectors(corners_in_metres)[:, 0] / 2.0
-    glass_mesh = Mesh(
-        vertices=glass.vertices.astype(np.float32),
-        faces=glass.faces.astype(np.uint32),
-        normals=glass.normals.astype(np.float32),
-        uvs=mesh.uvs[glass.vertex_of_carrier],
-    )
+    glass = _shape_glass(mesh, lamp_type, facing, units_per_metre)
     # The base color has the light's color, with 0.8 as its largest channel: no surface
     # reflects all light.
     glass_color = (0.8 * power / power.max()).astype(np.float32)
-    # The visible area is that of both lamps, so that the power of one is doubled.
-    visible_area = float(facing_area.clip(0.0).sum())
-    radiance = 2.0 * power / max(visible_area, 1e-9)
+    radiance = 2.0 * power / _measure_visible_area(glass, facing, units_per_metre)
     return LampGlass(
         name=f"{part.name}-{lamp_type}",
-        mesh=glass_mesh,
+        mesh=_make_glass_mesh(glass, mesh),
         base_color=np.tile(glass_color, (2, 2, 1)),
         material=GLASS_MATERIAL,
         emission=radiance.astype(np.float32)[None, None],
         carrier=part.name,
         vertex_of_carrier=glass.vertex_of_carrier,
         face_of_carrier=glass.face_of_carrier,
+    )
+
+
+def _shape_glass(
+    mesh: Mesh, lamp_type: str, facing: float, units_per_metre: float
+) -> _Glass:
+    """Return the shape of the glass of a car's lamps; the arguments are
+    `_make_glass`'s.
+
+    `mesh` is that of the car.
+    """
+    named_faces = [
+        faces
+        for name, faces in mesh.materials.items()
+        if MATERIAL_NAMES[lamp_type].search(name) and len(faces)
+    ]
+    if not named_faces:
+        return _make_disks(mesh, lamp_type, facing, units_per_metre)
+    faces = np.concatenate(named_faces)
+    return _lift_faces(mesh, faces, GLASS_OFFSET * units_per_metre)
+
+
+def _measure_visible_area(
+    glass: _Glass, facing: float, units_per_metre: float
+) -> float:
+    """Return the area of glass, square meters, for a viewer straight ahead of it.
+
+    It is that of both lamps, and at least 1e-9.
+    """
+    corners_in_metres = glass.vertices[glass.faces] / units_per_metre
+    # (F,) square meters of each face for a viewer straight ahead, below 0 if it faces
+    # the other way. An area vector is along the normal, with twice the area as length.
+    facing_area = facing * compute_area_vectors(corners_in_metres)[:, 0] / 2.0
+    return max(float(facing_area.clip(0.0).sum()), 1e-9)
+
+
+def _make_glass_mesh(glass: _Glass, car_mesh: Mesh) -> Mesh:
+    """Return the mesh of glass, with texture coordinates of its car's mesh."""
+    return Mesh(
+        vertices=glass.vertices.astype(np.float32),
+        faces=glass.faces.astype(np.uint32),
+        normals=glass.normals.astype(np.float32),
+        uvs=car_mesh.uvs[glass.vertex_of_carrier],
     )
 
 
@@ -464,25 +511,55 @@ def _make_disks(
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [facing, 1.0, 1.0]
     lower = corners.min(axis=(0, 1))
     upper = corners.max(axis=(0, 1))
-    height, height_fraction = LAMP_HEIGHTS[lamp_type]  # meters, and of the car's height
     width = upper[1] - lower[1]
     # A disk is at most a fifth as wide as the car.
     rim_offsets = min(LAMP_RADIUS * units_per_metre, 0.1 * width) * _make_circle(facing)
-    # the lower one of both heights, above the lowest point
-    center_z = lower[2] + min(
-        height * units_per_metre, height_fraction * (upper[2] - lower[2])
-    )
+    body_height = upper[2] - lower[2]
+    center_z = lower[2] + _find_lamp_height(lamp_type, body_height, units_per_metre)
+    gap = GLASS_OFFSET * units_per_metre
     disks = list[Float64Array]()
     for side in (1.0, -1.0):
         center_y = (lower[1] + upper[1]) / 2.0 + side * LAMP_OFFSET * width
-        # The disk lies in the plane x = 0 until it is moved in front of the body.
         center = np.array([0.0, center_y, center_z])
-        disk_vertices = np.concatenate([[center], center + rim_offsets])
-        body_x = _find_foremost_x(corners, disk_vertices, default=upper[0])
-        # `facing` mirrors the disks of tail lamps back to the rear.
-        disk_vertices[:, 0] = facing * (body_x + GLASS_OFFSET * units_per_metre)
-        disks.append(disk_vertices)
+        disks.append(_make_disk(corners, center + rim_offsets, center, facing, gap))
     return _attach_disks(mesh, disks, facing)
+
+
+def _find_lamp_height(
+    lamp_type: str, body_height: float, units_per_metre: float
+) -> float:
+    """Return the height of lamps above a car's lowest point, in the car's coordinates.
+
+    Args:
+        lamp_type: "headlamps" or "taillamps", a key of `LAMP_HEIGHTS`.
+        body_height: height of the car.
+        units_per_metre: length of a metre.
+    """
+    metres, fraction_of_body = LAMP_HEIGHTS[lamp_type]
+    return min(metres * units_per_metre, fraction_of_body * body_height)
+
+
+def _make_disk(
+    corners: Float64Array,
+    rim: Float64Array,
+    center: Float64Array,
+    facing: float,
+    gap: float,
+) -> Float64Array:
+    """Return the vertices of a disk in front of a car's body: its center, then its rim.
+
+    Args:
+        corners: (F, 3, 3) of the car's faces, mirrored for tail lamps.
+        rim, center: (N, 3) and (3,) points of the disk, at x = 0 until it is moved.
+        facing: 1 for lamps that shine along +x, -1 along -x.
+        gap: distance in front of the body.
+    """
+    disk_vertices = np.concatenate([[center], rim])
+    foremost = corners[..., 0].max()
+    body_x = _find_foremost_x(corners, disk_vertices, default=foremost)
+    # `facing` mirrors the disks of tail lamps back to the rear.
+    disk_vertices[:, 0] = facing * (body_x + gap)
+    return disk_vertices
 
 
 def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _Glass:
@@ -501,18 +578,26 @@ def _attach_disks(mesh: Mesh, disks: Sequence[Float64Array], facing: float) -> _
     # The vertices of the second disk follow those of the first.
     faces = np.concatenate([disk_faces, (1 + N_SPOKES) + disk_faces])
     normals = np.tile([[facing, 0.0, 0.0]], (len(vertices), 1))
-    # A query returns the distances to the nearest points, and their indices.
-    _distances, nearest_vertex = cKDTree(mesh.vertices).query(vertices)
     car_face_centers = mesh.vertices[mesh.faces].mean(axis=1)
     disk_face_centers = vertices[faces].mean(axis=1)
-    _distances, nearest_face = cKDTree(car_face_centers).query(disk_face_centers)
     return _Glass(
         vertices,
         faces,
         normals,
-        vertex_of_carrier=nearest_vertex,
-        face_of_carrier=nearest_face,
+        vertex_of_carrier=_find_nearest_indices(vertices, mesh.vertices),
+        face_of_carrier=_find_nearest_indices(disk_face_centers, car_face_centers),
     )
+
+
+def _find_nearest_indices(
+    queries: Float64Array, points: Float32Array | Float64Array
+) -> IntArray:
+    """Return for each of (N, 3) queries the index (N,) of the nearest of some points.
+
+    `points` are (M, 3).
+    """
+    _distances, indices = cKDTree(points).query(queries)
+    return np.asarray(indices)
 
 
 def _make_circle(facing: float) -> Float64Array:

@@ -22,7 +22,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.scene.assets import Float32Array, Float64Array
+from advsearch.scene.assets import BoolArray, Float32Array, Float64Array
 
 BLOCK = 16  # side of the blocks in which noise is measured, pixels
 QUIET_FRACTION = 0.25  # fraction of the blocks with less noise than the result
@@ -54,21 +54,27 @@ def measure_noise(levels: npt.NDArray[np.uint8]) -> Float64Array:
     """
     sigmas = []
     for channel in range(levels.shape[2]):
-        values = levels[..., channel].astype(np.float64)
-        # The filter reaches beyond the image at its outermost pixels, which are left
-        # out.
-        residual = np.abs(ndimage.convolve(values, RESIDUAL)[1:-1, 1:-1])
-        is_clipped = ((values == 0.0) | (values == 255.0))[1:-1, 1:-1]
-        block_residuals = _split_blocks(residual)  # (blocks, pixels)
-        clipped_fraction = _split_blocks(is_clipped).mean(axis=1)
-        usable_blocks = block_residuals[clipped_fraction <= MAX_CLIPPED]
-        sigma = 0.0
-        if len(usable_blocks):
-            medians = np.median(usable_blocks, axis=1)
-            sigma = MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
+        sigma = _measure_channel_noise(levels[..., channel].astype(np.float64))
         # The variance that rounding to integer levels adds is subtracted.
         sigmas.append(np.sqrt(max(0.0, sigma**2 - ROUNDING_VARIANCE)))
     return np.array(sigmas)
+
+
+def _measure_channel_noise(values: Float64Array) -> float:
+    """Return the standard deviation of the noise of one channel (H, W), in levels.
+
+    It contains the noise of rounding. It is 0 if too much of the image is clipped.
+    """
+    # The filter reaches beyond the image at its outermost pixels, which are left out.
+    residual = np.abs(ndimage.convolve(values, RESIDUAL)[1:-1, 1:-1])
+    is_clipped = ((values == 0.0) | (values == 255.0))[1:-1, 1:-1]
+    block_residuals = _split_blocks(residual)  # (blocks, pixels)
+    clipped_fraction = _split_blocks(is_clipped).mean(axis=1)
+    usable_blocks = block_residuals[clipped_fraction <= MAX_CLIPPED]
+    if not len(usable_blocks):
+        return 0.0
+    medians = np.median(usable_blocks, axis=1)
+    return MEDIAN_TO_SIGMA * float(np.quantile(medians, QUIET_FRACTION))
 
 
 def _split_blocks(image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
@@ -121,26 +127,41 @@ def _measure_edges(image: Float64Array) -> float | None:
     column_slope = np.abs(ndimage.gaussian_filter(image, NARROW, order=(0, 1)))
     narrow_slope = np.hypot(row_slope, column_slope)
     wide_slope = ndimage.gaussian_gradient_magnitude(image, WIDE)
-    # Only the steepest pixel across an edge is used.
-    is_steepest_in_column = narrow_slope >= ndimage.maximum_filter(
-        narrow_slope, size=(3, 1)
-    )
-    is_steepest_in_row = narrow_slope >= ndimage.maximum_filter(
-        narrow_slope, size=(1, 3)
-    )
-    is_edge_along_row = row_slope > column_slope  # it changes from row to row
-    is_edge = np.where(is_edge_along_row, is_steepest_in_column, is_steepest_in_row)
+    is_edge = _find_steepest(narrow_slope, row_slope, column_slope)
     # Weak edges are left out. The quantile estimates the steepest slope of the image,
     # without outliers.
     is_edge &= narrow_slope > MIN_SLOPE * float(np.quantile(narrow_slope, 0.995))
-    # Within this margin the filters reach beyond the border of the image.
-    margin = int(3 * WIDE)
-    is_inside = np.zeros_like(is_edge)
-    is_inside[margin:-margin, margin:-margin] = True
-    is_edge &= is_inside
+    is_edge &= _find_interior(narrow_slope.shape)
     if is_edge.sum() < MIN_EDGES:
         return None
     ratio = (narrow_slope[is_edge] / np.maximum(wide_slope[is_edge], 1e-12)) ** 2
+    return _compute_blur_of_edges(ratio)
+
+
+def _find_steepest(
+    slope: Float64Array, row_slope: Float64Array, column_slope: Float64Array
+) -> BoolArray:
+    """Return the steepest pixels (H, W) across edges, by the slope of an image (H, W).
+
+    The last two arguments are the components of the slope.
+    """
+    is_steepest_in_column = slope >= ndimage.maximum_filter(slope, size=(3, 1))
+    is_steepest_in_row = slope >= ndimage.maximum_filter(slope, size=(1, 3))
+    is_edge_along_row = row_slope > column_slope  # it changes from row to row
+    steepest = np.where(is_edge_along_row, is_steepest_in_column, is_steepest_in_row)
+    return np.asarray(steepest)
+
+
+def _find_interior(shape: tuple[int, ...]) -> BoolArray:
+    """Return the pixels (H, W) whose filters do not reach beyond an image's border."""
+    margin = int(3 * WIDE)
+    is_inside = np.zeros(shape, bool)
+    is_inside[margin:-margin, margin:-margin] = True
+    return is_inside
+
+
+def _compute_blur_of_edges(ratio: Float64Array) -> float:
+    """Return the blur of the sharper edges by squared ratios (N,) of slopes."""
     # An edge blurred by s has the ratio (s^2 + WIDE^2) / (s^2 + NARROW^2). It is at
     # most (WIDE / NARROW)^2, for s = 0. For a very blurred edge it goes to 1, where the
     # solution for s^2 would be infinite: hence 1.01.
@@ -163,20 +184,35 @@ def _calibrate() -> tuple[Float64Array, Float64Array]:
     blurs = np.arange(0.0, MAX_BLUR + 0.1, 0.25)  # up to and including `MAX_BLUR`
     measured_blurs = np.zeros(len(blurs))
     for angle in np.radians(CALIBRATION_ANGLES):
-        is_bright = grid[None] * np.cos(angle) + grid[:, None] * np.sin(angle) > 0.0
-        pixels = is_bright.reshape(size, oversampling, size, oversampling).mean(
-            axis=(1, 3)
-        )
+        pixels = _render_edge(grid, angle, oversampling)
         for index, blur in enumerate(blurs):
-            image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
-            measured_blur = _measure_edges(image)
-            assert (
-                measured_blur is not None
-            )  # an edge across the image has enough pixels
+            measured_blur = _measure_added_blur(pixels, blur)
             measured_blurs[index] += measured_blur / len(CALIBRATION_ANGLES)
     # An interpolation needs strictly rising values: equal ones get tiny differences.
     tiny_steps = 1e-9 * np.arange(len(blurs))
     return blurs, np.maximum.accumulate(measured_blurs + tiny_steps)
+
+
+def _measure_added_blur(pixels: Float64Array, blur: float) -> float:
+    """Return what `_measure_edges` returns for an edge (H, W) that is blurred."""
+    image = ndimage.gaussian_filter(pixels, blur) if blur else pixels
+    measured_blur = _measure_edges(image)
+    assert measured_blur is not None  # an edge across the image has enough pixels
+    return measured_blur
+
+
+def _render_edge(grid: Float64Array, angle: float, oversampling: int) -> Float64Array:
+    """Return an image of a straight edge, averaged over pixels.
+
+    Args:
+        grid: coordinates of the samples, along both axes.
+        angle: angle of the edge, radians.
+        oversampling: samples along each side of a pixel.
+    """
+    is_bright = grid[None] * np.cos(angle) + grid[:, None] * np.sin(angle) > 0.0
+    size = len(grid) // oversampling
+    samples = is_bright.reshape(size, oversampling, size, oversampling)
+    return np.asarray(samples.mean(axis=(1, 3)))
 
 
 def blur_image(image: Tensor, sigma: float) -> Tensor:

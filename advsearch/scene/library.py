@@ -25,6 +25,8 @@ from advsearch.scene.assets import (
     BoolArray,
     EnvironmentAsset,
     Float32Array,
+    Float64Array,
+    IntArray,
     Material,
     Mesh,
     ObjectAsset,
@@ -55,16 +57,7 @@ def make_finished_surface(
     Returns:
         A dictionary as `ObjectAsset.surface` has it.
     """
-    face_values = np.tile(
-        [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
-    )
-    for name, finish in finishes.items():
-        face_indices = mesh.materials[name]
-        face_values[face_indices] = (
-            finish.roughness,
-            finish.metallic,
-            finish.clearcoat,
-        )
+    face_values = _tabulate_finishes(mesh, finishes, main)
     face_of_texel = rasterize_charts(mesh, MATERIAL_MAP_SIDE).face_index
     texel_values = face_values[face_of_texel].astype(np.float32)
     surface: dict[str, object] = {
@@ -76,13 +69,38 @@ def make_finished_surface(
     # in the order of the face values
     for channel, name in enumerate(("roughness", "metallic", "clearcoat")):
         texel_channel = texel_values[:, :, channel : channel + 1]
-        surface[name] = {
-            "type": "bitmap",
-            "bitmap": texel_channel,
-            "raw": True,
-            "filter_type": "nearest",
-        }
+        surface[name] = _make_sharp_bitmap(texel_channel)
     return {"type": "twosided", "bsdf": surface}
+
+
+def _tabulate_finishes(
+    mesh: Mesh, finishes: Mapping[str, Material], main: Material
+) -> Float64Array:
+    """Return roughness, metallic and clear coat (F, 3) of each face of a mesh.
+
+    The arguments are those of `make_finished_surface`.
+    """
+    face_values = np.tile(
+        [main.roughness, main.metallic, main.clearcoat], (len(mesh.faces), 1)
+    )
+    for name, finish in finishes.items():
+        face_indices = mesh.materials[name]
+        face_values[face_indices] = (
+            finish.roughness,
+            finish.metallic,
+            finish.clearcoat,
+        )
+    return face_values
+
+
+def _make_sharp_bitmap(texels: Float32Array) -> dict[str, object]:
+    """Return Mitsuba's texture of texels (h, w, 1) that are not interpolated."""
+    return {
+        "type": "bitmap",
+        "bitmap": texels,
+        "raw": True,
+        "filter_type": "nearest",
+    }
 
 
 if TYPE_CHECKING:
@@ -147,40 +165,49 @@ def load_object(name: str) -> ObjectAsset:
         FileFormatError: the installation is damaged.
         UnknownNameError: there is no such object.
     """
-    import imageio.v3 as iio  # most scenes need no such file
-
     known_names = list_objects()
     if name not in known_names:
         raise UnknownNameError("object", name, known_names, OBJECT_HINT)
     directory = _get_data_directory() / "objects" / name
     try:
-        facts = json.loads((directory / "object.json").read_text("utf-8"))
-        mesh = _read_mesh(name, directory, facts.get("faces", ()))
-        content = (directory / "base_color.png").read_bytes()
-        levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
-        material = Material(**facts["material"])
-        finishes = {
-            finish: Material(**values)
-            for finish, values in facts.get("finishes", {}).items()
-        }
-        return ObjectAsset(
-            name=name,
-            mesh=mesh,
-            base_color=levels.astype(np.float32) / np.float32(255.0),
-            material=material,
-            label=facts["label"],
-            source=BUNDLED_OBJECT,
-            surface=make_finished_surface(mesh, finishes, material)
-            if finishes
-            else None,
-            finishes=finishes,
-            size_in_metres=facts["metres"],
-            drives=facts.get("drives", False),
-        )
+        return _read_object(name, directory)
     except (OSError, ValueError, KeyError, TypeError, FileFormatError) as error:
         raise FileFormatError(
             f"bundled object {name!r} cannot be read ({error}); reinstall advsearch"
         ) from error
+
+
+def _read_object(name: str, directory: Traversable) -> ObjectAsset:
+    """Return a bundled object from the directory of its files."""
+    facts = json.loads((directory / "object.json").read_text("utf-8"))
+    mesh = _read_mesh(name, directory, facts.get("faces", ()))
+    base_color = _read_base_color(directory)
+    material = Material(**facts["material"])
+    finish_values = facts.get("finishes", {})
+    finishes = {name: Material(**values) for name, values in finish_values.items()}
+    surface = make_finished_surface(mesh, finishes, material) if finishes else None
+    return ObjectAsset(
+        name=name,
+        mesh=mesh,
+        base_color=base_color,
+        material=material,
+        label=facts["label"],
+        source=BUNDLED_OBJECT,
+        surface=surface,
+        finishes=finishes,
+        size_in_metres=facts["metres"],
+        drives=facts.get("drives", False),
+    )
+
+
+def _read_base_color(directory: Traversable) -> Float32Array:
+    """Return the base color (H, W, 3) of a bundled object, in [0, 1]."""
+    import imageio.v3 as iio  # most scenes need no such file
+
+    content = (directory / "base_color.png").read_bytes()
+    levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
+    base_color: Float32Array = levels.astype(np.float32) / np.float32(255.0)
+    return base_color
 
 
 def _read_mesh(
@@ -194,15 +221,6 @@ def _read_mesh(
         material_runs: in the order of the faces, a material's name and how many
             successive faces have it. It is empty if the mesh has no named materials.
     """
-    # (F,) name of each face's material
-    material_of_face = np.repeat(
-        [material for material, _ in material_runs],
-        [count for _, count in material_runs],
-    )
-    materials = {
-        str(material): np.nonzero(material_of_face == material)[0]
-        for material in dict.fromkeys(material_of_face)
-    }
     elements, _ = read_elements((directory / "mesh.ply").read_bytes(), Notes(name))
     columns = elements["vertex"].scalars
     faces = elements["face"].lists["vertex_indices"].values
@@ -216,9 +234,25 @@ def _read_mesh(
         faces.reshape(-1, 3).astype(np.uint32),
         normals,
         uvs,
-        materials=materials,
+        materials=_group_faces(material_runs),
         rig=make_person() if has_body else None,
     )
+
+
+def _group_faces(material_runs: Sequence[tuple[str, int]]) -> dict[str, IntArray]:
+    """Return the indices of the faces of each material, by its name.
+
+    The argument is that of `_read_mesh`.
+    """
+    # (F,) name of each face's material
+    material_of_face = np.repeat(
+        [material for material, _ in material_runs],
+        [count for _, count in material_runs],
+    )
+    return {
+        str(material): np.nonzero(material_of_face == material)[0]
+        for material in dict.fromkeys(material_of_face)
+    }
 
 
 def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
@@ -248,10 +282,21 @@ def load_environment(name: str) -> EnvironmentAsset:
     if name not in known_names:
         raise UnknownNameError("environment", name, known_names, MAP_HINT)
     facts = _read_environment_facts()[name]
+    radiance = _read_map(name, facts.get("map", name))
+    ground = facts.get("ground")
+    candelas = facts.get("candelas")  # luminance of a radiance of 1, cd/m2
+    return EnvironmentAsset(
+        name, radiance, source=BUNDLED_ENVIRONMENT, ground=ground, candelas=candelas
+    )
+
+
+def _read_map(name: str, map_name: str) -> Float32Array:
+    """Return the map (H, W, 3) of a bundled environment, which others may share.
+
+    Raises FileFormatError: the installation is damaged.
+    """
     try:
-        # An environment has a map of its own, or that of another.
-        map_file = f"{facts.get('map', name)}.exr"
-        content = (_get_data_directory() / "environments" / map_file).read_bytes()
+        content = _get_map_file(map_name).read_bytes()
         planes, _notes = read_exr(Path(name), content)  # red, green and blue
         radiance: Float32Array = np.stack(planes, axis=2).astype(np.float32)
     except (OSError, FileFormatError) as error:
@@ -259,11 +304,12 @@ def load_environment(name: str) -> EnvironmentAsset:
             f"bundled environment {name!r} cannot be read ({error}); "
             "reinstall advsearch"
         ) from error
-    ground = facts.get("ground")
-    candelas = facts.get("candelas")  # luminance of a radiance of 1, cd/m2
-    return EnvironmentAsset(
-        name, radiance, source=BUNDLED_ENVIRONMENT, ground=ground, candelas=candelas
-    )
+    return radiance
+
+
+def _get_map_file(map_name: str) -> Traversable:
+    """Return the file of a bundled map."""
+    return _get_data_directory() / "environments" / f"{map_name}.exr"
 
 
 # ---- Environments from pictures: ``--environment path.hdr|.exr``, equirectangular maps
@@ -327,6 +373,18 @@ def read_light(path: Path, label: str = "environment") -> LightImage:
     return LightImage(size=planes[0].shape, read_rows=read_rows, notes=tuple(notes))
 
 
+# values that a map may not have: a name, a test of a plane's texels, and a remedy
+_BAD_RADIANCES: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
+    ("NaN", np.isnan, "paint them over"),
+    (
+        "infinite",
+        np.isinf,
+        "clamp them, or save the map in 32-bit floats if half floats overflowed",
+    ),
+    ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
+)
+
+
 def _check_planes(path: Path, planes: Sequence[Plane]) -> None:
     """Check the radiance of an ``.exr`` image.
 
@@ -335,25 +393,26 @@ def _check_planes(path: Path, planes: Sequence[Plane]) -> None:
 
     Raises InputError: a texel is NaN, infinite or negative in one of its three planes.
     """
-    kinds: tuple[tuple[str, Callable[[Plane], BoolArray], str], ...] = (
-        ("NaN", np.isnan, "paint them over"),
-        (
-            "infinite",
-            np.isinf,
-            "clamp them, or save the map in 32-bit floats if half floats overflowed",
-        ),
-        ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
-    )
-    for kind, is_bad, remedy in kinds:
+    for kind, is_bad, remedy in _BAD_RADIANCES:
         bad_texels = is_bad(planes[0]) | is_bad(planes[1]) | is_bad(planes[2])
         if bad_texels.any():
-            row, column = np.unravel_index(int(bad_texels.argmax()), bad_texels.shape)
-            value = ", ".join(f"{float(plane[row, column]):.4g}" for plane in planes)
             raise InputError(
                 f"{path}: expected finite radiance of at least 0, got "
-                f"{int(bad_texels.sum())} of {bad_texels.size} texels"
-                f" {kind} (the first in row {row}, column {column}: {value}); {remedy}"
+                f"{_describe_bad_texels(planes, bad_texels, kind)}; {remedy}"
             )
+
+
+def _describe_bad_texels(planes: Sequence[Plane], is_bad: BoolArray, kind: str) -> str:
+    """Return how many texels (H, W) of three planes are bad, and the first of them.
+
+    `kind` is what they are, such as "NaN".
+    """
+    row, column = np.unravel_index(int(is_bad.argmax()), is_bad.shape)
+    value = ", ".join(f"{float(plane[row, column]):.4g}" for plane in planes)
+    return (
+        f"{int(is_bad.sum())} of {is_bad.size} texels"
+        f" {kind} (the first in row {row}, column {column}: {value})"
+    )
 
 
 def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
@@ -375,13 +434,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     file = Path(path)
     light_image = read_light(file)
     notes = [f"{file.name}: {note}" for note in light_image.notes]
-    height, width = light_image.size
-    # one percent: a map of odd size may miss it by a row
-    if abs(width / (2 * height) - 1.0) > 0.01:
-        notes.append(
-            f"{file.name}: expected a map twice as wide as high, got {width} "
-            f"x {height}; it appears stretched"
-        )
+    notes += _describe_stretch(file.name, light_image.size)
     radiance = _resize_map(light_image.read_rows, light_image.size)
     if not radiance.any():
         notes.append(
@@ -396,6 +449,18 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     )
 
 
+def _describe_stretch(name: str, size: tuple[int, int]) -> list[str]:
+    """Return a note if a map of a height and a width is not twice as wide as high."""
+    height, width = size
+    # one percent: a map of odd size may miss it by a row
+    if abs(width / (2 * height) - 1.0) <= 0.01:
+        return []
+    return [
+        f"{name}: expected a map twice as wide as high, got {width} "
+        f"x {height}; it appears stretched"
+    ]
+
+
 def _resize_map(
     read_rows: Callable[[int, int], Float32Array], size: tuple[int, int]
 ) -> Float32Array:
@@ -408,13 +473,7 @@ def _resize_map(
         read_rows: returns the rows (n, W, 3) from a first row to an end.
         size: height and width of the map.
     """
-    height, width = size
-    shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
-    if shrink == 1.0:
-        texels = read_rows(0, height)
-    else:
-        target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
-        texels = _average_map(read_rows, size, target_shape)
+    texels = _shrink_map(read_rows, size)
     # how often a texel is repeated along each side; 1 for a map that is large enough
     row_repeats = math.ceil(MIN_MAP_SIZE[0] / texels.shape[0])
     column_repeats = math.ceil(MIN_MAP_SIZE[1] / texels.shape[1])
@@ -422,6 +481,21 @@ def _resize_map(
         texels.repeat(row_repeats, axis=0).repeat(column_repeats, axis=1),
         dtype=np.float32,
     )
+
+
+def _shrink_map(
+    read_rows: Callable[[int, int], Float32Array], size: tuple[int, int]
+) -> Float32Array:
+    """Return a map, averaged down to `MAX_MAP_SIZE` if it is larger.
+
+    The arguments are those of `_resize_map`.
+    """
+    height, width = size
+    shrink = min(1.0, MAX_MAP_SIZE[0] / height, MAX_MAP_SIZE[1] / width)
+    if shrink == 1.0:
+        return read_rows(0, height)
+    target_shape = max(1, round(height * shrink)), max(1, round(width * shrink))
+    return _average_map(read_rows, size, target_shape)
 
 
 def _average_map(
@@ -439,12 +513,16 @@ def _average_map(
         size: height and width of the map.
         target_shape: height and width of the result.
     """
-    height = size[0]
-    polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(
-        np.pi / height
-    )
-    row_weights = np.sin(polar)[:, None, None]
+    row_weights = _compute_row_weights(size[0])[:, None, None]
     weighted_mean = average_in_bands(
         lambda top, end: read_rows(top, end) * row_weights[top:end], size, target_shape
     )
-    return np.asarray(weighted_mean / average_area(row_weights, target_shape[0], 1))
+    mean_weight = average_area(row_weights, height=target_shape[0], width=1)
+    return np.asarray(weighted_mean / mean_weight)
+
+
+def _compute_row_weights(height: int) -> Float32Array:
+    """Return weights (height,) of a map's rows, the sines of their angles to +z."""
+    step = np.float32(np.pi / height)
+    polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * step
+    return np.asarray(np.sin(polar))

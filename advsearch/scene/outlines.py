@@ -17,6 +17,8 @@ from torch import Tensor
 
 from advsearch.scene.assets import BoolArray, Float64Array
 from advsearch.scene.camera_model import EQUIRECTANGULAR
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world, project_points
 from advsearch.scene.raster import rasterize_triangles
 from advsearch.scene.renderer import Renderer
@@ -72,14 +74,31 @@ def find_visible_meshes(
         inputs = renderer.scene.input_assembler(renderer.space.inputs(u))
     visible = []
     for name in description.meshes if names is None else names:
-        if name not in surfaces.shape_names:
-            continue
-        mask = surfaces.visible_mask(name).numpy()
-        if mask.any():
-            fraction, is_truncated = _compare_outline(renderer, inputs, name, mask)
-            distance = float(surfaces.depth.numpy()[mask].min())
-            visible.append(VisibleMesh(name, mask, fraction, is_truncated, distance))
+        mesh = _find_visible_mesh(renderer, inputs, surfaces, name)
+        if mesh is not None:
+            visible.append(mesh)
     return visible
+
+
+def _find_visible_mesh(
+    renderer: Renderer, inputs: Mapping[str, Tensor], surfaces: Surfaces, name: str
+) -> VisibleMesh | None:
+    """Return what of a mesh is visible; None if it is the nearest surface in no pixel.
+
+    Args:
+        renderer: renderer of the scene.
+        inputs: inputs of the scene, assembled.
+        surfaces: first surface that the camera sees in each pixel.
+        name: name of the mesh.
+    """
+    if name not in surfaces.shape_names:
+        return None
+    mask = surfaces.visible_mask(name).numpy()
+    if not mask.any():
+        return None
+    fraction, is_truncated = _compare_outline(renderer, inputs, name, mask)
+    distance = float(surfaces.depth.numpy()[mask].min())
+    return VisibleMesh(name, mask, fraction, is_truncated, distance)
 
 
 def _compare_outline(
@@ -105,6 +124,15 @@ def _compare_outline(
     outline = _rasterise_outline(corners)
     if not outline.covers(mask):
         return None, None
+    return _measure_outline(outline, mask)
+
+
+def _measure_outline(outline: _Outline, mask: BoolArray) -> tuple[float, bool]:
+    """Return which fraction of an outline is visible, and whether it leaves the image.
+
+    `mask` (H, W) are the visible pixels.
+    """
+    height, width = mask.shape
     row, column = np.nonzero(outline.cells)
     x = outline.left + (column + 0.5) * outline.step
     y = outline.top + (row + 0.5) * outline.step
@@ -147,10 +175,8 @@ def _project_faces(
     description = renderer.scene.description_and_filter[0]
     part = description.meshes[name]
     vertices = renderer.scene.input_assembler.get_vertices(name, inputs)
-    default_camera = torch.from_numpy(camera_to_world(description, width / height))
-    camera = inputs.get("camera.to_world", default_camera).detach().double().cpu()
-    # in the camera's coordinates: left, up and ahead
-    points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
+    camera = _get_camera_pose(description, inputs, aspect=width / height)
+    points = _to_camera_points(vertices, camera)
     positions, is_before = project_points(
         description, _select_camera_inputs(inputs), points, size
     )
@@ -163,6 +189,25 @@ def _project_faces(
     # positions count from the center of the image
     center = (width / 2.0, height / 2.0)
     return np.asarray(positions.numpy()[faces.numpy()] + center)
+
+
+def _get_camera_pose(
+    description: SceneDescription, inputs: Mapping[str, Tensor], aspect: float
+) -> Tensor:
+    """Return the pose (4, 4) of the camera of inputs, or else that of the scene.
+
+    `aspect` is width over height of the image.
+    """
+    camera = inputs.get("camera.to_world")
+    if camera is None:
+        return torch.from_numpy(camera_to_world(description, aspect))
+    return camera
+
+
+def _to_camera_points(vertices: Tensor, camera: Tensor) -> Tensor:
+    """Return vertices (V, 3) in the axes of a camera (4, 4): left, up and ahead."""
+    camera = camera.detach().double().cpu()
+    return (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]
 
 
 @dataclass(frozen=True, eq=False)

@@ -438,18 +438,28 @@ def make_sphere(rows: int, columns: int) -> Mesh:
     u goes around from +x to +y. Vertices are in rows from the bottom, with columns + 1
     in each: the first and the last are at one position, where u is 0 and 1.
     """
-    v, u = (
-        array.ravel()
-        for array in np.meshgrid(
-            np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij"
-        )
-    )
+    v_steps = np.linspace(0, 1, rows + 1)
+    u_steps = np.linspace(0, 1, columns + 1)
+    v_grid, u_grid = np.meshgrid(v_steps, u_steps, indexing="ij")
+    v = v_grid.ravel()
+    u = u_grid.ravel()
     theta = math.pi * (1.0 - v)
     phi = 2.0 * math.pi * u
     normals = np.stack(
         [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)],
         axis=1,
     )
+    uvs = np.stack([u, v], axis=1)
+    return Mesh(
+        vertices=(0.5 * normals).astype(np.float32),
+        faces=_make_sphere_faces(rows, columns).astype(np.uint32),
+        normals=normals.astype(np.float32),
+        uvs=uvs.astype(np.float32),
+    )
+
+
+def _make_sphere_faces(rows: int, columns: int) -> IntArray:
+    """Return the faces (F, 3) of a sphere of cells, see `make_sphere`."""
     # the vertex at the lower left corner of each cell, and the one above it
     corner = (
         np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]
@@ -460,8 +470,4 @@ def make_sphere(rows: int, columns: int) -> Mesh:
     # without the lower faces of the first row and the upper faces of the last one, two
     # of whose corners are at a pole
     faces = np.concatenate([lower[columns:], upper[:-columns]])
-    vertices, outwards, uvs = (
-        array.astype(np.float32)
-        for array in (0.5 * normals, normals, np.stack([u, v], axis=1))
-    )
-    return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)
+    return np.asarray(faces, np.int64)

@@ -202,29 +202,15 @@ class Person:
                 of clothing; `bones` and `parents`.
             defaults: default values that replace those of `PARAMETERS`.
         """
-        default_by_name = {
-            parameter.name: float(parameter.default) for parameter in PARAMETERS
-        }
+        default_by_name = _get_defaults()
         self.data = data
         self.defaults = default_by_name | dict(defaults)
         self._bones = [str(bone) for bone in data["bones"]]
         self._parents = [int(parent) for parent in data["parents"]]
-        weight_sums = data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
-        self._tensors = {
-            "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
-            "basis": torch.from_numpy(data["basis"].astype(np.float32)),
-            "weights": torch.from_numpy(data["weights"] / weight_sums),
-            "index": torch.from_numpy(data["index"].astype(np.int64)),
-        } | {
-            name: torch.from_numpy(data[name]) for name in ("shares", "stature", "mass")
-        }
-        # Points of the left and of the right shoe.
-        tag_of_vertex = np.repeat(data["tags"], data["points"])
-        is_shoe = tag_of_vertex == "shoes"
-        shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
-        is_left = data["mean"][shoe_points, 1] > 0  # y points to the person's left
-        self._tensors["shoe_l"] = torch.from_numpy(shoe_points[is_left])
-        self._tensors["shoe_r"] = torch.from_numpy(shoe_points[~is_left])
+        self._tensors = _convert_body(data)
+        left_points, right_points = _find_shoe_points(data)
+        self._tensors["shoe_l"] = torch.from_numpy(left_points)
+        self._tensors["shoe_r"] = torch.from_numpy(right_points)
         self.standing_points = self.pose({})
         self.size = float(
             (self.standing_points.amax(dim=0) - self.standing_points.amin(dim=0)).max()
@@ -259,9 +245,8 @@ class Person:
             posed = self._correct_legs(
                 posed, rotations, translations, joints, foot_rises
             )
-        # The origin is below the pelvis (the first bone), at the height of the lowest
-        # point.
-        pelvis = translations[0] + rotations[0] @ joints[0]
+        pelvis = translations[0] + rotations[0] @ joints[0]  # of the first bone
+        # below the pelvis, at the height of the lowest point
         origin = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
         point_of_vertex = self._get_tensor("index", device)
         return (scale * (posed - origin)).index_select(0, point_of_vertex)
@@ -283,10 +268,7 @@ class Person:
         Returns:
             The rise of the left foot, "l", and of the right one, "r".
         """
-        zero = torch.zeros_like(number_by_name["walk"])
-        zero_angles = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
-        joint_angles = add_walk({**number_by_name, **zero_angles})
-        rotations, translations = self._pose_bones(joints, joint_angles)
+        rotations, translations = self._pose_walk(joints, number_by_name)
         weights = self._get_tensor("weights", points.device)
         lowest_heights = dict[str, Tensor]()
         contacts = dict[str, Tensor]()
@@ -303,6 +285,18 @@ class Person:
         # correction.
         fraction = (number_by_name["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
         return _compute_rises(lowest_heights, contacts, fraction)
+
+    def _pose_walk(
+        self, joints: Tensor, number_by_name: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return rotations (J, 3, 3) and translations (J, 3) of bones in a walk alone.
+
+        The arguments are those of `_compute_leg_corrections`.
+        """
+        zero = torch.zeros_like(number_by_name["walk"])
+        zero_angles = {parameter.name: zero for parameter in (*SPINE, *_JOINTS)}
+        joint_angles = add_walk({**number_by_name, **zero_angles})
+        return self._pose_bones(joints, joint_angles)
 
     def _correct_legs(
         self,
@@ -334,18 +328,27 @@ class Person:
                 for bone in ("thigh", "calf", "foot")
             )
             # heights of the joints at the upper ends of thigh and foot
-            hip_height = (rotations[thigh] @ joints[thigh] + translations[thigh])[2]
-            ankle_height = (rotations[foot] @ joints[foot] + translations[foot])[2]
+            hip_height = _move_joint(thigh, rotations, translations, joints)[2]
+            ankle_height = _move_joint(foot, rotations, translations, joints)[2]
             # 0 at the hip, 1 at the ankle
-            below_hip = (
-                (hip_height - posed[:, 2]) / (hip_height - ankle_height)
-            ).clamp(0.0, 1.0)
-            foot_weight = sum(
-                weights[:, index] for index in self._find_foot_bones(foot)
-            )
-            leg_weight = (weights[:, thigh] + weights[:, calf]) * below_hip
-            rise = rise + foot_rise * (foot_weight + leg_weight)
+            below_hip = (hip_height - posed[:, 2]) / (hip_height - ankle_height)
+            leg_weight = weights[:, thigh] + weights[:, calf]
+            leg_weight = leg_weight * below_hip.clamp(0.0, 1.0)
+            rise = rise + foot_rise * (self._weigh_foot(foot, weights) + leg_weight)
         return torch.cat([posed[:, :2], (posed[:, 2] + rise)[:, None]], dim=1)
+
+    def _weigh_foot(self, foot: int, weights: Tensor) -> Tensor:
+        """Return the weight (P,) with which all bones of a foot move each point.
+
+        Args:
+            foot: index of the foot's bone.
+            weights: (P, J) weights of all bones.
+        """
+        foot_bones = self._find_foot_bones(foot)
+        total = torch.zeros_like(weights[:, foot])
+        for index in foot_bones:
+            total = total + weights[:, index]
+        return total
 
     def _find_foot_bones(self, foot: int) -> list[int]:
         """Return the bone of a foot and its children."""
@@ -387,26 +390,33 @@ class Person:
             (G, A, W, H) weights of the extremes of gender, age, weight and height,
             which sum to 1; and the factor to the requested height.
         """
-        gender_weights = torch.stack(
-            [1.0 - number_by_name["gender"], number_by_name["gender"]]
+        gender = number_by_name["gender"]
+        gender_weights = torch.stack([1.0 - gender, gender])
+        age = number_by_name["age"]
+        age_weights = compute_interpolation_weights(age, age.new_tensor(AGES))
+        # The heaviness of a body is 0 if it is thin, 0.5 if average and 1 if heavy.
+        heaviness = number_by_name["weight"]
+        heaviness_weights = compute_interpolation_weights(
+            heaviness, heaviness.new_tensor([0.0, 0.5, 1.0])
         )
-        age_weights = compute_interpolation_weights(
-            number_by_name["age"], number_by_name["age"].new_tensor(AGES)
-        )
-        # The "weight" of a body is 0 if it is thin, 0.5 if average and 1 if heavy.
-        body_weight_weights = compute_interpolation_weights(
-            number_by_name["weight"],
-            number_by_name["weight"].new_tensor([0.0, 0.5, 1.0]),
-        )
-        # The mixture (G, A, W) without the height, and the heights (H,) in meters of
-        # the shortest, the average and the tallest body of that mixture.
         mixture = torch.einsum(
-            "g,a,w->gaw", gender_weights, age_weights, body_weight_weights
+            "g,a,w->gaw", gender_weights, age_weights, heaviness_weights
         )
+        return self._mix_heights(mixture, number_by_name["height"])
+
+    def _mix_heights(
+        self, mixture: Tensor, requested_height: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the mixture of extreme bodies, and the scale to the requested height.
+
+        Args:
+            mixture: (G, A, W) weights of the extremes of gender, age and weight.
+            requested_height: scalar, meters.
+        """
+        # (H,) meters: the shortest, the average and the tallest body of the mixture
         statures = torch.einsum(
             "gaw,gawh->h", mixture, self._get_tensor("stature", mixture.device)
         )
-        requested_height = number_by_name["height"]
         # A mixture has at least the height of the shortest extreme, and at most that of
         # the tallest. A body beyond these is scaled.
         clamped_height = torch.minimum(
@@ -471,12 +481,11 @@ class Person:
             joint_rotations.append(rotation)
             rotations.append(rotation @ straight_rotations.get(bone, identity))
             positions.append(position)
-        all_rotations = torch.stack(rotations)
         # The translation is position - rotation joint, so that the joint itself moves
         # to its position.
-        return all_rotations, torch.stack(positions) - torch.einsum(
-            "jik,jk->ji", all_rotations, joints
-        )
+        all_rotations = torch.stack(rotations)
+        moved_joints = torch.einsum("jik,jk->ji", all_rotations, joints)
+        return all_rotations, torch.stack(positions) - moved_joints
 
     def _compute_straight_turns(self, joints: Tensor) -> dict[str, Tensor]:
         """Return the rotations (3, 3) of limbs from the rest pose to all angles 0.
@@ -504,6 +513,44 @@ class Person:
             hand_turn = make_axis_rotation("z", joints.new_tensor(sign * 60.0))
             rotations[f"hand_{side}"] = hand_turn @ rotations[f"lowerarm_{side}"]
         return rotations
+
+
+def _get_defaults() -> dict[str, float]:
+    """Return the defaults of `PARAMETERS` by name."""
+    return {parameter.name: float(parameter.default) for parameter in PARAMETERS}
+
+
+def _convert_body(data: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+    """Return arrays of body.npz as tensors, in meters, with weights that sum to 1."""
+    weight_sums = data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)
+    tensors = {
+        "mean": torch.from_numpy(data["mean"].astype(np.float32) * 1e-4),
+        "basis": torch.from_numpy(data["basis"].astype(np.float32)),
+        "weights": torch.from_numpy(data["weights"] / weight_sums),
+        "index": torch.from_numpy(data["index"].astype(np.int64)),
+    }
+    for name in ("shares", "stature", "mass"):
+        tensors[name] = torch.from_numpy(data[name])
+    return tensors
+
+
+def _find_shoe_points(data: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the points of the left and of the right shoe."""
+    tag_of_vertex = np.repeat(data["tags"], data["points"])
+    is_shoe = tag_of_vertex == "shoes"
+    shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
+    is_left = data["mean"][shoe_points, 1] > 0  # y points to the person's left
+    return shoe_points[is_left], shoe_points[~is_left]
+
+
+def _move_joint(
+    bone: int, rotations: Tensor, translations: Tensor, joints: Tensor
+) -> Tensor:
+    """Return the position (3,) of the joint at the upper end of a bone in a pose.
+
+    The last three arguments are those of `Person._correct_legs`.
+    """
+    return rotations[bone] @ joints[bone] + translations[bone]
 
 
 @lru_cache(maxsize=1)
@@ -562,6 +609,13 @@ def add_walk(angle_by_name: Mapping[str, Tensor]) -> dict[str, Tensor]:
     # heel strikes.
     chest_turn = stride * 5.0 * torch.cos(phase)
     angle_by_joint["spine_turn"] = angle_by_joint["spine_turn"] + chest_turn
+    return _limit_angles(angle_by_joint)
+
+
+def _limit_angles(angle_by_joint: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the angles of joints within their limits, and other parameters as they
+    are.
+    """
     limits = {
         parameter.name: (parameter.low, parameter.high)
         for parameter in PARAMETERS
@@ -678,19 +732,9 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
     Args:
         angle: degrees by parameter, such as "left_knee".
     """
-    # Each of three bones of the back has a third of the angle, and neck and head have a
-    # half each.
-    spine, side, turn = (
-        angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
-    )
-    spine_rotation = (
-        make_axis_rotation("y", spine)
-        @ make_axis_rotation("x", -side)  # "spine_side" bends to the left
-        @ make_axis_rotation("z", turn)
-    )
-    neck_rotation = make_axis_rotation(
-        "z", angle["neck_turn"] / 2.0
-    ) @ make_axis_rotation("y", angle["neck"] / 2.0)
+    spine_rotation = _compute_spine_turn(angle)
+    neck_turn = make_axis_rotation("z", angle["neck_turn"] / 2.0)
+    neck_rotation = neck_turn @ make_axis_rotation("y", angle["neck"] / 2.0)
     rotations = {
         "spine_01": spine_rotation,
         "spine_02": spine_rotation,
@@ -698,9 +742,24 @@ def compute_joint_turns(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:
         "neck_01": neck_rotation,
         "head": neck_rotation,
     }
-    rotations |= _compute_limb_turns(angle, "left", 1.0)
-    rotations |= _compute_limb_turns(angle, "right", -1.0)
+    rotations |= _compute_limb_turns(angle, "left", sign=1.0)
+    rotations |= _compute_limb_turns(angle, "right", sign=-1.0)
     return rotations
+
+
+def _compute_spine_turn(angle: Mapping[str, Tensor]) -> Tensor:
+    """Return the rotation (3, 3) of each of three bones of the back.
+
+    `angle` has degrees by parameter, of which each bone has a third.
+    """
+    spine, side, turn = (
+        angle[name] / 3.0 for name in ("spine", "spine_side", "spine_turn")
+    )
+    return (
+        make_axis_rotation("y", spine)
+        @ make_axis_rotation("x", -side)  # "spine_side" bends to the left
+        @ make_axis_rotation("z", turn)
+    )
 
 
 def _compute_limb_turns(
@@ -720,18 +779,28 @@ def _compute_limb_turns(
     limb_angles = {joint: angle_by_joint[f"{side}_{joint}"] for joint, *_ in LIMBS}
     suffix = side[0]
     rotations = dict[str, Tensor]()
-    shoulder_rotation = make_axis_rotation(
-        "x", sign * limb_angles["shoulder_out"]
-    ) @ make_axis_rotation("y", -limb_angles["shoulder"])
+    shoulder_rotation = _make_swing_rotation(
+        outwards=sign * limb_angles["shoulder_out"], forwards=limb_angles["shoulder"]
+    )
     shoulder_turn = make_axis_rotation("z", -sign * limb_angles["shoulder_turn"])
     rotations[f"upperarm_{suffix}"] = shoulder_rotation @ shoulder_turn
     rotations[f"lowerarm_{suffix}"] = make_axis_rotation("y", -limb_angles["elbow"])
-    rotations[f"thigh_{suffix}"] = make_axis_rotation(
-        "x", sign * limb_angles["hip_out"]
-    ) @ make_axis_rotation("y", -limb_angles["hip"])
+    rotations[f"thigh_{suffix}"] = _make_swing_rotation(
+        outwards=sign * limb_angles["hip_out"], forwards=limb_angles["hip"]
+    )
     rotations[f"calf_{suffix}"] = make_axis_rotation("y", limb_angles["knee"])
     rotations[f"foot_{suffix}"] = make_axis_rotation("y", -limb_angles["ankle"])
     return rotations
+
+
+def _make_swing_rotation(outwards: Tensor, forwards: Tensor) -> Tensor:
+    """Return the rotation (3, 3) of a hanging limb forwards, and then to the left.
+
+    Args:
+        outwards: degrees to the left side; negative to the right.
+        forwards: degrees to the front.
+    """
+    return make_axis_rotation("x", outwards) @ make_axis_rotation("y", -forwards)
 
 
 def make_axis_rotation(axis: str, degrees: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -153,18 +153,8 @@ def read_photograph_folder(
     views: dict[str, PhotographView] = {}
     n_pixels = 0
     for path in _list_photographs(directory):
-        file = find_camera_file(path)
-        if file is None and not has_camera:
-            raise FileFormatError(
-                f"{path}: expected its camera file beside it, such as "
-                f"{path.with_suffix('.yaml').name}, got none; add it, remove the "
-                "photograph from the folder, or set `camera` for all of them"
-            )
-        _check_inside(path, directory)
-        if file is not None:
-            _check_inside(file, directory)
-        with open_image(path, LARGEST_FILE) as image:
-            n_pixels += image.width * image.height
+        _check_files(path, directory, has_camera=has_camera)
+        n_pixels += _measure_pixels(path)
         check_most(
             directory, n_pixels, MAX_FOLDER_PIXELS, "photographs of at most {} pixels"
         )
@@ -174,6 +164,35 @@ def read_photograph_folder(
         _check_same_statements(view, first_view)
         views[path.name] = view
     return views
+
+
+def _measure_pixels(path: Path) -> int:
+    """Return the number of pixels of a photograph, from its file."""
+    with open_image(path, LARGEST_FILE) as image:
+        return image.width * image.height
+
+
+def _check_files(path: Path, directory: Path, *, has_camera: bool) -> None:
+    """Check a photograph of a folder, and the camera file beside it.
+
+    Raises FileFormatError: one of them is a link that leads out of the folder, or
+    there is no camera file, and the user names no camera (`has_camera`).
+    """
+    file = find_camera_file(path)
+    if file is None and not has_camera:
+        _reject_without_camera(path)
+    _check_inside(path, directory)
+    if file is not None:
+        _check_inside(file, directory)
+
+
+def _reject_without_camera(path: Path) -> NoReturn:
+    """Raise FileFormatError for a photograph that has no camera file beside it."""
+    raise FileFormatError(
+        f"{path}: expected its camera file beside it, such as "
+        f"{path.with_suffix('.yaml').name}, got none; add it, remove the "
+        "photograph from the folder, or set `camera` for all of them"
+    )
 
 
 def _list_photographs(folder: Path) -> list[Path]:
@@ -186,8 +205,7 @@ def _list_photographs(folder: Path) -> list[Path]:
     with os.scandir(folder) as entries:
         for index, entry in enumerate(entries, start=1):
             check_most(folder, index, MAX_FILES, "a folder of at most {} files")
-            is_photograph = Path(entry.name).suffix.lower() in PHOTOGRAPH_SUFFIXES
-            if is_photograph and not entry.name.startswith("."):
+            if _is_visible_photograph(entry.name):
                 paths.append(folder / entry.name)
     if not paths:
         raise FileFormatError(
@@ -196,6 +214,12 @@ def _list_photographs(folder: Path) -> list[Path]:
         )
     check_most(folder, len(paths), MAX_PHOTOGRAPHS, "at most {} photographs")
     return sorted(paths)
+
+
+def _is_visible_photograph(file_name: str) -> bool:
+    """Return whether a file is a photograph, by its name, and is not hidden."""
+    is_photograph = Path(file_name).suffix.lower() in PHOTOGRAPH_SUFFIXES
+    return is_photograph and not file_name.startswith(".")
 
 
 def _check_inside(path: Path, folder: Path) -> None:
@@ -238,31 +262,41 @@ def _parse_view(
     """
     stated = {name: entries[name] for name in VIEW_KEYS & entries.keys()}
     has_lens = bool(entries.keys() - VIEW_KEYS)  # all other entries are about the lens
-    pose = None
-    if "object_to_camera" in stated:
-        numbers = _parse_numbers(file, "object_to_camera", stated, (12, 16))
-        # The last row of a pose is always 0 0 0 1, and may be left out.
-        pose = np.eye(4)
-        n_rows = len(numbers) // 4
-        pose[:n_rows] = numbers.reshape(-1, 4)
+    pose = _parse_pose(file, stated) if "object_to_camera" in stated else None
     spec = str(photograph)
     if "part" in stated:
-        part = _parse_numbers(file, "part", stated, (4,))
-        spec += "#" + ",".join(f"{number:.0f}" for number in part.tolist())
-        if not CROP.fullmatch(spec):
-            raise FileFormatError(
-                f"{file}: part: expected X, Y, WIDTH, HEIGHT in pixels, got "
-                f"{stated['part']!s:.60}"
-            )
+        spec = _parse_part(file, spec, stated)
     return PhotographView(
         spec=spec,
         file=str(file),
         camera=str(file) if has_lens else None,
         settings=_parse_settings(file, stated.get("set", {})),
         object_to_camera=pose,
-        up=_parse_numbers(file, "up", stated, (3,)) if "up" in stated else None,
+        up=_parse_numbers(file, "up", stated, counts=(3,)) if "up" in stated else None,
         occluder=_parse_occluder(file, stated),
     )
+
+
+def _parse_pose(file: Path, stated: Mapping[str, Any]) -> Float64Array:
+    """Return the pose (4, 4) of the object that a camera file states."""
+    numbers = _parse_numbers(file, "object_to_camera", stated, counts=(12, 16))
+    # The last row of a pose is always 0 0 0 1, and may be left out.
+    pose = np.eye(4)
+    n_rows = len(numbers) // 4
+    pose[:n_rows] = numbers.reshape(-1, 4)
+    return pose
+
+
+def _parse_part(file: Path, photograph: str, stated: Mapping[str, Any]) -> str:
+    """Return the path of a photograph with the part of it that a camera file states."""
+    part = _parse_numbers(file, "part", stated, counts=(4,))
+    spec = photograph + "#" + ",".join(f"{number:.0f}" for number in part.tolist())
+    if not CROP.fullmatch(spec):
+        raise FileFormatError(
+            f"{file}: part: expected X, Y, WIDTH, HEIGHT in pixels, got "
+            f"{stated['part']!s:.60}"
+        )
+    return spec
 
 
 def _parse_numbers(
@@ -280,21 +314,31 @@ def _parse_numbers(
         FileFormatError: it has another number of values, or values that are no finite
             numbers.
     """
-    value = stated[name]
-    if isinstance(value, Mapping):  # a matrix as OpenCV writes it
-        value = value.get("data")
-    if isinstance(value, str):
-        value = value.replace(",", " ").split()
-    try:
-        numbers = np.array(value, np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
+    value = _unwrap_entry(stated[name])
+    numbers = _to_flat_numbers(value)
     if len(numbers) not in counts or not np.isfinite(numbers).all():
         expected = " or ".join(map(str, counts))
         raise FileFormatError(
             f"{file}: {name}: expected {expected} finite numbers, got {value!s:.60}"
         )
     return numbers
+
+
+def _unwrap_entry(value: object) -> object:
+    """Return the list in a matrix of OpenCV or in a text; other values as they are."""
+    if isinstance(value, Mapping):  # a matrix as OpenCV writes it
+        value = value.get("data")
+    if isinstance(value, str):
+        return value.replace(",", " ").split()
+    return value
+
+
+def _to_flat_numbers(value: Any) -> Float64Array:
+    """Return the numbers (N,) of an entry; none if it has other values."""
+    try:
+        return np.array(value, np.float64).reshape(-1)
+    except (TypeError, ValueError):
+        return np.empty(0)
 
 
 def _parse_settings(file: Path, stated: object) -> dict[str, float]:
@@ -310,18 +354,23 @@ def _parse_settings(file: Path, stated: object) -> dict[str, float]:
     """
     if not isinstance(stated, Mapping):
         raise FileFormatError(f"{file}: set: expected settings by name")
-    for name in stated:
-        if not str(name).startswith(VIEW_SETTINGS):
-            raise FileFormatError(
-                f"{file}: set: {name!s:.60} is not about the view; expected settings "
-                f"that begin with {', '.join(VIEW_SETTINGS)}"
-            )
+    _check_view_settings(file, stated)
     try:
         values = resolve_settings(stated)
     except InputError as error:
         raise FileFormatError(f"{file}: {error}") from None
     # A stated value is never None; "or" is for the type.
     return {str(name): float(values[name] or 0.0) for name in stated}
+
+
+def _check_view_settings(file: Path, stated: Mapping[Any, object]) -> None:
+    """Raise FileFormatError if a camera file sets what is not about the view."""
+    for name in stated:
+        if not str(name).startswith(VIEW_SETTINGS):
+            raise FileFormatError(
+                f"{file}: set: {name!s:.60} is not about the view; expected settings "
+                f"that begin with {', '.join(VIEW_SETTINGS)}"
+            )
 
 
 def _parse_occluder(file: Path, stated: Mapping[str, Any]) -> str | None:
@@ -362,36 +411,73 @@ def make_photograph_scene(
         FileFormatError: a file cannot be used.
         InputError: the entries contradict the scene.
     """
+    scene = _apply_stated_settings(description, view.settings)
+    requested_camera = camera or view.camera
+    photograph = find_photograph_file(view.spec)  # `spec` is a path: never None here
+    scene = _with_requested_camera(scene, requested_camera, photograph)
+    scene = scene.with_backdrop(view.spec, occluder or view.occluder)
+    if view.object_to_camera is None:
+        return scene
+    return _apply_measured_pose(scene, view, view.object_to_camera)
+
+
+def _with_requested_camera(
+    scene: SceneDescription,
+    requested_camera: str | PhotographCameras | None,
+    photograph: Path | None,
+) -> SceneDescription:
+    """Return a scene with the camera that took a photograph, if there is one.
+
+    Args:
+        scene: the scene.
+        requested_camera: a camera file, the name of a camera, or the cameras of many
+            photographs or their file; None leaves the camera as it is.
+        photograph: the file of the photograph.
+    """
+    cameras = requested_camera
+    if isinstance(requested_camera, str):
+        cameras = _read_cameras(requested_camera, photograph)
+    if isinstance(cameras, str):
+        return scene.with_camera(cameras)
+    if cameras is not None and photograph is not None:
+        return scene.with_photograph_camera(cameras, photograph)
+    return scene
+
+
+def _apply_stated_settings(
+    description: SceneDescription, settings: Mapping[str, float]
+) -> SceneDescription:
+    """Return a scene with the settings of a camera file that the user has not
+    requested.
+    """
     stated = {
         name: value
-        for name, value in view.settings.items()
+        for name, value in settings.items()
         if name not in description.requested
     }
     # Controls (the parameters that a search varies) must not vary settings that the
     # user requested. Settings of the file are protected like these, except for those of
     # camera and pose.
     fixed = {name for name in stated if not name.startswith(("camera.", "pose."))}
-    scene = replace(
+    return replace(
         description,
         values={**description.values, **stated},
         requested=description.requested | fixed,
     )
-    requested_camera = camera or view.camera
-    photograph = find_photograph_file(view.spec)  # `spec` is a path: never None here
-    cameras = requested_camera
-    if isinstance(requested_camera, str):
-        # A file may have the cameras of many photographs; otherwise it is one camera.
-        with track_opened_files(photograph or requested_camera):
-            cameras = read_photograph_cameras(requested_camera) or requested_camera
-    if isinstance(cameras, str):
-        scene = scene.with_camera(cameras)
-    elif cameras is not None and photograph is not None:
-        scene = scene.with_photograph_camera(cameras, photograph)
-    scene = scene.with_backdrop(view.spec, occluder or view.occluder)
-    if view.object_to_camera is None:
-        return scene
+
+
+def _read_cameras(spec: str, photograph: Path | None) -> str | PhotographCameras:
+    """Return the cameras of many photographs in a file, or the file of a single one."""
+    with track_opened_files(photograph or spec):
+        return read_photograph_cameras(spec) or spec
+
+
+def _apply_measured_pose(
+    scene: SceneDescription, view: PhotographView, object_to_camera: Float64Array
+) -> SceneDescription:
+    """Return a scene with the measured pose (4, 4) of the object in a photograph."""
     try:
-        measured = compute_view_settings(scene.object, view.object_to_camera, view.up)
+        measured = compute_view_settings(scene.object, object_to_camera, view.up)
     except InputError as error:
         raise InputError(f"{view.file}: {error}") from None
     measured_values = {

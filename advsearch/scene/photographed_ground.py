@@ -10,7 +10,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import EnvironmentAsset, Float32Array, Mesh
+from advsearch.scene.assets import (
+    EnvironmentAsset,
+    Float32Array,
+    Float64Array,
+    Mesh,
+)
 
 N_SECTORS = 128
 N_RINGS = 64
@@ -85,10 +90,20 @@ class PhotographedGround:
         radius, map_column = np.meshgrid(radii, map_columns, indexing="ij")
         # Columns of a map begin at +y, and continue over +x, -y and -x.
         azimuth = 0.5 * math.pi - 2.0 * math.pi * map_column + math.radians(rotation)
-        vertices = height * np.stack(
-            [radius * np.cos(azimuth), radius * np.sin(azimuth), np.zeros_like(radius)],
-            axis=-1,
+        x = radius * np.cos(azimuth)
+        y = radius * np.sin(azimuth)
+        vertices = height * np.stack([x, y, np.zeros_like(radius)], axis=-1)
+        uvs = np.stack([map_column, self._compute_texture_v(radius)], axis=-1)
+        upwards = np.array([0.0, 0.0, 1.0], np.float32)
+        return Mesh(
+            vertices=vertices.reshape(-1, 3).astype(np.float32),
+            faces=_make_ring_faces(),
+            normals=np.tile(upwards, (vertices.size // 3, 1)),
+            uvs=uvs.reshape(-1, 2).astype(np.float32),
         )
+
+    def _compute_texture_v(self, radius: Float64Array) -> Float64Array:
+        """Return the texture coordinate v at radii, in heights of the camera."""
         # Rows of the map are counted at their centers: row 0 is straight up, and the
         # last one straight down.
         angle_from_up = math.pi - np.arctan(radius)
@@ -97,17 +112,8 @@ class PhotographedGround:
         # of row 0, half a row above its center.
         texture_row = map_row - self._horizon_row
         n_texture_rows = self._map_rows - self._horizon_row
-        v = 1.0 - (texture_row + 0.5) / n_texture_rows
-        uvs = np.stack([map_column, v], axis=-1)
-        normals = np.tile(
-            np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1)
-        )
-        return Mesh(
-            vertices.reshape(-1, 3).astype(np.float32),
-            _make_ring_faces(),
-            normals,
-            uvs.reshape(-1, 2).astype(np.float32),
-        )
+        v: Float64Array = 1.0 - (texture_row + 0.5) / n_texture_rows
+        return v
 
     def compute_reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map (H, W, 3) of any size.
@@ -123,16 +129,19 @@ class PhotographedGround:
         map_row = torch.arange(
             self._horizon_row, self._map_rows, device=radiance.device
         ) * ((rows - 1) / (self._map_rows - 1))
-        # The row above is at most the last but one, so that there is a next row.
-        upper = map_row.floor().long().clamp_max(rows - 2)
-        fraction = (map_row - upper)[:, None, None].to(radiance.dtype)
-        lower_half = radiance[upper] + fraction * (
-            radiance[upper + 1] - radiance[upper]
-        )
+        lower_half = _interpolate_rows(radiance, map_row)
         irradiance = compute_irradiance(radiance)
         return torch.where(
             irradiance > 0.0, lower_half * math.pi / irradiance.clamp_min(1e-30), 0.0
         )
+
+
+def _interpolate_rows(values: Tensor, row: Tensor) -> Tensor:
+    """Return values (h, W, C) of a map (H, W, C) at positions (h,) among its rows."""
+    # The row above is at most the last but one, so that there is a next row.
+    upper = row.floor().long().clamp_max(values.shape[0] - 2)
+    fraction = (row - upper)[:, None, None].to(values.dtype)
+    return values[upper] + fraction * (values[upper + 1] - values[upper])
 
 
 def _make_ring_faces() -> npt.NDArray[np.uint32]:

@@ -41,11 +41,7 @@ def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPa
         part: the mesh.
         values: all settings of the scene by name.
     """
-    user_parameters = {}
-    for parameter in POSE:
-        value = values.get(f"pose:{part.name}.{parameter.name}")
-        if value is not None:
-            user_parameters[parameter.name] = value
+    user_parameters = _select_pose(part.name, values)
     if user_parameters:
         defaults = {parameter.name: float(parameter.default) for parameter in POSE}
         # The pose is that of the vertices in the world, so that it follows `to_world`.
@@ -56,6 +52,16 @@ def apply_settings(part: MeshPart, values: Mapping[str, float | None]) -> MeshPa
     return replace(
         part, material=part.material.with_values(values, f"material:{part.name}.")
     )
+
+
+def _select_pose(name: str, values: Mapping[str, float | None]) -> dict[str, float]:
+    """Return the parameters of the pose of the mesh with a name that settings state."""
+    user_parameters = {}
+    for parameter in POSE:
+        value = values.get(f"pose:{name}.{parameter.name}")
+        if value is not None:
+            user_parameters[parameter.name] = value
+    return user_parameters
 
 
 def compute_base_vertices(part: MeshPart) -> Float64Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from advsearch.errors import EnvironmentSetupError
 from advsearch.scene import rendered_channels as channels
-from advsearch.scene.assets import IntArray
+from advsearch.scene.assets import Float64Array, IntArray
 from advsearch.scene.mitsuba_backend.variant import mitsuba_lock
 
 # All four as in Open Image Denoise's `autoexposure`.
@@ -44,14 +45,7 @@ def denoise(
         EnvironmentSetupError: the package is not installed.
     """
     with mitsuba_lock:
-        try:
-            # imported here, after Mitsuba, since Mitsuba has to choose libLLVM first
-            import mitsuba_oidn
-        except ImportError as error:
-            raise EnvironmentSetupError(
-                f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, "
-                "or use `denoise=none`"
-            ) from error
+        denoiser = _import_denoiser()
         resolution = (radiance.shape[0], radiance.shape[1])
         # images in memory that is used again by the next call in this thread
         buffers = _get_buffers(resolution, threading.get_ident())
@@ -61,17 +55,36 @@ def denoise(
         color_buffer.copy_(radiance.detach() * gain)
         albedo_buffer.copy_(albedo.detach())
         normal_buffer.copy_(normal.detach())
-        quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
-        mitsuba_oidn.denoise(
-            color_buffer,
-            albedo_buffer,
-            normal_buffer,
-            hdr=True,
-            quality=quality,
-            input_scale=1.0,  # the gain is applied already
-            output=output,
-        )
+        _run_denoiser(denoiser, buffers, quick=quick)
         return (output / gain).to(radiance.device)
+
+
+def _import_denoiser() -> Any:
+    """Import Open Image Denoise, or raise an error that says how to install it."""
+    try:
+        # imported here, after Mitsuba, since Mitsuba has to choose libLLVM first
+        import mitsuba_oidn
+    except ImportError as error:
+        raise EnvironmentSetupError(
+            f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, "
+            "or use `denoise=none`"
+        ) from error
+    return mitsuba_oidn
+
+
+def _run_denoiser(denoiser: Any, buffers: list[Tensor], *, quick: bool) -> None:
+    """Denoise the color of the buffers of `_get_buffers` into the last of them."""
+    color_buffer, albedo_buffer, normal_buffer, output = buffers
+    quality = denoiser.Quality.Fast if quick else denoiser.Quality.High
+    denoiser.denoise(
+        color_buffer,
+        albedo_buffer,
+        normal_buffer,
+        hdr=True,
+        quality=quality,
+        input_scale=1.0,  # the gain is applied already
+        output=output,
+    )
 
 
 # The denoised change is faded out where the mean relative change within `FADE_RADIUS`
@@ -111,27 +124,54 @@ def denoise_image(
     coverage = rendered[..., channels.COVERAGE]
     denoised = [remove_noise(color), coverage]
     if plane_radiance is not None:
-        relative_change = _denoise_shade(
-            rendered[..., channels.PLANE_CHANGE] / plane_radiance,
-            visible=(1.0 - coverage).clamp(0.0, 1.0),
-            remove_noise=remove_noise,
-        )
-        # The plane is a surface: where the camera sees none, there is no normal.
-        is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
-        denoised.append(plane_radiance * is_surface * relative_change)
+        denoised.append(_denoise_plane(rendered, normal, plane_radiance, remove_noise))
     has_coat = rendered.shape[-1] > channels.COAT_CHANGE.start
     if has_coat:
-        # What the coat reflects without and with the object is denoised as two images,
-        # which are then subtracted.
-        noisy_change = rendered[..., channels.COAT_CHANGE]
-        noisy_before = rendered[..., channels.ENVIRONMENT_IN_COAT].contiguous()
-        noisy_after = (noisy_before + noisy_change).clamp_min(0.0)
-        before = remove_noise(noisy_before)
-        after = remove_noise(noisy_after)
         assert plane_radiance is not None
-        fade = _compute_fade(noisy_change / plane_radiance)
-        denoised += [(after - before) * fade, before]
+        denoised += _denoise_coat(rendered, plane_radiance, remove_noise)
     return torch.cat(denoised, dim=-1)
+
+
+def _denoise_plane(
+    rendered: Tensor,
+    normal: Tensor,
+    plane_radiance: Tensor,
+    remove_noise: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """Return the denoised change (H, W, 3) of the plane's radiance, which is (3,).
+
+    It is 0 where `normal` (H, W, 3) is 0. `rendered` has the channels of an image with
+    a photograph.
+    """
+    coverage = rendered[..., channels.COVERAGE]
+    relative_change = _denoise_shade(
+        rendered[..., channels.PLANE_CHANGE] / plane_radiance,
+        visible=(1.0 - coverage).clamp(0.0, 1.0),
+        remove_noise=remove_noise,
+    )
+    # The plane is a surface: where the camera sees none, there is no normal.
+    is_surface = (normal != 0.0).any(dim=-1, keepdim=True)
+    return plane_radiance * is_surface * relative_change
+
+
+def _denoise_coat(
+    rendered: Tensor,
+    plane_radiance: Tensor,
+    remove_noise: Callable[[Tensor], Tensor],
+) -> list[Tensor]:
+    """Return the denoised change of what the plane's coat reflects, and what it
+    reflects without the object.
+
+    Both are radiance (H, W, 3). They are denoised as two images, without and with the
+    object, which are then subtracted.
+    """
+    noisy_change = rendered[..., channels.COAT_CHANGE]
+    noisy_before = rendered[..., channels.ENVIRONMENT_IN_COAT].contiguous()
+    noisy_after = (noisy_before + noisy_change).clamp_min(0.0)
+    before = remove_noise(noisy_before)
+    after = remove_noise(noisy_after)
+    fade = _compute_fade(noisy_change / plane_radiance)
+    return [(after - before) * fade, before]
 
 
 def _denoise_shade(
@@ -206,6 +246,15 @@ def _compute_gain(radiance: Tensor) -> float:
     threads.
     """
     luminance = (radiance.cpu().numpy() * LUMINANCE_WEIGHTS).sum(axis=-1)
+    bin_means = _compute_bin_means(luminance)
+    bin_means = bin_means[bin_means > MIN_LUMINANCE]
+    if not bin_means.size:  # the image is black
+        return 1.0
+    return float(KEY_LUMINANCE / np.exp2(np.log2(bin_means).mean()))
+
+
+def _compute_bin_means(luminance: Float64Array) -> Float64Array:
+    """Return the means of luminance (H, W) over squares of about `BIN_SIZE` pixels."""
     height, width = luminance.shape
     row_starts = _find_bin_starts(height)
     column_starts = _find_bin_starts(width)
@@ -213,11 +262,8 @@ def _compute_gain(radiance: Tensor) -> float:
     column_counts = np.diff(column_starts, append=width)
     row_sums = np.add.reduceat(luminance, row_starts, axis=0)
     bin_sums = np.add.reduceat(row_sums, column_starts, axis=1)
-    bin_means = bin_sums / np.outer(row_counts, column_counts)
-    bin_means = bin_means[bin_means > MIN_LUMINANCE]
-    if not bin_means.size:  # the image is black
-        return 1.0
-    return float(KEY_LUMINANCE / np.exp2(np.log2(bin_means).mean()))
+    means: Float64Array = bin_sums / np.outer(row_counts, column_counts)
+    return means
 
 
 def _find_bin_starts(size: int) -> IntArray:

@@ -32,6 +32,7 @@ from advsearch.errors import AdvsearchError, EnvironmentSetupError
 from advsearch.trust.code import SUBPROCESS_DIRECTORY
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
+_VARIABLE_ADVICE = "Correct it, or unset it to let advsearch look for one."
 ELF_HEADER_SIZE = 20  # bytes of the beginning of an ELF file that are compared
 MIN_VERSION = 17  # the first major version that renders: see the head of this file
 _PATTERNS = (
@@ -94,16 +95,7 @@ def find_libraries(
     Returns:
         Usable files first, each group newest first.
     """
-    patterns = [*_PATTERNS, *_list_conda_patterns(environ.get("CONDA_PREFIX", ""))]
-    paths: list[Path] = []
-    for pattern in patterns:
-        matches = root.glob(pattern)
-        paths += [path for path in matches if _NAME.fullmatch(path.name)]
-    # The dynamic loader knows only the real root. It may answer with a bare name, such
-    # as "libLLVM.so.19", which is no path.
-    library = ctypes.util.find_library("LLVM") if root == Path("/") else None
-    if library and os.sep in library:
-        paths.append(Path(library))
+    paths = _find_library_files(root, environ)
     # one of the links that lead to each file, by the file
     link_of_file = {path.resolve(): path for path in paths if path.is_file()}
     libraries = [
@@ -115,6 +107,24 @@ def find_libraries(
         key=lambda library: (not library.refusal, library.version),
         reverse=True,
     )
+
+
+def _find_library_files(root: Path, environ: Mapping[str, str]) -> list[Path]:
+    """Return paths below a root that may be libLLVM files, some of them repeatedly.
+
+    The arguments are those of `find_libraries`.
+    """
+    patterns = [*_PATTERNS, *_list_conda_patterns(environ.get("CONDA_PREFIX", ""))]
+    paths: list[Path] = []
+    for pattern in patterns:
+        matches = root.glob(pattern)
+        paths += [path for path in matches if _NAME.fullmatch(path.name)]
+    # The dynamic loader knows only the real root. It may answer with a bare name, such
+    # as "libLLVM.so.19", which is no path.
+    library = ctypes.util.find_library("LLVM") if root == Path("/") else None
+    if library and os.sep in library:
+        paths.append(Path(library))
+    return paths
 
 
 def _list_conda_patterns(prefix: str) -> list[str]:
@@ -140,27 +150,41 @@ def examine_library(path: Path, *, name_hint: Path) -> LibraryFile:
         path: path of the file, symbolic links resolved.
         name_hint: the link through which it was found.
     """
-    # The first bytes of Python's own program. They are empty on systems whose programs
-    # are no ELF files: there the library is not checked by its header.
-    interpreter_header = read_interpreter_header()
-    header = b""
-    try:
-        with path.open("rb") as file:
-            header = file.read(ELF_HEADER_SIZE)
-    except OSError as error:
-        reason = f"it cannot be read: {error.strerror}"
+    reason = _explain_unusable_file(path)
+    if reason:
         return LibraryFile(path, version=(), refusal=reason)
-    if interpreter_header:
-        if header[:4] != b"\x7fELF" or len(header) < ELF_HEADER_SIZE:
-            reason = "it is not a shared library"
-            return LibraryFile(path, version=(), refusal=reason)
-        if _get_architecture(header) != _get_architecture(interpreter_header):
-            reason = "it is for another processor"
-            return LibraryFile(path, version=(), refusal=reason)
     version = (
         parse_version(path) or parse_version(name_hint) or query_version(str(path))
     )
     return LibraryFile(path, version, refusal=explain_refusal(version))
+
+
+def _explain_unusable_file(path: Path) -> str:
+    """Return why a file cannot be loaded, by its first bytes; empty if it can."""
+    # The first bytes of Python's own program. They are empty on systems whose programs
+    # are no ELF files: there the library is not checked by its header.
+    interpreter_header = read_interpreter_header()
+    try:
+        with path.open("rb") as file:
+            header = file.read(ELF_HEADER_SIZE)
+    except OSError as error:
+        return f"it cannot be read: {error.strerror}"
+    return _explain_wrong_header(header, interpreter_header)
+
+
+def _explain_wrong_header(header: bytes, interpreter_header: bytes) -> str:
+    """Return why a file with this beginning cannot be loaded; empty if it can.
+
+    `interpreter_header` is the beginning of Python's own program. If that is empty,
+    nothing is checked.
+    """
+    if not interpreter_header:
+        return ""
+    if header[:4] != b"\x7fELF" or len(header) < ELF_HEADER_SIZE:
+        return "it is not a shared library"
+    if _get_architecture(header) != _get_architecture(interpreter_header):
+        return "it is for another processor"
+    return ""
 
 
 def explain_refusal(version: Version) -> str:
@@ -209,26 +233,39 @@ def ensure_llvm() -> LibraryFile:
         library = select_newest(find_libraries())
         os.environ[ENVIRONMENT_VARIABLE] = str(library.path)
         return library
+    return _examine_named_library(variable)
+
+
+def _examine_named_library(variable: str) -> LibraryFile:
+    """Return the libLLVM that ``DRJIT_LIBLLVM_PATH`` names, if it is usable."""
+    library = _find_named_library(variable)
+    if library.refusal:
+        raise EnvironmentSetupError(
+            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or "
+            f"later, got {library}. {_VARIABLE_ADVICE}"
+        )
+    # the path as the variable has it, not resolved
+    return replace(library, path=Path(variable))
+
+
+def _find_named_library(variable: str) -> LibraryFile:
+    """Return the libLLVM with a path or a plain name, usable or not.
+
+    Raises:
+        EnvironmentSetupError: there is no file with the path.
+    """
     path = Path(variable)
-    advice = "Correct it, or unset it to let advsearch look for one."
     # A plain name: the dynamic loader finds the file, and only the library itself knows
     # its version.
     if os.sep not in variable:
         version = query_version(variable)
-        library = LibraryFile(path, version, explain_refusal(version))
-    elif path.is_file():
-        library = examine_library(path.resolve(), name_hint=path)
-    else:
-        raise EnvironmentSetupError(
-            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which "
-            f"does not exist. {advice}"
-        )
-    if library.refusal:
-        raise EnvironmentSetupError(
-            f"{ENVIRONMENT_VARIABLE}: expected a libLLVM of version {MIN_VERSION} or "
-            f"later, got {library}. {advice}"
-        )
-    return replace(library, path=path)  # as the variable has it, not resolved
+        return LibraryFile(path, version, explain_refusal(version))
+    if path.is_file():
+        return examine_library(path.resolve(), name_hint=path)
+    raise EnvironmentSetupError(
+        f"{ENVIRONMENT_VARIABLE}: expected a libLLVM file, got {variable!r}, which "
+        f"does not exist. {_VARIABLE_ADVICE}"
+    )
 
 
 def get_install_command(
@@ -242,32 +279,52 @@ def get_install_command(
         release: what identifies the Linux distribution; None reads ``/etc/os-release``.
         system: as `sys.platform`.
     """
-    sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
-    commands = {
-        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19",
-        "Fedora": f"{sudo}dnf install llvm-libs",
-        "Homebrew": "brew install llvm",
-        "conda": "conda install -c conda-forge libllvm19",
-    }
+    commands = _list_install_commands()
     if os.environ.get("CONDA_PREFIX"):
         return commands["conda"]
     if system == "darwin":
         return commands["Homebrew"]
-    if release is None:
-        with contextlib.suppress(OSError):
-            release = platform.freedesktop_os_release()
-    release = release or {}
+    release = _read_release() if release is None else release
+    source = _find_package_source(release)
+    if source is not None:
+        return commands[source]
+    return "\n".join(f"  {name}: {command}" for name, command in commands.items())
+
+
+def _find_package_source(release: Mapping[str, str]) -> str | None:
+    """Return from where a Linux distribution gets a good libLLVM; None if unknown.
+
+    It is a key of `_list_install_commands`.
+    """
     ids = {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
     version = release.get("VERSION_ID", "")
     # Ubuntu before 24 has no package of a good version: there it is conda's.
     is_old_ubuntu = "ubuntu" in ids and re.match(r"(1\d|2[0-3])\.", version)
     if is_old_ubuntu:
-        return commands["conda"]
+        return "conda"
     if ids & {"debian", "ubuntu"}:
-        return commands["Debian, Ubuntu"]
+        return "Debian, Ubuntu"
     if ids & {"fedora", "rhel"}:
-        return commands["Fedora"]
-    return "\n".join(f"  {name}: {command}" for name, command in commands.items())
+        return "Fedora"
+    return None
+
+
+def _list_install_commands() -> dict[str, str]:
+    """Return commands that install a good libLLVM, by the platform."""
+    sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
+    return {
+        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19",
+        "Fedora": f"{sudo}dnf install llvm-libs",
+        "Homebrew": "brew install llvm",
+        "conda": "conda install -c conda-forge libllvm19",
+    }
+
+
+def _read_release() -> Mapping[str, str]:
+    """Return what identifies this Linux distribution; empty if it cannot be read."""
+    with contextlib.suppress(OSError):
+        return platform.freedesktop_os_release()
+    return {}
 
 
 def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
@@ -290,10 +347,17 @@ def select_newest(candidates: list[LibraryFile]) -> LibraryFile:
             rejected.append(f"{candidate.path} (cannot be loaded: {error})")
         else:
             return candidate
+    raise EnvironmentSetupError(_describe_lack(rejected))
+
+
+def _describe_lack(rejected: list[str]) -> str:
+    """Return the message that no libLLVM is usable: the rejected ones, and how to get
+    one.
+    """
     rejected_text = "Found: " + "; ".join(rejected) + "." if rejected else "Found none."
     command = get_install_command()
     separator = "\n" if "\n" in command else " "
-    raise EnvironmentSetupError(
+    return (
         f"expected a libLLVM of version {MIN_VERSION} or later, with which Dr.Jit "
         f"compiles its kernels. {rejected_text} Install one "
         f"with:{separator}{command}{separator}or name a file in {ENVIRONMENT_VARIABLE}."
@@ -321,17 +385,22 @@ def query_version(library: str) -> Version:
     """
     path = os.path.abspath(library) if os.sep in library else library
     try:
-        output = subprocess.run(
-            [sys.executable, "-c", _PROBE, path],
-            capture_output=True,
-            text=True,
-            timeout=30,
-            check=True,
-            cwd=SUBPROCESS_DIRECTORY,
-        ).stdout
+        output = _run_probe(path)
         return tuple(int(number) for number in output.split())
     except (OSError, subprocess.SubprocessError, ValueError):
         return ()
+
+
+def _run_probe(path: str) -> str:
+    """Return what `_PROBE` prints for a library: its version numbers."""
+    return subprocess.run(
+        [sys.executable, "-c", _PROBE, path],
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=True,
+        cwd=SUBPROCESS_DIRECTORY,
+    ).stdout
 
 
 def main() -> int:

@@ -45,6 +45,7 @@ from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.material_view import (
     INTERIOR,
+    Camera,
     FilmView,
     compute_outline_term,
     compute_shadow_term,
@@ -162,11 +163,24 @@ def material_adjoint(
         # cancels. For a smooth cotangent, independent noise averages out better.
         tile = ROUGH_TILE if _is_rough(cotangent) else 1
         total += _compute_interior_term(view, seed, spp, tile)
+    total = _add_boundary_terms(total, view, seed, boundary_spp, shadow_spp)
+    return _backpropagate_to_meshes(view, total)
+
+
+def _add_boundary_terms(
+    total: Any, view: FilmView, seed: int, outline_spp: int, shadow_spp: int
+) -> Any:
+    """Return a value plus the outline and shadow terms of all meshes, one by one."""
     # A still mesh may hide a moving one, or cast a shadow on it. The index gives each
     # mesh random numbers of its own.
     for index, mesh in enumerate([*view.moving_meshes, *view.still_meshes]):
-        total += compute_outline_term(view, mesh, seed, index, boundary_spp)
+        total += compute_outline_term(view, mesh, seed, index, outline_spp)
         total += compute_shadow_term(view, mesh, seed, index, shadow_spp)
+    return total
+
+
+def _backpropagate_to_meshes(view: FilmView, total: Any) -> dict[str, Tensor]:
+    """Return the gradients of a value by vertices and normals of the moving meshes."""
     # The value of `total` means nothing: each term is made so that its gradient is the
     # derivative of the loss.
     if dr.grad_enabled(total):
@@ -218,11 +232,28 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
     *attached_values, _is_moving = view.attach_hit(hit)
     local_values = [type(value)(dr.detach(value)) for value in attached_values]
     dr.enable_grad(local_values)
-    point, scaled_normal, shading_normal = local_values
+    sample_loss = _compute_sample_loss(view, si, film, local_values, sampler)
+    dr.backward(dr.sum(sample_loss))
+    return _carry_gradients_on(attached_values, local_values) / spp
 
-    # Step 1: differentiate the sum over all samples of W L J / J0. W is the cotangent
-    # (`weight`), L the radiance and J the area on the film of a piece of the surface,
-    # up to a constant factor. J0 is J without gradient, so that J / J0 has the value 1.
+
+def _compute_sample_loss(
+    view: FilmView, si: Any, film: Any, local_values: list[Any], sampler: Any
+) -> Any:
+    """Return what each sample adds to the loss, W L J / J0, attached to its point.
+
+    W is the cotangent, L the radiance, and J the area on the film of a piece of the
+    surface, up to a constant factor. J0 is J without gradient, so that J / J0 has the
+    value 1.
+
+    Args:
+        view: the scene.
+        si: surface interactions of the hits, without gradients.
+        film: sampled film positions in pixels.
+        local_values: points, normals and shading normals of the hits, with gradients.
+        sampler: random numbers.
+    """
+    point, scaled_normal, shading_normal = local_values
     # J is area cos / depth^2, where the product below has the length depth / cos of the
     # axis: hence the third power.
     film_area = (
@@ -235,17 +266,23 @@ def _compute_interior_term(view: FilmView, seed: int, spp: int, tile: int) -> An
     moving_si = _attach_interaction(view, si, point, scaled_normal, shading_normal)
     radiance = _sample_reflected(view, moving_si, si, sampler)
     sample_loss = dr.sum(weight * radiance)  # over the color channels
-    dr.backward(dr.sum(sample_loss * _with_relative_gradient(film_area)))
+    return sample_loss * _with_relative_gradient(film_area)
 
-    # Step 2: the gradient of value * constant by the vertices is the constant, here the
-    # gradient of step 1, times the derivative of the value.
+
+def _carry_gradients_on(attached_values: list[Any], local_values: list[Any]) -> Any:
+    """Return a value that has the gradients of copies as gradients of the originals.
+
+    The gradient of value * constant by the vertices is the constant, here the gradient
+    of the copy, times the derivative of the value. Gradients that are not finite are
+    left out.
+    """
     total = mi.Float(0)
     for value, local_value in zip(attached_values, local_values, strict=True):
         gradient = dr.grad(local_value)
         is_finite = dr.all(dr.isfinite(gradient))
         product = dr.dot(value, dr.select(is_finite, gradient, 0))
         total += dr.sum(dr.select(is_finite, product, 0))
-    return total / spp
+    return total
 
 
 def _sample_first_hits(
@@ -269,8 +306,35 @@ def _sample_first_hits(
         Film positions in pixels; their hits; and a sampler that goes on with their
         random numbers. Positions that see no moving mesh are left out.
     """
-    n_columns = view.camera.width + 1
-    n_rows = view.camera.height + 1
+    film, sampler = _sample_film(view.camera, seed, spp, tile)
+    hit = view.scene.ray_intersect_preliminary(
+        view.camera.make_ray(film), coherent=True
+    )
+    on_moving = _find_moving_hits(view, hit)
+    dr.eval(on_moving, film, hit, sampler)
+    # Keep the lanes that see a moving mesh, with the states of their generators.
+    selected_lanes = dr.compress(on_moving)
+    film = dr.gather(type(film), film, selected_lanes)
+    hit = dr.gather(type(hit), hit, selected_lanes)
+    sampler.rng = dr.gather(type(sampler.rng), sampler.rng, selected_lanes)
+    return film, hit, sampler
+
+
+def _find_moving_hits(view: FilmView, hit: Any) -> Any:
+    """Return whether each hit is on a mesh that moves."""
+    on_moving = mi.Bool(False)
+    for mesh in view.moving_meshes:
+        on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
+    return on_moving
+
+
+def _sample_film(camera: Camera, seed: int, spp: int, tile: int) -> tuple[Any, Any]:
+    """Sample positions on the film in pixels, and return them with their sampler.
+
+    The arguments are those of `_sample_first_hits`.
+    """
+    n_columns = camera.width + 1
+    n_rows = camera.height + 1
     lane = dr.arange(mi.UInt32, n_columns * n_rows * spp)
     cell = lane // spp
     sample = lane % spp
@@ -286,26 +350,20 @@ def _sample_first_hits(
         count=n_tiles * spp,
         index=tile_index * spp + sample,
     )
+    # the first cell begins half a pixel outside of the film
+    film = mi.Point2f(column, row) - 0.5 + _sample_in_cell(sampler, sample, spp)
+    return film, sampler
 
-    # A cell has as many strata as samples, in an almost square grid.
+
+def _sample_in_cell(sampler: Any, sample: Any, spp: int) -> Any:
+    """Return stratified positions in [0, 1]^2, for sample numbers below `spp`.
+
+    There are as many strata as samples, in an almost square grid.
+    """
     strata_across = _find_largest_divisor(spp)
     strata_shape = mi.Point2f(strata_across, spp // strata_across)
     stratum = mi.Point2f(sample % strata_across, sample // strata_across)
-    # the first cell begins half a pixel outside of the film
-    film = mi.Point2f(column, row) - 0.5 + (stratum + sampler.next_2d()) / strata_shape
-    hit = view.scene.ray_intersect_preliminary(
-        view.camera.make_ray(film), coherent=True
-    )
-    on_moving = mi.Bool(False)
-    for mesh in view.moving_meshes:
-        on_moving |= hit.is_valid() & (hit.shape == mesh.shape)
-    dr.eval(on_moving, film, hit, sampler)
-    # Keep the lanes that see a moving mesh, with the states of their generators.
-    selected_lanes = dr.compress(on_moving)
-    film = dr.gather(type(film), film, selected_lanes)
-    hit = dr.gather(type(hit), hit, selected_lanes)
-    sampler.rng = dr.gather(type(sampler.rng), sampler.rng, selected_lanes)
-    return film, hit, sampler
+    return (stratum + sampler.next_2d()) / strata_shape
 
 
 def _find_largest_divisor(count: int) -> int:
@@ -342,26 +400,32 @@ def _attach_interaction(
         shading_normal: shading normal with gradients, of any length.
     """
 
-    def attach_normal(fixed: Any, normal: Any) -> Any:
-        """Give a fixed normal the gradient of another, which may be its opposite."""
-        # Below 0 if the normals are opposite; then `mulsign` turns the second over.
-        cosine = dr.dot(dr.detach(normal), fixed)
-        return dr.replace_grad(fixed, dr.mulsign(dr.normalize(normal), cosine))
-
     moving_si = mi.SurfaceInteraction3f(si)
     moving_si.p = dr.replace_grad(si.p, point)
-    moving_si.n = attach_normal(si.n, scaled_normal)
-    normal = attach_normal(si.sh_frame.n, shading_normal)
-    fixed_tangent = si.sh_frame.s
+    moving_si.n = _attach_normal(si.n, scaled_normal)
+    moving_si.sh_frame = _attach_frame(si.sh_frame, shading_normal)
+    to_eye = dr.normalize(view.camera.eye - point)
+    moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))
+    return moving_si
+
+
+def _attach_normal(fixed: Any, normal: Any) -> Any:
+    """Give a fixed normal the gradient of another, which may be its opposite."""
+    # Below 0 if the normals are opposite; then `mulsign` turns the second over.
+    cosine = dr.dot(dr.detach(normal), fixed)
+    return dr.replace_grad(fixed, dr.mulsign(dr.normalize(normal), cosine))
+
+
+def _attach_frame(fixed_frame: Any, shading_normal: Any) -> Any:
+    """Return a shading frame with the gradient of a normal; its values stay."""
+    normal = _attach_normal(fixed_frame.n, shading_normal)
+    fixed_tangent = fixed_frame.s
     # the part of the tangent t that is perpendicular to the moving normal n:
     # t - n (n . t)
     perpendicular = dr.fma(-normal, dr.dot(normal, fixed_tangent), fixed_tangent)
     tangent = dr.replace_grad(fixed_tangent, dr.normalize(perpendicular))
-    # The cross product has the value of the frame's second tangent, `si.sh_frame.t`.
-    moving_si.sh_frame = mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
-    to_eye = dr.normalize(view.camera.eye - point)
-    moving_si.wi = dr.replace_grad(si.wi, moving_si.sh_frame.to_local(to_eye))
-    return moving_si
+    # The cross product has the value of the frame's second tangent, `fixed_frame.t`.
+    return mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
 
 
 def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> Any:
@@ -383,19 +447,33 @@ def _sample_reflected(view: FilmView, moving_si: Any, si: Any, sampler: Any) -> 
         is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     direct = _reflect_light(view, moving_si, si, ds, em_weight, has_light)
 
-    # `incoming` is the light along the sampled direction, times the value of the BSDF
-    # over the density. Only this value changes as the surface turns, so that its
-    # relative change is multiplied. A mirror has no BSDF value: its factor is 1.
+    relative_bsdf = _compute_relative_bsdf(moving_si, si, wo, active, is_smooth)
+    return direct + dr.select(active, incoming * relative_bsdf, 0.0)
+
+
+def _compute_relative_bsdf(
+    moving_si: Any, si: Any, wo: Any, active: Any, is_smooth: Any
+) -> Any:
+    """Return 1, with the relative gradient of the BSDF, per color channel.
+
+    The light along a sampled direction is multiplied by the value of the BSDF over the
+    density. Only this value changes as the surface turns, so that its relative change
+    is multiplied. A mirror has no BSDF value: its factor is 1.
+
+    Args:
+        moving_si, si: the surface interaction, with and without gradients.
+        wo: direction of the incoming light in the world.
+        active: lanes in which there is a sample.
+        is_smooth: lanes in which the BSDF has a value.
+    """
     bsdf_value = si.bsdf().eval(
         mi.BSDFContext(), moving_si, moving_si.to_local(wo), active & is_smooth
     )
-    relative_bsdf = mi.Color3f(
-        *(
-            _with_relative_gradient(dr.select(is_smooth, channel, 1.0))
-            for channel in bsdf_value
-        )
+    factors = (
+        _with_relative_gradient(dr.select(is_smooth, channel, 1.0))
+        for channel in bsdf_value
     )
-    return direct + dr.select(active, incoming * relative_bsdf, 0.0)
+    return mi.Color3f(*factors)
 
 
 def _sample_light(
@@ -437,16 +515,32 @@ def _sample_incoming(
     is_smooth = ~mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
     ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
     radiance = view.sample_radiance(ray, sampler, view.max_depth - 1, active)
-    # `sample_radiance` includes all emission of the next surface or of the environment.
-    # Its fraction 1 - MIS weight is covered by samples at emitters, and subtracted
-    # here. In the direction of a mirror they cover nothing.
+    # In the direction of a mirror, samples at emitters cover nothing.
     is_shared = active & is_smooth
     si_next = view.scene.ray_intersect(ray, active)
-    ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
-    em_pdf = view.scene.pdf_emitter_direction(si, ds_next, is_shared)
-    mis = mi.ad.integrators.common.mis_weight(bsdf_sample.pdf, em_pdf)
-    radiance -= (1.0 - mis) * ds_next.emitter.eval(si_next, is_shared)
+    radiance -= _compute_covered_emission(view, si, si_next, bsdf_sample.pdf, is_shared)
     return bsdf_sample, bsdf_weight * radiance, active
+
+
+def _compute_covered_emission(
+    view: FilmView, si: Any, si_next: Any, bsdf_pdf: Any, active: Any
+) -> Any:
+    """Return the emission along rays that is covered by samples at emitters.
+
+    It is the fraction 1 - MIS weight of the emission of the next surface or of the
+    environment.
+
+    Args:
+        view: the scene.
+        si: surface interactions at which the rays begin.
+        si_next: surface interactions at which they end.
+        bsdf_pdf: densities by which their directions were sampled.
+        active: lanes that are computed.
+    """
+    ds_next = mi.DirectionSample3f(view.scene, si=si_next, ref=si)
+    em_pdf = view.scene.pdf_emitter_direction(si, ds_next, active)
+    mis = mi.ad.integrators.common.mis_weight(bsdf_pdf, em_pdf)
+    return (1.0 - mis) * ds_next.emitter.eval(si_next, active)
 
 
 def _reflect_light(
@@ -467,9 +561,30 @@ def _reflect_light(
     """
     flags = ds.emitter.flags()
     is_near = active & ~mi.has_flag(flags, mi.EmitterFlags.Infinite)
-    is_surface = is_near & mi.has_flag(flags, mi.EmitterFlags.Surface)
     to_light = ds.p - moving_si.p
     ds.d = dr.select(is_near, dr.replace_grad(ds.d, dr.normalize(to_light)), ds.d)
+    em_weight = _attach_emitter_weight(view, moving_si, ds, em_weight, is_near)
+    bsdf_value, bsdf_pdf = si.bsdf().eval_pdf(
+        mi.BSDFContext(), moving_si, moving_si.to_local(ds.d), active
+    )
+    mis_weight = mi.ad.integrators.common.mis_weight
+    mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf))
+    return dr.select(active, bsdf_value * em_weight * mis, 0.0)
+
+
+def _attach_emitter_weight(
+    view: FilmView, moving_si: Any, ds: Any, em_weight: Any, is_near: Any
+) -> Any:
+    """Return the light of sampled emitters with the gradient of the moving point.
+
+    Args:
+        view: the scene.
+        moving_si: the surface interaction, with gradients.
+        ds: Mitsuba's direction sample of the emitter, with a direction that has them.
+        em_weight: radiance of the emitter divided by the sample's density.
+        is_near: lanes whose emitter is not infinitely far.
+    """
+    is_surface = is_near & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Surface)
     # the emitter's radiance towards the moving point
     moving_radiance = view.scene.eval_emitter_direction(moving_si, ds, is_near)
     moving_weight = moving_radiance / dr.select(is_near, ds.pdf, 1.0)
@@ -482,10 +597,4 @@ def _reflect_light(
         is_surface, dr.squared_norm(ds.p - moving_si.p), 1.0
     )
     em_weight = dr.replace_grad(em_weight, moving_weight)
-    em_weight = em_weight * dr.select(is_surface, _with_relative_gradient(falloff), 1.0)
-    bsdf_value, bsdf_pdf = si.bsdf().eval_pdf(
-        mi.BSDFContext(), moving_si, moving_si.to_local(ds.d), active
-    )
-    mis_weight = mi.ad.integrators.common.mis_weight
-    mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf))
-    return dr.select(active, bsdf_value * em_weight * mis, 0.0)
+    return em_weight * dr.select(is_surface, _with_relative_gradient(falloff), 1.0)

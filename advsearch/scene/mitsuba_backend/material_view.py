@@ -163,25 +163,25 @@ class FilmView:
         self.padded_cotangent = to_drjit_array(
             torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1))
         )
+        self._sort_meshes(parameters, moving)
+
+    def _sort_meshes(self, parameters: Any, moving: Mapping[str, Tensor]) -> None:
+        """Set the meshes that move and those that do not, from the scene's shapes.
+
+        The arguments are those of the class.
+        """
         moving_meshes = dict[str, TriMesh]()
         self.still_meshes = list[TriMesh]()
-        for shape in scene.shapes():
+        for shape in self.scene.shapes():
             vertices_name = f"{shape.id()}.vertices"
             if vertices_name in moving:
-                positions = moving[vertices_name]
-                normals = moving[f"{shape.id()}.normals"]
-                mesh = _make_mesh(shape, parameters, positions, normals)
-                dr.enable_grad(mesh.positions, mesh.normals)
-                moving_meshes[vertices_name] = mesh
-            # all other meshes but single rectangles, which have two faces, such as the
-            # ground; the normals of still meshes are not used
-            elif shape.is_mesh() and shape.face_count() > 2:
-                buffer = parameters[f"{shape.id()}.{POSITIONS}"]
-                positions = buffer.torch().reshape(-1, 3).clone()
-                normals = torch.zeros_like(positions)
-                self.still_meshes.append(
-                    _make_mesh(shape, parameters, positions, normals)
+                moving_meshes[vertices_name] = _make_moving_mesh(
+                    shape, parameters, moving
                 )
+            # all other meshes but single rectangles, which have two faces, such as the
+            # ground
+            elif shape.is_mesh() and shape.face_count() > 2:
+                self.still_meshes.append(_make_still_mesh(shape, parameters))
         # In the order of `moving`, which decides the random numbers of each mesh. The
         # names of normals, which are in `moving` too, are skipped.
         self.moving_meshes = [
@@ -207,16 +207,35 @@ class FilmView:
         )
         fraction = padded_film - mi.Point2f(cell)
         # index of the cell's upper left corner in the padded image
-        padded_width = width + 2
-        corner = cell.y * padded_width + cell.x
-        cell_corners = [
+        corner = cell.y * (width + 2) + cell.x
+        # In Dr.Jit, a value & a mask is 0 where the mask is False.
+        return self._interpolate_in_cell(corner, fraction, active) & active
+
+    def _interpolate_in_cell(self, corner: Any, fraction: Any, active: Any) -> Any:
+        """Return the padded cotangent in cells, bilinear between their four corners.
+
+        Args:
+            corner: index of each cell's upper left corner in the padded image.
+            fraction: position in the cell, in [0, 1]^2.
+            active: lanes that are read.
+        """
+        upper_left, upper_right, lower_left, lower_right = self._gather_cell_corners(
+            corner, active
+        )
+        top = dr.lerp(upper_left, upper_right, fraction.x)
+        bottom = dr.lerp(lower_left, lower_right, fraction.x)
+        return dr.lerp(top, bottom, fraction.y)
+
+    def _gather_cell_corners(self, corner: Any, active: Any) -> list[Any]:
+        """Return the padded cotangent at four corners of cells, in the order of rows.
+
+        `corner` is the index of each cell's upper left corner in the padded image.
+        """
+        padded_width = self.camera.width + 2
+        return [
             dr.gather(mi.Color3f, self.padded_cotangent, corner + offset, active)
             for offset in (0, 1, padded_width, padded_width + 1)
         ]
-        top = dr.lerp(cell_corners[0], cell_corners[1], fraction.x)
-        bottom = dr.lerp(cell_corners[2], cell_corners[3], fraction.x)
-        # In Dr.Jit, a value & a mask is 0 where the mask is False.
-        return dr.lerp(top, bottom, fraction.y) & active
 
     def attach_hit(self, hit: Any) -> tuple[Any, Any, Any, Any]:
         """Return the surface point of a hit, attached to the vertices of moving meshes.
@@ -233,25 +252,13 @@ class FilmView:
         scaled_normal = mi.Normal3f(0, 0, 1)
         shading_normal = mi.Normal3f(0, 0, 1)
         is_moving = mi.Bool(False)
-        u, v = hit.prim_uv
         for mesh in self.moving_meshes:
             on_mesh = hit.is_valid() & (hit.shape == mesh.shape)
-            corners = dr.gather(mi.Point3u, mesh.faces, hit.prim_index, on_mesh)
-            a, b, c = (
-                dr.gather(mi.Point3f, mesh.positions, corner, on_mesh)
-                for corner in corners
+            mesh_point, face_normal, mesh_shading_normal = _attach_to_mesh(
+                mesh, hit, on_mesh
             )
-            face_normal = mi.Normal3f(dr.cross(b - a, c - a))
-            mesh_point = dr.fma(b - a, u, dr.fma(c - a, v, a))
             point = dr.select(on_mesh, mesh_point, point)
             scaled_normal = dr.select(on_mesh, face_normal, scaled_normal)
-            mesh_shading_normal = face_normal
-            if mesh.is_smooth:
-                a, b, c = (
-                    dr.gather(mi.Normal3f, mesh.normals, corner, on_mesh)
-                    for corner in corners
-                )
-                mesh_shading_normal = dr.fma(b - a, u, dr.fma(c - a, v, a))
             shading_normal = dr.select(on_mesh, mesh_shading_normal, shading_normal)
             is_moving = is_moving | on_mesh
         return point, scaled_normal, shading_normal, is_moving
@@ -273,6 +280,54 @@ class FilmView:
             dr.ADMode.Primal, self.scene, sampler, ray, derivative, state, active
         )
         return radiance
+
+
+def _attach_to_mesh(mesh: TriMesh, hit: Any, on_mesh: Any) -> tuple[Any, Any, Any]:
+    """Return points, normals and shading normals of hits, attached to a mesh.
+
+    They are those of `FilmView.attach_hit`. `on_mesh` are the lanes whose hit is on
+    this mesh.
+    """
+    corners = dr.gather(mi.Point3u, mesh.faces, hit.prim_index, on_mesh)
+    triangle = _gather_triangle(mi.Point3f, mesh.positions, corners, on_mesh)
+    a, b, c = triangle
+    face_normal = mi.Normal3f(dr.cross(b - a, c - a))
+    point = _interpolate_triangle(triangle, hit.prim_uv)
+    if not mesh.is_smooth:
+        return point, face_normal, face_normal
+    normals = _gather_triangle(mi.Normal3f, mesh.normals, corners, on_mesh)
+    return point, face_normal, _interpolate_triangle(normals, hit.prim_uv)
+
+
+def _gather_triangle(kind: Any, buffer: Any, corners: Any, active: Any) -> list[Any]:
+    """Return the values of a type at the three corners of faces, from a flat buffer."""
+    return [dr.gather(kind, buffer, corner, active) for corner in corners]
+
+
+def _interpolate_triangle(values: list[Any], uv: Any) -> Any:
+    """Interpolate the values at three corners by barycentric coordinates."""
+    a, b, c = values
+    u, v = uv
+    return dr.fma(b - a, u, dr.fma(c - a, v, a))
+
+
+def _make_moving_mesh(
+    shape: Any, parameters: Any, moving: Mapping[str, Tensor]
+) -> TriMesh:
+    """Make the mesh of a shape with the positions and normals in `moving`."""
+    positions = moving[f"{shape.id()}.vertices"]
+    normals = moving[f"{shape.id()}.normals"]
+    mesh = _make_mesh(shape, parameters, positions, normals)
+    dr.enable_grad(mesh.positions, mesh.normals)
+    return mesh
+
+
+def _make_still_mesh(shape: Any, parameters: Any) -> TriMesh:
+    """Make the mesh of a shape as it is; its normals are 0, since they are not used."""
+    buffer = parameters[f"{shape.id()}.{POSITIONS}"]
+    positions = buffer.torch().reshape(-1, 3).clone()
+    normals = torch.zeros_like(positions)
+    return _make_mesh(shape, parameters, positions, normals)
 
 
 def _make_mesh(
@@ -428,6 +483,40 @@ def compute_outline_term(
     )
     edge_point = mesh.interpolate_edge(sampled.ends, sampled.fraction)
     edge_film = view.camera.project(edge_point)
+    hit, strength = _look_past_outline(view, edge_point, edge_film, film_normal, stream)
+    film_behind = _locate_on_film(view, hit)
+    motion = dr.dot(film_normal, edge_film - film_behind)
+    # minus: where the outline moves outwards, the radiance behind is lost
+    return dr.sum(strength * motion) * -sampled.pixels_per_sample
+
+
+def _locate_on_film(view: FilmView, hit: Any) -> Any:
+    """Return the film positions of hits in pixels, attached to the vertices.
+
+    Only their gradients are used. So a point that does not move may have any position:
+    it is 0. This is called outside of `suspend_grad`, since the motion of the points is
+    differentiated.
+    """
+    point, _normal, _shading_normal, is_moving = view.attach_hit(hit)
+    return dr.select(is_moving, view.camera.project(point), 0.0)
+
+
+def _look_past_outline(
+    view: FilmView, edge_point: Any, edge_film: Any, film_normal: Any, stream: int
+) -> tuple[Any, Any]:
+    """Return what is behind points of an outline, and how much it matters.
+
+    Args:
+        view: the scene.
+        edge_point: points on the outline, in the world.
+        edge_film: their film positions in pixels.
+        film_normal: unit normals of the outline on the film, away from the mesh.
+        stream: stream of the random numbers, as from `make_stream`.
+
+    Returns:
+        The hits just past the outline, and the strengths, see
+        `_sample_outline_strength`.
+    """
     with dr.suspend_grad():
         # A ray just past the edge, on the side away from the mesh, sees what the edge
         # would hide if it moved outwards.
@@ -439,14 +528,7 @@ def compute_outline_term(
         strength = _sample_outline_strength(view, ray, edge_film, is_visible, stream)
         # Evaluated here, so that the backward pass does not trace the rays again.
         dr.eval(strength, hit)
-    # Outside of `suspend_grad`, since the motion is differentiated by the vertices.
-    # Only its gradient is used. So a point that does not move may have any position: it
-    # is 0.
-    point_behind, _normal, _shading_normal, moves_behind = view.attach_hit(hit)
-    film_behind = dr.select(moves_behind, view.camera.project(point_behind), 0.0)
-    motion = dr.dot(film_normal, edge_film - film_behind)
-    # minus: where the outline moves outwards, the radiance behind is lost
-    return dr.sum(strength * motion) * -sampled.pixels_per_sample
+    return hit, strength
 
 
 def _sample_outline_strength(
@@ -545,9 +627,8 @@ def _sample_outline(
     Returns:
         The samples; None if no outline is in the image.
     """
-    # An axis of a Dr.Jit point is an array over lanes, of which there is one here.
-    eye = torch.tensor([axis[0] for axis in camera.eye], dtype=torch.float64)
-    forward = torch.tensor([axis[0] for axis in camera.forward], dtype=torch.float64)
+    eye = _read_single_vector(camera.eye)
+    forward = _read_single_vector(camera.forward)
     ends, outwards = _find_outline(mesh, eye)
     if len(ends) == 0 or len(random) == 0:
         return None
@@ -559,18 +640,36 @@ def _sample_outline(
         return None
     edge_index, film_fraction = _sample_along(length, random)
 
-    # A short step away from the mesh, projected to the film, shows on which side of the
-    # edge the mesh is.
-    midpoints = mesh.vertices[ends].mean(dim=1)
-    outside_points = midpoints + 1e-3 * mesh.extent * outwards
-    outwards_on_film = project_to_film(camera, outside_points) - project_to_film(
-        camera, midpoints
-    )
+    outwards_on_film = _project_directions(camera, mesh, ends, outwards)
     edge_on_film = second_on_film[edge_index] - first_on_film[edge_index]
     normal = _find_film_normals(edge_on_film, outwards_on_film[edge_index])
     fraction = _to_space_fraction(film_fraction, depth[edge_index])
     pixels_per_sample = float(length.sum()) / len(random)
     return _OutlineSamples(ends[edge_index], fraction, normal, pixels_per_sample)
+
+
+def _read_single_vector(vector: Any) -> Tensor:
+    """Return a point or vector of Dr.Jit with a single lane as (3,) float64."""
+    # An axis is an array over lanes, of which there is one.
+    return torch.tensor([axis[0] for axis in vector], dtype=torch.float64)
+
+
+def _project_directions(
+    camera: Camera, mesh: TriMesh, ends: Tensor, outwards: Tensor
+) -> Tensor:
+    """Return directions (E, 2) on the film that lead away from the mesh at its edges.
+
+    Args:
+        camera: the camera.
+        mesh: the mesh.
+        ends: (E, 2) vertices of the edges.
+        outwards: (E, 3) unit directions away from the mesh.
+    """
+    # a short step away from the mesh, projected to the film
+    midpoints = mesh.vertices[ends].mean(dim=1)
+    outside_points = midpoints + 1e-3 * mesh.extent * outwards
+    outside_on_film = project_to_film(camera, outside_points)
+    return outside_on_film - project_to_film(camera, midpoints)
 
 
 def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
@@ -585,28 +684,37 @@ def _find_outline(mesh: TriMesh, eye: Tensor) -> tuple[Tensor, Tensor]:
     """
     edges = _find_edges(mesh.vertices, mesh.corners)
     ends = edges.ends
-    # (E, 3) normals of the planes
-    plane = torch.linalg.cross(
-        mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
-    )
-    plane = torch.nn.functional.normalize(plane, dim=1)
+    plane = _compute_plane_normals(mesh, ends, eye)
     # (3 F,) for each side of a face: signed distance of the face's third corner from
     # the plane of the edge on which the side lies
     corner_from_eye = mesh.vertices[edges.third_corner] - eye
     offset_from_plane = (plane[edges.edge_of_side] * corner_from_eye).sum(dim=1)
-    # (E,) the smallest and the largest distance over the faces at an edge
-    min_offset = torch.full(
-        (len(ends),), torch.inf, dtype=offset_from_plane.dtype
-    ).scatter_reduce(0, edges.edge_of_side, offset_from_plane, "amin")
-    max_offset = torch.full(
-        (len(ends),), -torch.inf, dtype=offset_from_plane.dtype
-    ).scatter_reduce(0, edges.edge_of_side, offset_from_plane, "amax")
+    min_offset, max_offset = _find_offset_range(edges, offset_from_plane)
     are_faces_in_front = min_offset > 0.0  # all on the side of the plane's normal
     are_faces_behind = max_offset < 0.0
     on_outline = are_faces_in_front | are_faces_behind
     # turns the normals away from the faces
     sign = torch.where(are_faces_in_front[on_outline], -1.0, 1.0)[:, None]
     return ends[on_outline], plane[on_outline] * sign
+
+
+def _compute_plane_normals(mesh: TriMesh, ends: Tensor, eye: Tensor) -> Tensor:
+    """Return unit normals (E, 3) of the planes through edges (E, 2) and an eye (3,)."""
+    normal = torch.linalg.cross(
+        mesh.vertices[ends[:, 0]] - eye, mesh.vertices[ends[:, 1]] - eye
+    )
+    return torch.nn.functional.normalize(normal, dim=1)
+
+
+def _find_offset_range(edges: _MeshEdges, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the smallest and the largest offset (E,) over the faces at each edge.
+
+    `offset` (3 F,) has a number for each side of a face.
+    """
+    infinite = torch.full((len(edges.ends),), torch.inf, dtype=offset.dtype)
+    smallest = infinite.scatter_reduce(0, edges.edge_of_side, offset, "amin")
+    largest = (-infinite).scatter_reduce(0, edges.edge_of_side, offset, "amax")
+    return smallest, largest
 
 
 def _sample_along(length: Tensor, random: Tensor) -> tuple[Tensor, Tensor]:
@@ -697,21 +805,37 @@ def compute_shadow_term(
         shadow = _sample_shadow_borders(view, mesh, lines, stream)
     if shadow is None:
         return mi.Float(0)
+    motion = _compute_border_motion(view, mesh, lines, shadow)
+    sine = _compute_edge_sines(mesh, lines)
+    strength = shadow.strength * to_drjit_float(sine[shadow.line_index])
+    # minus: where the edge moves outwards, light is blocked
+    return dr.sum(strength * motion) * -lines.measure_per_sample
+
+
+def _compute_border_motion(
+    view: FilmView, mesh: TriMesh, lines: _TangentLines, shadow: _ShadowBorders
+) -> Any:
+    """Return a value whose gradient is the motion of edges relative to lit points.
+
+    It is the component along the edges' normals.
+    """
     # Only the gradient of the motion is used. So a lit point that does not move may
     # have any position: it is 0.
     index = shadow.line_index
     lit_point, _normal, _shading_normal, lit_point_moves = view.attach_hit(shadow.hit)
     edge_point = mesh.interpolate_edge(lines.ends[index], lines.fraction[index])
     moving_lit_point = dr.select(lit_point_moves, lit_point, 0.0)
-    motion = dr.dot(shadow.edge_normal, edge_point - moving_lit_point)
-    # sine of the angle between each line and its edge: an edge along the line sweeps no
-    # area
-    sine = torch.linalg.cross(
-        lines.direction, _compute_edge_directions(mesh.vertices, lines.ends)
-    ).norm(dim=1)
-    strength = shadow.strength * to_drjit_float(sine[index])
-    # minus: where the edge moves outwards, light is blocked
-    return dr.sum(strength * motion) * -lines.measure_per_sample
+    return dr.dot(shadow.edge_normal, edge_point - moving_lit_point)
+
+
+def _compute_edge_sines(mesh: TriMesh, lines: _TangentLines) -> Tensor:
+    """Return the sine (n,) of the angle between each line and its edge.
+
+    An edge along the line sweeps no area.
+    """
+    edge_direction = _compute_edge_directions(mesh.vertices, lines.ends)
+    sine: Tensor = torch.linalg.cross(lines.direction, edge_direction).norm(dim=1)
+    return sine
 
 
 class _ShadowBorders(NamedTuple):
@@ -737,12 +861,7 @@ def _sample_shadow_borders(
         lines: sampled edge points, and lines through them.
         stream: stream of the random numbers, as from `make_stream`.
     """
-    edge_points = torch.lerp(
-        mesh.vertices[lines.ends[:, 0]],
-        mesh.vertices[lines.ends[:, 1]],
-        lines.fraction[:, None],
-    )
-    edge_position = to_drjit_vectors(mi.Point3f, edge_points)
+    edge_position = to_drjit_vectors(mi.Point3f, _locate_edge_points(mesh, lines))
     to_light = to_drjit_vectors(mi.Vector3f, lines.direction)
     edge_normal = to_drjit_vectors(mi.Vector3f, lines.normal)
     offset = SHADOW_OFFSET * mesh.extent * edge_normal
@@ -756,15 +875,12 @@ def _sample_shadow_borders(
     line_index = dr.compress(dr.any(light_weight != 0.0))
     if dr.width(line_index) == 0:
         return None
-    light_weight, hit, si, edge_position, offset, edge_normal = (
-        dr.gather(type(value), value, line_index)
-        for value in (light_weight, hit, si, edge_position, offset, edge_normal)
+    light_weight, hit, si, edge_position, offset, edge_normal = _select_lanes(
+        line_index, light_weight, hit, si, edge_position, offset, edge_normal
     )
     # how much the loss changes as the lit point passes the shadow's border
     difference = _sample_radiance_difference(view, si, edge_position, offset, stream)
-    strength = dr.sum(light_weight * difference)
-    # A sample that is not finite is left out, so that it does not spoil the sum.
-    strength = dr.select(dr.isfinite(strength), strength, 0.0)
+    strength = _multiply_finite(light_weight, difference)
     dr.eval(strength, hit)
     return _ShadowBorders(
         line_index=line_index.torch().to("cpu", torch.int64),
@@ -772,6 +888,27 @@ def _sample_shadow_borders(
         edge_normal=edge_normal,
         strength=strength,
     )
+
+
+def _select_lanes(lanes: Any, *values: Any) -> list[Any]:
+    """Return each of some values of Dr.Jit with only the lanes of these indices."""
+    return [dr.gather(type(value), value, lanes) for value in values]
+
+
+def _locate_edge_points(mesh: TriMesh, lines: _TangentLines) -> Tensor:
+    """Return the points (n, 3) of the mesh's edges through which the lines go."""
+    first_end = mesh.vertices[lines.ends[:, 0]]
+    second_end = mesh.vertices[lines.ends[:, 1]]
+    return torch.lerp(first_end, second_end, lines.fraction[:, None])
+
+
+def _multiply_finite(light_weight: Any, difference: Any) -> Any:
+    """Return the sum over the color channels of the products, 0 if it is not finite.
+
+    So a bad sample does not spoil the sum over all samples.
+    """
+    strength = dr.sum(light_weight * difference)
+    return dr.select(dr.isfinite(strength), strength, 0.0)
 
 
 def _weigh_lit_points(view: FilmView, si: Any, to_light: Any) -> Any:
@@ -801,6 +938,24 @@ def _weigh_lit_points(view: FilmView, si: Any, to_light: Any) -> Any:
     weight = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(to_light), is_visible)
     is_visible &= dr.any(weight > 0.0)
     is_visible &= ~view.scene.ray_test(si.spawn_ray_to(camera.eye), is_visible)
+    film_area = _compute_film_area(camera, si, to_eye, depth)
+    # An area across the bundle covers 1 / cosine of the surface where the light
+    # arrives.
+    cosine = dr.abs(dr.dot(si.n, to_light))
+    weight *= film_area / dr.maximum(cosine, MIN_COSINE)
+    cotangent = view.interpolate_cotangent(film, is_visible)
+    return dr.select(is_visible, weight * cotangent, 0.0)
+
+
+def _compute_film_area(camera: Camera, si: Any, to_eye: Any, depth: Any) -> Any:
+    """Return the area in pixels that a unit area of the surface covers on the film.
+
+    Args:
+        camera: the camera.
+        si: surface interactions of points.
+        to_eye: vectors from the points to the camera.
+        depth: depths of the points.
+    """
     matrix = camera.to_film.matrix
     # Area in pixels of a unit square at depth 1 that faces the camera. An entry of the
     # matrix is an array with one lane.
@@ -809,16 +964,10 @@ def _weigh_lit_points(view: FilmView, si: Any, to_light: Any) -> Any:
     pixels_at_unit_depth = abs(
         film_widths_per_unit * camera.width * film_heights_per_unit * camera.height
     )
-    # Area in pixels of a unit area of the surface. The cosine at the surface over the
-    # squared depth would hold on the camera's axis; away from it the product with
-    # `to_eye`, which is longer than the depth, needs the third power.
-    film_area = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixels_at_unit_depth
-    # An area across the bundle covers 1 / cosine of the surface where the light
-    # arrives.
-    cosine = dr.abs(dr.dot(si.n, to_light))
-    weight *= film_area / dr.maximum(cosine, MIN_COSINE)
-    cotangent = view.interpolate_cotangent(film, is_visible)
-    return dr.select(is_visible, weight * cotangent, 0.0)
+    # The cosine at the surface over the squared depth would hold on the camera's axis;
+    # away from it the product with `to_eye`, which is longer than the depth, needs the
+    # third power.
+    return dr.abs(dr.dot(si.n, to_eye)) / depth**3 * pixels_at_unit_depth
 
 
 def _sample_radiance_difference(
@@ -837,29 +986,45 @@ def _sample_radiance_difference(
         stream: stream of random numbers; both sides have the same.
     """
 
-    def make_ray(target: Any) -> Any:
-        """Return a ray from the lit point that does not end at the target."""
-        ray = si.spawn_ray_to(target)
-        return mi.Ray3f(ray.o, ray.d)
-
     past_edge = edge_point + offset
     inside_edge = edge_point - offset
-    occluder = view.scene.ray_intersect_preliminary(make_ray(past_edge), coherent=False)
+    is_free = _is_edge_free(view, si, edge_point, offset)
+    past = _sample_radiance_from(view, si, past_edge, stream, is_free)
+    inside = _sample_radiance_from(view, si, inside_edge, stream, is_free)
+    difference = past - inside
+    return dr.select(is_free, difference, 0.0)
+
+
+def _is_edge_free(view: FilmView, si: Any, edge_point: Any, offset: Any) -> Any:
+    """Return whether nothing but the mesh itself hides an edge from lit points.
+
+    The arguments are those of `_sample_radiance_difference`.
+    """
+    ray = _make_endless_ray(si, edge_point + offset)
+    occluder = view.scene.ray_intersect_preliminary(ray, coherent=False)
     # The mesh itself, at the edge or within two offsets of it, is no occluder.
     max_distance = dr.norm(edge_point - si.p) * (1.0 - DEPTH_TOLERANCE)
     max_distance -= 2.0 * dr.norm(offset)
-    is_free = ~occluder.is_valid() | (occluder.t > max_distance)
+    return ~occluder.is_valid() | (occluder.t > max_distance)
 
-    def sample_radiance(target: Any) -> Any:
-        """Return the radiance from the direction of a target, with equal noise."""
-        sampler = make_sampler(stream + _PATHS, dr.width(edge_point))
-        # The camera's segment is one of the path's `max_depth`.
-        return view.sample_radiance(
-            make_ray(target), sampler, view.max_depth - 1, is_free
-        )
 
-    difference = sample_radiance(past_edge) - sample_radiance(inside_edge)
-    return dr.select(is_free, difference, 0.0)
+def _sample_radiance_from(
+    view: FilmView, si: Any, target: Any, stream: int, active: Any
+) -> Any:
+    """Return the radiance at lit points from the direction of targets.
+
+    The noise is the same in each call with the same `stream`.
+    """
+    sampler = make_sampler(stream + _PATHS, dr.width(target))
+    ray = _make_endless_ray(si, target)
+    # The camera's segment is one of the path's `max_depth`.
+    return view.sample_radiance(ray, sampler, view.max_depth - 1, active)
+
+
+def _make_endless_ray(si: Any, target: Any) -> Any:
+    """Return a ray from a lit point that does not end at the target."""
+    ray = si.spawn_ray_to(target)
+    return mi.Ray3f(ray.o, ray.d)
 
 
 class _TangentLines(NamedTuple):
@@ -910,19 +1075,12 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
     # Both faces go from the edge to the side where the mesh is.
     inwards = edges.along_first[edge_index] + along_second
 
-    # A direction perpendicular to the edge, within the exterior angle: `along_second`
-    # rotated about the edge towards `opening`.
-    angle = random[:, 2:3] * edges.angle[edge_index][:, None]
-    perpendicular = (
-        torch.cos(angle) * along_second + torch.sin(angle) * edges.opening[edge_index]
-    )
+    perpendicular = _sample_exterior_angle(edges, edge_index, random[:, 2:3])
     # The last random number is scaled to -2 to 2. Its sign chooses the exterior angle
     # or the opposite one, and its magnitude minus 1 is the cosine of line and edge.
     signed_choice = 4.0 * random[:, 3:4] - 2.0
     perpendicular = torch.where(signed_choice < 0.0, -perpendicular, perpendicular)
-    edge_cosine = signed_choice.abs() - 1.0
-    edge_sine = (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt()
-    direction = edge_cosine * axis + edge_sine * perpendicular
+    direction = _tilt_to_edges(perpendicular, axis, signed_choice.abs() - 1.0)
 
     normal = _orient_outwards(torch.linalg.cross(axis, perpendicular), inwards)
     # `measure` contains the edge's length and the exterior angle. The range of
@@ -934,6 +1092,32 @@ def _sample_tangents(mesh: TriMesh, random: Tensor) -> _TangentLines | None:
         normal=normal,
         measure_per_sample=4.0 * float(measure.sum()) / len(random),
     )
+
+
+def _sample_exterior_angle(
+    edges: _ExteriorAngles, edge_index: Tensor, random: Tensor
+) -> Tensor:
+    """Sample unit directions (n, 3) perpendicular to edges, in their exterior angles.
+
+    Args:
+        edges: the edges.
+        edge_index: (n,) index of the edge of each sample.
+        random: (n, 1) numbers in [0, 1).
+    """
+    # `along_second` rotated about the edge towards `opening`
+    angle = random * edges.angle[edge_index][:, None]
+    along_second = edges.along_second[edge_index]
+    opening = edges.opening[edge_index]
+    return torch.cos(angle) * along_second + torch.sin(angle) * opening
+
+
+def _tilt_to_edges(perpendicular: Tensor, axis: Tensor, edge_cosine: Tensor) -> Tensor:
+    """Return unit directions (n, 3) that have a cosine (n, 1) with the edges' axes.
+
+    `perpendicular` and `axis` are unit vectors (n, 3), perpendicular to each other.
+    """
+    edge_sine = (1.0 - edge_cosine.square()).clamp_min(0.0).sqrt()
+    return edge_cosine * axis + edge_sine * perpendicular
 
 
 class _ExteriorAngles(NamedTuple):
@@ -958,33 +1142,18 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
     """
     vertices = mesh.vertices
     edges = _find_edges(vertices, mesh.corners)
-    # Sort the sides of faces by their edge, so that those of one edge follow one
-    # another. The first and the last of them belong to its two faces; at an edge with a
-    # single face they are the same.
-    sorted_sides = torch.argsort(edges.edge_of_side, stable=True)
     n_faces = torch.bincount(edges.edge_of_side, minlength=len(edges.ends))
-    # (E,) where the sides of each edge begin and end in `sorted_sides`
-    last_index = n_faces.cumsum(dim=0) - 1
-    first_index = last_index - n_faces + 1
+    first_side, last_side = _find_outer_sides(edges, n_faces)
     length = _compute_edge_vectors(vertices, edges.ends).norm(dim=1)
     is_measured = (n_faces <= 2) & (length > 0.0)
     ends = edges.ends[is_measured]
     axis = _compute_edge_directions(vertices, ends)
+    start = vertices[ends[:, 0]]
 
-    def compute_face_directions(index: Tensor) -> Tensor:
-        """Return unit vectors along faces, perpendicular to the measured edges.
-
-        Args:
-            index: (E,) for every edge the index of a side in `sorted_sides`.
-        """
-        side = sorted_sides[index[is_measured]]
-        vector = vertices[edges.third_corner[side]] - vertices[ends[:, 0]]
-        return torch.nn.functional.normalize(
-            vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1
-        )
-
-    along_first = compute_face_directions(first_index)
-    along_second = compute_face_directions(last_index)
+    first_corner = vertices[edges.third_corner[first_side[is_measured]]]
+    last_corner = vertices[edges.third_corner[last_side[is_measured]]]
+    along_first = _remove_component(first_corner - start, axis)
+    along_second = _remove_component(last_corner - start, axis)
     is_single = n_faces[is_measured] == 1
     opening, angle = _measure_between_faces(along_first, along_second, axis, is_single)
     return _ExteriorAngles(
@@ -995,6 +1164,27 @@ def _measure_exterior_angles(mesh: TriMesh) -> _ExteriorAngles:
         opening=opening,
         angle=angle,
     )
+
+
+def _find_outer_sides(edges: _MeshEdges, n_faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Return for each edge the first and the last side (E,) of a face on it.
+
+    They belong to the two faces at the edge; at an edge with a single face they are the
+    same. `n_faces` (E,) is the number of faces at each edge.
+    """
+    # Sort the sides of faces by their edge, so that those of one edge follow one
+    # another.
+    sorted_sides = torch.argsort(edges.edge_of_side, stable=True)
+    # (E,) where the sides of each edge begin and end in `sorted_sides`
+    last_index = n_faces.cumsum(dim=0) - 1
+    first_index = last_index - n_faces + 1
+    return sorted_sides[first_index], sorted_sides[last_index]
+
+
+def _remove_component(vectors: Tensor, axis: Tensor) -> Tensor:
+    """Return unit vectors (N, 3): the parts of vectors perpendicular to unit axes."""
+    along_axis = (vectors * axis).sum(dim=1, keepdim=True) * axis
+    return torch.nn.functional.normalize(vectors - along_axis, dim=1)
 
 
 def _measure_between_faces(

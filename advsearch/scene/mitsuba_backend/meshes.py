@@ -65,17 +65,7 @@ def make_principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
         part: the mesh.
         extra: further entries of the principled plugin.
     """
-    material = part.material
-    surface: Plugin = {
-        "type": "principled",
-        "base_color": make_texture(srgb_to_linear(part.base_color)),
-        "roughness": material.roughness,
-        "metallic": clamp_to_rendered("metallic", material.metallic),
-        "specular": clamp_to_rendered("specular", material.specular),
-        **(extra or {}),
-    }
-    if material.clearcoat > 0.0:
-        surface["clearcoat"] = clamp_to_rendered("clearcoat", material.clearcoat)
+    surface = _make_single_sided_surface(part, extra or {})
     bsdf: Plugin = {"type": "twosided", "bsdf": surface}
     if part.normal_map is not None:
         bsdf = {
@@ -90,6 +80,22 @@ def make_principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
             "bsdf": bsdf,
         }
     return bsdf
+
+
+def _make_single_sided_surface(part: MeshPart, extra: Plugin) -> Plugin:
+    """Return the one-sided principled BSDF of a mesh, with further entries `extra`."""
+    material = part.material
+    surface: Plugin = {
+        "type": "principled",
+        "base_color": make_texture(srgb_to_linear(part.base_color)),
+        "roughness": material.roughness,
+        "metallic": clamp_to_rendered("metallic", material.metallic),
+        "specular": clamp_to_rendered("specular", material.specular),
+        **extra,
+    }
+    if material.clearcoat > 0.0:
+        surface["clearcoat"] = clamp_to_rendered("clearcoat", material.clearcoat)
+    return surface
 
 
 def clamp_to_rendered(name: str, value: float) -> float:
@@ -123,17 +129,21 @@ def compute_sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     powers: dict[str, float] = {}
     for part in parts:
         if part.emission is not None:
-            vertices = part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
-            vectors = compute_area_vectors(vertices[part.mesh.faces])
-            # In proportion to the power: only fractions of the total count.
-            doubled_area = np.linalg.norm(vectors, axis=1).sum()
-            powers[part.name] = float(part.emission.mean() * doubled_area)
+            powers[part.name] = _compute_relative_power(part, part.emission)
     total = max(sum(powers.values()), 1e-30)  # of faces without area it is 0
     return {
         name: (1.0 - MIN_WEIGHT_FRACTION) * power / total
         + MIN_WEIGHT_FRACTION / len(powers)
         for name, power in powers.items()
     }
+
+
+def _compute_relative_power(part: MeshPart, emission: Float32Array) -> float:
+    """Return the power of a mesh that emits light, up to a constant factor."""
+    vertices = part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T
+    vectors = compute_area_vectors(vertices[part.mesh.faces])
+    doubled_area = np.linalg.norm(vectors, axis=1).sum()
+    return float(emission.mean() * doubled_area)
 
 
 def has_textured_emission(part: MeshPart) -> bool:
@@ -223,18 +233,25 @@ def to_repeating_uv(
         matrix = torch.as_tensor(np.asarray(options["to_uv"]), dtype=uv.dtype)
         uv = uv @ matrix[:2, :2].T + matrix[:2, -1]  # (3, 3) or (4, 4)
     texture_size = torch.tensor((size[1], size[0]), dtype=uv.dtype)
-    wrap_mode = options.get("wrap_mode", "repeat")
-    if wrap_mode == "mirror":
-        uv = 1.0 - (uv % 2.0 - 1.0).abs()  # back and forth in [0, 1]
-    # within half a texel of the border the texture does not blend with the other side
-    if wrap_mode != "repeat":
-        uv = torch.minimum(
-            torch.maximum(uv, 0.5 / texture_size), 1.0 - 0.5 / texture_size
-        )
+    uv = _wrap_uv(uv, options.get("wrap_mode", "repeat"), texture_size)
     # At the center of a texel, interpolation returns that texel alone.
     if options.get("filter_type") == "nearest":
         return (torch.floor(uv * texture_size) + 0.5) / texture_size
     return uv
+
+
+def _wrap_uv(uv: Tensor, wrap_mode: object, texture_size: Tensor) -> Tensor:
+    """Convert mirrored or clamped texture coordinates (n, 2) for a repeating texture.
+
+    `texture_size` is its width and height in texels.
+    """
+    if wrap_mode == "mirror":
+        uv = 1.0 - (uv % 2.0 - 1.0).abs()  # back and forth in [0, 1]
+    if wrap_mode == "repeat":
+        return uv
+    # within half a texel of the border the texture does not blend with the other side
+    half_texel = 0.5 / texture_size
+    return torch.minimum(torch.maximum(uv, half_texel), 1.0 - half_texel)
 
 
 def make_mitsuba_mesh(
@@ -246,8 +263,6 @@ def make_mitsuba_mesh(
 ) -> Any:
     """Make a Mitsuba mesh under a pose, with shading normals and texture coordinates.
 
-    Mitsuba's bitmaps have row 0 at v = 0 and ours have it at v = 1, so v is flipped.
-
     Args:
         name: Mitsuba's id of the mesh.
         mesh: the mesh.
@@ -255,6 +270,26 @@ def make_mitsuba_mesh(
         bsdf: dictionary of its surface.
         light: dictionary of the light that it emits, or None.
     """
+    vertices, normals = _transform_mesh(mesh, to_world)
+    plugin = mi.Mesh(
+        name,
+        vertex_count=len(vertices),
+        face_count=len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=_make_mesh_properties(bsdf, light),
+    )
+    _set_mesh_arrays(plugin, mesh, vertices, normals)
+    for key, values in mesh.attributes.items():
+        flat_values = np.ascontiguousarray(values, np.float32).ravel()
+        plugin.add_attribute(key, values.shape[1], flat_values)
+    return plugin
+
+
+def _transform_mesh(
+    mesh: Mesh, to_world: Float64Array
+) -> tuple[Float64Array, Float64Array]:
+    """Return the vertices and the unit normals (V, 3) of a mesh in the world."""
     linear = to_world[:3, :3]
     vertices = multiply_rows(mesh.vertices.astype(np.float64), linear.T)
     vertices += to_world[:3, 3]
@@ -262,30 +297,33 @@ def make_mitsuba_mesh(
     inverse = np.linalg.inv(linear).astype(np.float64)
     normals = multiply_rows(mesh.normals.astype(np.float64), inverse)
     normals /= np.maximum(compute_lengths(normals), 1e-12)
-    uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
+    return vertices, normals
+
+
+def _make_mesh_properties(bsdf: Plugin, light: Plugin | None) -> Any:
+    """Return Mitsuba's properties of a mesh with a surface and perhaps a light."""
     properties = mi.Properties()
     # Optimizing would merge equal values into one object: to change one would change
     # all.
     properties["bsdf"] = mi.load_dict(bsdf, optimize=False)
     if light is not None:
         properties["emitter"] = mi.load_dict(light, optimize=False)
-    plugin = mi.Mesh(
-        name,
-        vertex_count=len(vertices),
-        face_count=len(mesh.faces),
-        has_vertex_normals=True,
-        has_vertex_texcoords=True,
-        props=properties,
-    )
+    return properties
+
+
+def _set_mesh_arrays(
+    plugin: Any, mesh: Mesh, vertices: Float64Array, normals: Float64Array
+) -> None:
+    """Set vertices, normals, texture coordinates and faces of a Mitsuba mesh.
+
+    Mitsuba's bitmaps have row 0 at v = 0 and ours have it at v = 1, so v is flipped.
+    """
+    uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
     parameters = mi.traverse(plugin)
     for key, values in ((POSITIONS, vertices), (NORMALS, normals), (TEXCOORDS, uvs)):
         parameters[key] = mi.Float(values.astype(np.float32).ravel())
     parameters[FACES] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
     parameters.update()
-    for key, values in mesh.attributes.items():
-        flat_values = np.ascontiguousarray(values, np.float32).ravel()
-        plugin.add_attribute(key, values.shape[1], flat_values)
-    return plugin
 
 
 def to_loadable(plugin: Mapping[str, object]) -> Plugin:

@@ -51,27 +51,45 @@ def find_plugin_numbers(
         InputError: there is something else than a number or a color.
     """
     numbers, other_types = _find_numbers(description)
-    # maps the key of a channel, such as "mug.bsdf.reflectance.red", to its color's key
-    color_of_channel: dict[str, str] = {}
-    for key, plugin_number in numbers.items():
-        if len(plugin_number.values) > 1:
-            color_of_channel |= {f"{key}.{channel}": key for channel in CHANNELS}
+    color_of_channel = _map_channels(numbers)
     # in the requested order, a color of which several channels are requested once
     full_keys = tuple(dict.fromkeys(color_of_channel.get(key, key) for key in keys))
     for key in full_keys:
-        if key in other_types:
-            raise InputError(
-                f"`controls` mitsuba:{key}: expected a number or a colour, and Mitsuba "
-                f"has {other_types[key]} there; other controls may move it, such as "
-                "pose and texture"
-            )
-        if key not in numbers:
-            raise UnknownNameError("number or colour in Mitsuba", key, numbers)
+        _check_is_number(key, numbers, other_types)
     # The scene may have an input for the number already; else it gets a new one.
     return tuple(
         replace(numbers[key], input=numbers[key].input or f"{name}.{key}")
         for key in full_keys
     )
+
+
+def _map_channels(numbers: dict[str, PluginNumber]) -> dict[str, str]:
+    """Return the key of each color by the keys of its channels.
+
+    A channel's key is such as "mug.bsdf.reflectance.red".
+    """
+    color_of_channel: dict[str, str] = {}
+    for key, plugin_number in numbers.items():
+        if len(plugin_number.values) > 1:
+            color_of_channel |= {f"{key}.{channel}": key for channel in CHANNELS}
+    return color_of_channel
+
+
+def _check_is_number(
+    key: str, numbers: dict[str, PluginNumber], other_types: dict[str, str]
+) -> None:
+    """Raise an error if a scene has no number or color at one of Mitsuba's keys.
+
+    `numbers` and `other_types` are those of `_find_numbers`.
+    """
+    if key in other_types:
+        raise InputError(
+            f"`controls` mitsuba:{key}: expected a number or a colour, and Mitsuba "
+            f"has {other_types[key]} there; other controls may move it, such as "
+            "pose and texture"
+        )
+    if key not in numbers:
+        raise UnknownNameError("number or colour in Mitsuba", key, numbers)
 
 
 @lru_cache(maxsize=1)
@@ -87,36 +105,58 @@ def _find_numbers(
         if there is one; and the type of everything else by its key, for messages.
     """
     scene = MitsubaScene(description, SMALL_RESOLUTION)
-    # Names of inputs that are numbers or colors, by Mitsuba's key. These are written
-    # with the functions `to_flat_array` and `to_color`; textures and poses are not.
-    input_of_key = {
-        key: name
-        for name, (key, scene_input) in scene.declared_inputs.items()
-        if scene_input.convert_to_mitsuba in (to_flat_array, to_color)
-    }
+    input_of_key = _find_input_names(scene)
     numbers: dict[str, PluginNumber] = {}
     other_types: dict[str, str] = {}
     for key in scene.parameters.keys():
         value = scene.parameters[key]
-        # A Python float is a constant that Mitsuba compiles into its kernels.
-        is_plain = isinstance(value, float)
-        is_single_number = isinstance(value, mi.Float) and len(value) == 1
-        if is_plain:
-            values: tuple[float, ...] = (value,)
-        elif is_single_number or isinstance(value, mi.Color3f):
-            values = tuple(map(float, np.array(value).reshape(-1)))
-        else:
+        values = _read_values(value)
+        if values is None:
             other_types[key] = f"a {type(value).__name__}"
-            continue
-        estimators = _find_valid_estimators(scene.parameters.flags(key))
-        numbers[key] = PluginNumber(
-            key,
-            values,
-            input=input_of_key.get(key, ""),
-            valid=estimators,
-            plain=is_plain,
-        )
+        else:
+            name = input_of_key.get(key, "")
+            numbers[key] = _make_plugin_number(scene, key, values, name)
     return numbers, other_types
+
+
+def _make_plugin_number(
+    scene: MitsubaScene, key: str, values: tuple[float, ...], input_name: str
+) -> PluginNumber:
+    """Return a number or a color of a scene by Mitsuba's key.
+
+    `input_name` is the scene's own input for it, or empty.
+    """
+    return PluginNumber(
+        key,
+        values,
+        input=input_name,
+        valid=_find_valid_estimators(scene.parameters.flags(key)),
+        # A Python float is a constant that Mitsuba compiles into its kernels.
+        plain=isinstance(scene.parameters[key], float),
+    )
+
+
+def _find_input_names(scene: MitsubaScene) -> dict[str, str]:
+    """Return names of a scene's inputs that are numbers or colors, by Mitsuba's key.
+
+    These are written with the functions `to_flat_array` and `to_color`; textures and
+    poses are not.
+    """
+    return {
+        key: name
+        for name, (key, scene_input) in scene.declared_inputs.items()
+        if scene_input.convert_to_mitsuba in (to_flat_array, to_color)
+    }
+
+
+def _read_values(value: object) -> tuple[float, ...] | None:
+    """Return the number or the three of a color of Mitsuba; None for anything else."""
+    if isinstance(value, float):
+        return (value,)
+    is_single_number = isinstance(value, mi.Float) and len(value) == 1
+    if is_single_number or isinstance(value, mi.Color3f):
+        return tuple(map(float, np.array(value).reshape(-1)))
+    return None
 
 
 def _find_valid_estimators(flags: int) -> tuple[str, ...]:

@@ -109,19 +109,39 @@ def _find_highest_drops(drops: Float64Array, half_width: float) -> IntArray:
     ) / GRID_SIZE * 2.0 * half_width - half_width
     highest_drop = np.full((GRID_SIZE, GRID_SIZE), len(drops))  # no drop
     max_height = np.zeros((GRID_SIZE, GRID_SIZE))
-    for index, (x, y, radius, curvature_radius) in enumerate(drops):
-        # only the cells in the square around the drop are computed
-        rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
-        columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
-        dy = cell_centers[rows] - y
-        dx = cell_centers[columns] - x
-        distance_squared = dy[:, None] ** 2 + dx[None] ** 2
-        height = _compute_cap_height(distance_squared, radius, curvature_radius)
-        cells = np.ix_(rows, columns)
-        is_higher = (distance_squared < radius**2) & (height > max_height[cells])
-        highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
-        max_height[cells] = np.where(is_higher, height, max_height[cells])
+    for index, drop in enumerate(drops):
+        _put_drop(highest_drop, max_height, cell_centers, index, drop)
     return highest_drop
+
+
+def _put_drop(
+    highest_drop: IntArray,
+    max_height: Float64Array,
+    cell_centers: Float64Array,
+    index: int,
+    drop: Float64Array,
+) -> None:
+    """Put a drop into a grid where it is higher than the drops so far.
+
+    Args:
+        highest_drop: (GRID, GRID) index of the highest drop so far; is changed.
+        max_height: (GRID, GRID) its height, millimeters, 0 without one; is changed.
+        cell_centers: (GRID,) coordinates of the cells' centers, the same for x and y.
+        index: index of the drop.
+        drop: (4,) x, y, radius on the sheet, and radius of curvature.
+    """
+    x, y, radius, curvature_radius = drop
+    # only the cells in the square around the drop are computed
+    rows = np.flatnonzero(np.abs(cell_centers - y) <= radius)
+    columns = np.flatnonzero(np.abs(cell_centers - x) <= radius)
+    dy = cell_centers[rows] - y
+    dx = cell_centers[columns] - x
+    distance_squared = dy[:, None] ** 2 + dx[None] ** 2
+    height = _compute_cap_height(distance_squared, radius, curvature_radius)
+    cells = np.ix_(rows, columns)
+    is_higher = (distance_squared < radius**2) & (height > max_height[cells])
+    highest_drop[cells] = np.where(is_higher, index, highest_drop[cells])
+    max_height[cells] = np.where(is_higher, height, max_height[cells])
 
 
 common: Any = mi.ad.integrators.common
@@ -436,13 +456,29 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         distance = dr.select(is_environment, dr.inf, ds.dist)
         _, haze_length = self._find_haze_segment(event.p, ds.d, distance)
         if not primal:
-            # The sampled weight has no gradient. The emitter is evaluated again with
-            # gradients; the value stays that of the sample.
-            with dr.resume_grad():
-                radiance = scene.eval_emitter_direction(event, ds, active)
-                inverse_density = dr.select(active, dr.rcp(ds.pdf), 0.0)
-                weight = dr.replace_grad(weight, radiance * inverse_density)
+            weight = _attach_sampled_light(scene, event, ds, weight, active)
         return ds, weight, haze_length, active
+
+
+def _attach_sampled_light(
+    scene: Any, event: Any, ds: Any, weight: Any, active: Any
+) -> Any:
+    """Return the weights of emitter samples, attached to the emitters' parameters.
+
+    A sampled weight has no gradient. The emitter is evaluated again with gradients; the
+    value stays that of the sample.
+
+    Args:
+        scene: Mitsuba's scene.
+        event: the event from which the emitters were sampled.
+        ds: Mitsuba's direction sample.
+        weight: radiance over density of the sample.
+        active: lanes in which there is a sample.
+    """
+    with dr.resume_grad():
+        radiance = scene.eval_emitter_direction(event, ds, active)
+        inverse_density = dr.select(active, dr.rcp(ds.pdf), 0.0)
+        return dr.replace_grad(weight, radiance * inverse_density)
 
 
 def _eval_towards_emitter(
@@ -580,10 +616,7 @@ class _PlaneHits:
             active: lanes that are traced.
             coat: coat of the plane; None if it is matt.
         """
-        plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
-        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
-        self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
+        self._intersect_plane(scene, ray, active)
         self._coat = coat
         # The reflectance of the matt part. What a coat takes from it is left out: the
         # changes are used as ratios to the plane's radiance, in which it cancels.
@@ -593,6 +626,21 @@ class _PlaneHits:
         self.direct_changes = [
             dr.select(self.is_hit, factor * light, 0.0) for factor in self._factors
         ]
+        self._continue_path(scene, sampler, ray, active)
+
+    def _intersect_plane(self, scene: Any, ray: Any, active: Any) -> None:
+        """Set where camera rays meet the plane first, `is_hit` and `_si`."""
+        plane = next(shape for shape in scene.shapes() if shape.id() == PLANE_SHAPE)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        self.is_hit = active & hit.is_valid() & (hit.shape == mi.ShapePtr(plane))
+        self._si = hit.compute_surface_interaction(ray, mi.RayFlags.All, self.is_hit)
+
+    def _continue_path(self, scene: Any, sampler: Any, ray: Any, active: Any) -> None:
+        """Sample where paths go on, and set `weights`, `path_ray` and `is_traced`.
+
+        With a coat this also adds to `direct_changes`. The arguments are those of the
+        class.
+        """
         # The random number is drawn even without a coat, where it has no effect.
         leaves_coat = sampler.next_1d() < COAT_FRACTION
         # The density is in proportion to the cosine, so that the weight of a path from
@@ -600,16 +648,15 @@ class _PlaneHits:
         direction = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
         self.weights = [self._albedo]
         is_bounced = direction.z > 0.0
-        if coat is not None:
+        if self._coat is not None:
             direction, is_bounced = self._choose_bounce(
-                coat, direction, leaves_coat, sampler
+                self._coat, direction, leaves_coat, sampler
             )
         bounced_ray = self._si.spawn_ray(self._si.to_world(direction))
         self.path_ray = dr.select(self.is_hit, bounced_ray, ray)
         self.is_traced = active & (~self.is_hit | is_bounced)
-        if coat is not None:
-            # adds to `direct_changes`
-            self._reflect_environment(scene, coat, direction)
+        if self._coat is not None:
+            self._reflect_environment(scene, self._coat, direction)
 
     def _sample_emitter(self, scene: Any, sampler: Any) -> Any:
         """Sample an emitter from the plane, and return its radiance over the density.
@@ -617,33 +664,70 @@ class _PlaneHits:
         This also sets `_factors`, by which that radiance is multiplied for each of the
         quantities: the change of the matt ground, and with a coat also the change of
         the coat and the environment in it. A factor is the fraction of the light that
-        is reflected. For the two changes it has a sign:
-
-        - light of the environment is already in the photograph: -1 where something
-          blocks it, else 0;
-        - light of a lamp is not: 1, or 0 where something blocks it.
+        is reflected. For the two changes it has a sign, see `_find_light_signs`.
         """
         si = self._si
         ds, light = scene.sample_emitter_direction(
             si, sampler.next_2d(), test_visibility=False, active=self.is_hit
         )
         is_sampled = self.is_hit & (ds.pdf != 0.0)
-        is_blocked = scene.ray_test(si.spawn_ray_to(ds.p), is_sampled)
         is_environment = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        visibility = dr.select(is_blocked, 0.0, 1.0)
-        sign = dr.select(is_environment, visibility - 1.0, visibility)
+        sign = self._find_light_signs(scene, ds.p, is_sampled, is_environment)
         direction = si.to_local(ds.d)
         matt_fraction = self._albedo * dr.inv_pi * dr.maximum(direction.z, 0.0)
         self._emitter_sample = ds
         self._factors = [dr.select(is_sampled, sign * matt_fraction, 0.0)]
         if self._coat is not None:
-            coat_fraction = self._compute_coat_fraction(
-                self._coat, direction, ds.pdf, is_environment
+            self._factors += self._compute_coat_factors(
+                self._coat, direction, sign, is_sampled, is_environment
             )
-            change = dr.select(is_sampled, sign * coat_fraction, 0.0)
-            environment = dr.select(is_sampled & is_environment, coat_fraction, 0.0)
-            self._factors += [mi.Color3f(change), mi.Color3f(environment)]
         return light
+
+    def _find_light_signs(
+        self, scene: Any, light_point: Any, is_sampled: Any, is_environment: Any
+    ) -> Any:
+        """Return the sign with which the light of each sample changes the photograph.
+
+        - Light of the environment is already in the photograph: -1 where something
+          blocks it, else 0.
+        - Light of a lamp is not: 1, or 0 where something blocks it.
+
+        Args:
+            scene: Mitsuba's scene.
+            light_point: sampled points on the emitters.
+            is_sampled: lanes in which there is a sample.
+            is_environment: lanes whose emitter is the environment.
+        """
+        ray = self._si.spawn_ray_to(light_point)
+        is_blocked = scene.ray_test(ray, is_sampled)
+        visibility = dr.select(is_blocked, 0.0, 1.0)
+        return dr.select(is_environment, visibility - 1.0, visibility)
+
+    def _compute_coat_factors(
+        self,
+        coat: _Coat,
+        direction: Any,
+        sign: Any,
+        is_sampled: Any,
+        is_environment: Any,
+    ) -> list[Any]:
+        """Return the factors of an emitter sample's light for both quantities of the
+        coat.
+
+        Args:
+            coat: coat of the plane.
+            direction: local direction to the emitter.
+            sign: sign of the change, see `_find_light_signs`.
+            is_sampled: lanes in which there is a sample.
+            is_environment: lanes whose emitter is the environment.
+        """
+        density = self._emitter_sample.pdf
+        coat_fraction = self._compute_coat_fraction(
+            coat, direction, density, is_environment
+        )
+        change = dr.select(is_sampled, sign * coat_fraction, 0.0)
+        environment = dr.select(is_sampled & is_environment, coat_fraction, 0.0)
+        return [mi.Color3f(change), mi.Color3f(environment)]
 
     def _compute_coat_fraction(
         self, coat: _Coat, direction: Any, emitter_density: Any, is_environment: Any
@@ -715,24 +799,45 @@ class _PlaneHits:
             direction: direction of the bounce, in the plane's local axes.
         """
         environment = scene.environment()
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.d = self.path_ray.d
-        ds.emitter = mi.EmitterPtr(environment)
+        ds = self._make_bounce_sample(environment)
         is_bounced = self.is_hit & self.is_traced
-        _value, coat_density = coat.evaluate(self._si.wi, direction)
-        density = COAT_FRACTION * coat_density
-        both_densities = density + scene.pdf_emitter_direction(self._si, ds, is_bounced)
-        mis_weight = density / dr.maximum(both_densities, MIN_DENSITY)
-        # the interaction of a ray that leaves the scene
-        escaped = dr.zeros(mi.SurfaceInteraction3f)
-        escaped.wi = -ds.d
-        escaped.wavelengths = self._si.wavelengths
+        mis_weight = self._weigh_bounce(scene, coat, direction, ds)
+        light = environment.eval(self._make_escaped(ds.d), is_bounced)
         # `weights[1]` is 0 in lanes where the path leaves the matt ground.
-        reflected = self.weights[1] * mis_weight * environment.eval(escaped, is_bounced)
+        reflected = self.weights[1] * mis_weight * light
         reflected = dr.select(is_bounced, reflected, 0.0)
         is_blocked = scene.ray_test(self.path_ray, is_bounced)
         self.direct_changes[1] -= dr.select(is_blocked, reflected, 0.0)
         self.direct_changes[2] += reflected
+
+    def _make_bounce_sample(self, environment: Any) -> Any:
+        """Return a direction sample of the environment along the next segment."""
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.d = self.path_ray.d
+        ds.emitter = mi.EmitterPtr(environment)
+        return ds
+
+    def _weigh_bounce(self, scene: Any, coat: _Coat, direction: Any, ds: Any) -> Any:
+        """Return the MIS weight of a bounce off the coat against samples at emitters.
+
+        Args:
+            scene: Mitsuba's scene.
+            coat: coat of the plane.
+            direction: direction of the bounce, in the plane's local axes.
+            ds: the same as a direction sample of the environment.
+        """
+        is_bounced = self.is_hit & self.is_traced
+        _value, coat_density = coat.evaluate(self._si.wi, direction)
+        density = COAT_FRACTION * coat_density
+        both_densities = density + scene.pdf_emitter_direction(self._si, ds, is_bounced)
+        return density / dr.maximum(both_densities, MIN_DENSITY)
+
+    def _make_escaped(self, direction: Any) -> Any:
+        """Return the interaction of rays in a direction that leave the scene."""
+        escaped = dr.zeros(mi.SurfaceInteraction3f)
+        escaped.wi = -direction
+        escaped.wavelengths = self._si.wavelengths
+        return escaped
 
     def list_changes(self, path_radiance: Any) -> list[Any]:
         """Return the one or three quantities of the class, three channels each.
@@ -980,38 +1085,12 @@ def _refract_through_drop(
         The direction behind the drop, not normalized; the fraction of the light that
         passes; and whether the ray is lost by total reflection.
     """
-    radius_on_sheet = drop.z
     curvature_radius = drop.w
 
-    # Snell's law at the flat side, whose normal is z
-    inside_direction = mi.Vector3f(
-        direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0
-    )
-    inside_direction.z = dr.safe_sqrt(
-        1.0
-        - inside_direction.x * inside_direction.x
-        - inside_direction.y * inside_direction.y
-    )
+    inside_direction = _refract_into_water(direction)
 
-    # Entry and exit point are measured from the center of the sphere.
-    entry = mi.Vector3f(
-        dx,
-        dy,
-        dr.safe_sqrt(
-            curvature_radius * curvature_radius - radius_on_sheet * radius_on_sheet
-        ),
-    )
-    entry_cosine = dr.dot(entry, inside_direction)
-    # length of the ray inside, up to the sphere: the larger root of
-    # |entry + t direction| = curvature radius
-    exit_distance = (
-        dr.safe_sqrt(
-            entry_cosine * entry_cosine
-            - dr.squared_norm(entry)
-            + curvature_radius * curvature_radius
-        )
-        - entry_cosine
-    )
+    entry = _locate_entry(dx, dy, drop)
+    exit_distance = _measure_path_in_drop(entry, inside_direction, curvature_radius)
     exit_point = entry + inside_direction * exit_distance
     normal = exit_point / curvature_radius  # of the cap, outwards
 
@@ -1022,9 +1101,26 @@ def _refract_through_drop(
     outside_direction = (
         WATER_IOR * inside_direction + (cos_outside - WATER_IOR * cos_inside) * normal
     )
+    transmitted = _compute_drop_transmittance(
+        direction.z, inside_direction.z, cos_inside, cos_outside
+    )
+    # A ray that leaves the cap towards the sheet does not reach the scene.
+    is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
+    return outside_direction, transmitted, is_lost
+
+
+def _compute_drop_transmittance(
+    cos_before: Any, cos_entered: Any, cos_inside: Any, cos_outside: Any
+) -> Any:
+    """Return the fraction of the light that passes both surfaces of a drop.
+
+    Args:
+        cos_before, cos_entered: cosines at the flat side, outside and inside.
+        cos_inside, cos_outside: cosines at the cap.
+    """
     transmitted = _compute_transmittance(
-        cos_incident=direction.z,
-        cos_refracted=inside_direction.z,
+        cos_incident=cos_before,
+        cos_refracted=cos_entered,
         ior_incident=1.0,
         ior_refracted=WATER_IOR,
     )
@@ -1034,9 +1130,47 @@ def _refract_through_drop(
         ior_incident=WATER_IOR,
         ior_refracted=1.0,
     )
-    # A ray that leaves the cap towards the sheet does not reach the scene.
-    is_lost = (cos_outside_squared <= 0.0) | (outside_direction.z <= 0.0)
-    return outside_direction, transmitted, is_lost
+    return transmitted
+
+
+def _refract_into_water(direction: Any) -> Any:
+    """Refract unit directions at a drop's flat side, whose normal is z."""
+    inside_direction = mi.Vector3f(
+        direction.x / WATER_IOR, direction.y / WATER_IOR, 0.0
+    )
+    inside_direction.z = dr.safe_sqrt(
+        1.0
+        - inside_direction.x * inside_direction.x
+        - inside_direction.y * inside_direction.y
+    )
+    return inside_direction
+
+
+def _locate_entry(dx: Any, dy: Any, drop: Any) -> Any:
+    """Return where rays enter a drop, from the center of the sphere of its cap.
+
+    The arguments are those of `_refract_through_drop`.
+    """
+    radius_on_sheet = drop.z
+    curvature_radius = drop.w
+    center_distance = dr.safe_sqrt(
+        curvature_radius * curvature_radius - radius_on_sheet * radius_on_sheet
+    )
+    return mi.Vector3f(dx, dy, center_distance)
+
+
+def _measure_path_in_drop(entry: Any, direction: Any, curvature_radius: Any) -> Any:
+    """Return the lengths of rays inside a drop, from the entry up to the sphere.
+
+    It is the larger root of |entry + t direction| = curvature radius.
+    """
+    entry_cosine = dr.dot(entry, direction)
+    discriminant = (
+        entry_cosine * entry_cosine
+        - dr.squared_norm(entry)
+        + curvature_radius * curvature_radius
+    )
+    return dr.safe_sqrt(discriminant) - entry_cosine
 
 
 class ModelledCamera(mi.Sensor):  # type: ignore[misc]
@@ -1067,11 +1201,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         self._model = CameraModel(str(props["kind"]), values, max_angle_degrees=reach)
         self._near = float(props["near_clip"])
         self._far = float(props["far_clip"])
-        # columns and rows of the grid of ray directions, about one for each pixel
-        self._grid_cells = tuple(
-            max(MIN_CELLS, min(MAX_CELLS, int(size)))
-            for size in self.film().crop_size()
-        )
+        # columns and rows of the grid of ray directions
+        self._grid_cells = _choose_grid_cells(self.film().crop_size())
         # The transform that Mitsuba read from the properties. From here on
         # `world_transform` returns `pose`.
         self.pose = mi.Transform4f(super().world_transform())
@@ -1139,6 +1270,17 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         if self._sheet_half_width > 0.0:
             direction, transmitted = self._bend_by_drops(direction, sample3)
         weight = dr.select(is_inside, transmitted, 0.0)
+        ray = self._make_sampled_ray(time, direction, weight > 0.0)
+        return ray, mi.Spectrum(weight)
+
+    def _make_sampled_ray(self, time: Any, direction: Any, has_light: Any) -> Any:
+        """Return rays in the world, along directions in the camera's axes.
+
+        Args:
+            time: time of the rays.
+            direction: unit directions.
+            has_light: lanes whose ray may meet something; others have the length 0.
+        """
         # Each field has one entry a lane, `maxt` too: Dr.Jit cannot differentiate a ray
         # whose fields have different lengths.
         ray = dr.zeros(mi.RayDifferential3f)
@@ -1146,9 +1288,8 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         # Near and far are distances along the ray, since a wide lens has no planes.
         ray.o = self.pose @ mi.Point3f(self._near * direction)
         ray.d = self.pose @ mi.Vector3f(direction)
-        # of length 0 where the lens has no direction, so that the ray hits nothing
-        ray.maxt = dr.select(weight > 0.0, mi.Float(self._far), 0.0)
-        return ray, mi.Spectrum(weight)
+        ray.maxt = dr.select(has_light, mi.Float(self._far), 0.0)
+        return ray
 
     def sample_ray(
         self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
@@ -1213,27 +1354,33 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             The drop's four numbers, as in `sample_raindrops`; the point's x and y from
             the drop's center; and whether there is a drop at all.
         """
-        half_width = self._sheet_half_width
-        cells_per_mm = GRID_SIZE / (2.0 * half_width)
-        column = (x + half_width) * cells_per_mm
-        row = (y + half_width) * cells_per_mm
-        on_grid = (
-            active
-            & (column >= 0.0)
-            & (column < GRID_SIZE)
-            & (row >= 0.0)
-            & (row < GRID_SIZE)
-        )
-        row_index = mi.UInt32(dr.clip(row, 0.0, GRID_SIZE - 1.0))
-        column_index = mi.UInt32(dr.clip(column, 0.0, GRID_SIZE - 1.0))
-        cell = row_index * GRID_SIZE + column_index
-        drop_index = dr.gather(mi.UInt32, self._drop_of_cell, cell, on_grid)
+        drop_index, on_grid = self._look_up_drop(x, y, active)
         drop = dr.gather(mi.Vector4f, self._drops, drop_index)
         dx = x - drop.x
         dy = y - drop.y
         radius = drop.z  # below 0 in a cell without a drop, see `NO_DROP`
         is_hit = on_grid & (radius > 0.0) & (dx * dx + dy * dy < radius * radius)
         return drop, dx, dy, is_hit
+
+    def _look_up_drop(self, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+        """Return the index of the drop at a point of the sheet, and whether it is on
+        the grid.
+
+        The arguments are those of `_find_drop`. A cell without a drop has the index
+        after the last drop.
+        """
+        half_width = self._sheet_half_width
+        cells_per_mm = GRID_SIZE / (2.0 * half_width)
+        column = (x + half_width) * cells_per_mm
+        row = (y + half_width) * cells_per_mm
+        has_column = (column >= 0.0) & (column < GRID_SIZE)
+        has_row = (row >= 0.0) & (row < GRID_SIZE)
+        on_grid = active & has_column & has_row
+        row_index = mi.UInt32(dr.clip(row, 0.0, GRID_SIZE - 1.0))
+        column_index = mi.UInt32(dr.clip(column, 0.0, GRID_SIZE - 1.0))
+        cell = row_index * GRID_SIZE + column_index
+        drop_index = dr.gather(mi.UInt32, self._drop_of_cell, cell, on_grid)
+        return drop_index, on_grid
 
     def _make_rays(self) -> None:
         """Compute the grid of ray directions from the lens's numbers."""
@@ -1276,6 +1423,11 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
             dr.gather(mi.Vector4f, self.rays, left + 1),
             fraction,
         )
+
+
+def _choose_grid_cells(film_size: Any) -> tuple[int, ...]:
+    """Return columns and rows of a grid of ray directions, about one for each pixel."""
+    return tuple(max(MIN_CELLS, min(MAX_CELLS, int(size))) for size in film_size)
 
 
 mi.register_sensor("advsearch_camera", ModelledCamera)

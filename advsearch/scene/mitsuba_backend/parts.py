@@ -16,6 +16,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene import parts
+from advsearch.scene.assets import Float32Array, Float64Array
 from advsearch.scene.backdrop import compute_refractive_index, has_plane
 from advsearch.scene.camera_model import NUMBER_NAMES, CameraModel
 from advsearch.scene.color import srgb_to_linear
@@ -30,6 +31,7 @@ from advsearch.scene.mitsuba_backend.variant import (
     scene_registry,
     suppress_warnings,
 )
+from advsearch.scene.photographed_ground import PhotographedGround
 
 Write = Callable[[Any], Any]
 """Converts a Dr.Jit `TensorXf` to the type that the Mitsuba parameter takes.
@@ -131,14 +133,7 @@ def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
     Raises:
         RuntimeError: several parameters match.
     """
-    prefix, asterisk, suffix = scene_input.key.partition("*")
-    keys = [scene_input.key] if scene_input.key in parameters else []
-    if asterisk:
-        keys = [
-            key
-            for key in parameters.keys()
-            if key.startswith(prefix) and key.endswith(suffix)
-        ]
+    keys = _match_keys(parameters, scene_input.key)
     owner = scene_input.parameter_owner
     if owner is not None:
         # Mitsuba's properties of a parameter: the third is the object that has it.
@@ -148,6 +143,18 @@ def find_key(parameters: Any, scene_input: SceneInput) -> str | None:
             f"expected one Mitsuba parameter {scene_input.key}, found {keys}"
         )
     return keys[0] if keys else None
+
+
+def _match_keys(parameters: Any, pattern: str) -> list[str]:
+    """Return which keys of Mitsuba's parameters match one with an asterisk or not."""
+    prefix, asterisk, suffix = pattern.partition("*")
+    if not asterisk:
+        return [pattern] if pattern in parameters else []
+    return [
+        key
+        for key in parameters.keys()
+        if key.startswith(prefix) and key.endswith(suffix)
+    ]
 
 
 SURFACE_KEYS = {
@@ -197,33 +204,48 @@ def translate_mesh(part: parts.MeshPart, lobes: Plugin | None = None) -> Transla
             such as `IDLE_LOBES`; not used if the mesh has a surface of the user's.
     """
     name = part.name
-    shape = (len(part.mesh.vertices), 3)
-    vertices_key = f"{name}.{meshes.POSITIONS}"
-    normals_key = f"{name}.{meshes.NORMALS}"
-    inputs = [
-        SceneInput(f"{name}.vertices", vertices_key, to_flat_array, shape=shape),
-        SceneInput(f"{name}.normals", normals_key, to_flat_array, shape=shape),
-    ]
+    inputs = _make_buffer_inputs(part)
     if part.surface is None:
         surface = meshes.make_principled(part, lobes)
         inputs += _make_principled_inputs(name)
     else:
         surface, surface_inputs = _load_user_surface(part, part.surface)
         inputs += surface_inputs
-    if meshes.has_textured_emission(part):
-        inputs.append(
-            SceneInput(
-                f"{name}.radiance",
-                f"{name}.emitter.radiance.data",
-                has_interior_adjoint=True,
-            )
-        )
-    elif part.emission is not None:
-        inputs.append(_make_light_input(name, "radiance", "emitter.radiance"))
+    inputs += _make_emission_inputs(part)
     mesh = meshes.make_mitsuba_mesh(
         name, part.mesh, part.to_world, surface, meshes.make_emitter(part)
     )
     return TranslatedPart({name: mesh}, tuple(inputs))
+
+
+def _make_buffer_inputs(part: parts.MeshPart) -> list[SceneInput]:
+    """Return the inputs of a mesh's vertices and normals."""
+    name = part.name
+    shape = (len(part.mesh.vertices), 3)
+    vertices_key = f"{name}.{meshes.POSITIONS}"
+    normals_key = f"{name}.{meshes.NORMALS}"
+    return [
+        SceneInput(f"{name}.vertices", vertices_key, to_flat_array, shape=shape),
+        SceneInput(f"{name}.normals", normals_key, to_flat_array, shape=shape),
+    ]
+
+
+def _make_emission_inputs(part: parts.MeshPart) -> list[SceneInput]:
+    """Return the input of the light that a mesh emits, if it emits any.
+
+    It is a texture, or a color if the light is even.
+    """
+    name = part.name
+    if meshes.has_textured_emission(part):
+        texture = SceneInput(
+            f"{name}.radiance",
+            f"{name}.emitter.radiance.data",
+            has_interior_adjoint=True,
+        )
+        return [texture]
+    if part.emission is None:
+        return []
+    return [_make_light_input(name, "radiance", "emitter.radiance")]
 
 
 def _load_user_surface(
@@ -245,21 +267,26 @@ def _load_user_surface(
         texture = mi.load_dict(
             meshes.make_base_texture(part.base_color, options), optimize=False
         )
-        # The surface may have other textures, so that several keys match. That of this
-        # texture is found by its owner.
-        inputs.append(
-            SceneInput(
-                f"{part.name}.base_color",
-                f"{part.name}.*.data",
-                has_interior_adjoint=True,
-                parameter_owner=texture,
-            )
-        )
+        inputs.append(_make_texture_input(part.name, texture))
         return texture
 
     # `load_base_texture` is called here, if there is a base color, and adds the input.
     filled_surface = meshes.fill_base_color(surface, load_base_texture)
     return filled_surface, inputs
+
+
+def _make_texture_input(name: str, texture: Any) -> SceneInput:
+    """Return the input of the base color of the mesh with a name, a texture of its own.
+
+    The surface may have other textures, so that several keys match. That of this
+    texture is found by its owner.
+    """
+    return SceneInput(
+        f"{name}.base_color",
+        f"{name}.*.data",
+        has_interior_adjoint=True,
+        parameter_owner=texture,
+    )
 
 
 def _make_principled_inputs(name: str) -> list[SceneInput]:
@@ -275,17 +302,28 @@ def _make_principled_inputs(name: str) -> list[SceneInput]:
         has_interior_adjoint=True,
     )
     numbers = [
-        SceneInput(
-            f"{name}.{parameter}",
-            f"{name}.*.{key}",
-            convert_to_mitsuba=to_flat_array,
-            has_interior_adjoint=True,
-            shape=(1,),
-            rendered_range=meshes.RENDERED_RANGES.get(parameter),
-        )
+        _make_surface_number_input(name, parameter, key)
         for parameter, key in SURFACE_KEYS.items()
     ]
     return [base_color, *numbers]
+
+
+def _make_surface_number_input(name: str, parameter: str, key: str) -> SceneInput:
+    """Return the input of one number of a principled surface.
+
+    Args:
+        name: name of the mesh.
+        parameter: our name of the number, such as "roughness".
+        key: Mitsuba's name of it.
+    """
+    return SceneInput(
+        name=f"{name}.{parameter}",
+        key=f"{name}.*.{key}",
+        convert_to_mitsuba=to_flat_array,
+        has_interior_adjoint=True,
+        shape=(1,),
+        rendered_range=meshes.RENDERED_RANGES.get(parameter),
+    )
 
 
 def _make_light_input(name: str, parameter: str, key: str) -> SceneInput:
@@ -353,31 +391,40 @@ def _make_number_input(plugin_number: parts.PluginNumber) -> SceneInput:
     the key of one of a principled surface, such as "roughness", is clamped to the range
     that Mitsuba renders correctly.
     """
-    write: Write
-    if plugin_number.plain:
-        write = to_constant
-    elif len(plugin_number.values) == 3:
-        write = to_color
-    else:
-        write = to_flat_array
-    # the name that such a number has in our materials, at most one
-    surface_parameters = [
-        parameter
-        for parameter, key in SURFACE_KEYS.items()
-        if plugin_number.key.endswith(f".{key}")
-    ]
-    rendered_range = None  # any number is rendered as it is
-    if surface_parameters:
-        rendered_range = meshes.RENDERED_RANGES.get(surface_parameters[0])
     return SceneInput(
         plugin_number.input,
         plugin_number.key,
-        write,
+        _choose_conversion(plugin_number),
         # if the adjoint is among the estimators that are valid for it
         has_interior_adjoint="adjoint" in plugin_number.valid,
         shape=(len(plugin_number.values),),
-        rendered_range=rendered_range,
+        rendered_range=_find_rendered_range(plugin_number.key),
     )
+
+
+def _choose_conversion(plugin_number: parts.PluginNumber) -> Write:
+    """Return the function that converts a tensor to the type that Mitsuba has there."""
+    if plugin_number.plain:
+        return to_constant
+    if len(plugin_number.values) == 3:
+        return to_color
+    return to_flat_array
+
+
+def _find_rendered_range(key: str) -> tuple[float, float] | None:
+    """Return the range that Mitsuba renders correctly for a number by its key.
+
+    None if any number is rendered as it is.
+    """
+    # the name that such a number has in our materials, at most one
+    surface_parameters = [
+        parameter
+        for parameter, key_in_surface in SURFACE_KEYS.items()
+        if key.endswith(f".{key_in_surface}")
+    ]
+    if not surface_parameters:
+        return None
+    return meshes.RENDERED_RANGES.get(surface_parameters[0])
 
 
 @translate_part.register
@@ -444,18 +491,11 @@ def _translate_projector(part: parts.ProjectorPart) -> TranslatedPart:
     So a texel is the radiance of a white screen there.
     """
     name = part.name
-    # black until the input `pattern` is set
-    image = {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(np.zeros((*part.sides, 3), np.float32)),
-        "raw": True,
-        "wrap_mode": "clamp",
-    }
     projector = {
         "type": "projector",
         "fov": part.fov,
         "fov_axis": "x",
-        "irradiance": image,
+        "irradiance": _make_black_image(part.sides),
     }
     pattern = SceneInput(
         name=f"{name}.pattern",
@@ -465,14 +505,43 @@ def _translate_projector(part: parts.ProjectorPart) -> TranslatedPart:
     return TranslatedPart({name: projector}, (_make_pose_input(name, "pose"), pattern))
 
 
+def _make_black_image(sides: tuple[int, int]) -> Plugin:
+    """Return the image of a projector until its input `pattern` is set."""
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.zeros((*sides, 3), np.float32)),
+        "raw": True,
+        "wrap_mode": "clamp",
+    }
+
+
 @translate_part.register
 def _translate_beam(part: parts.BeamLamp) -> TranslatedPart:
     """Return a headlamp's beam as a projector.
 
-    The table has the intensity I of each direction. On a plane at distance 1, at an
-    angle a to the axis, the distance is 1 / cos a and the plane is tilted by a. So the
-    irradiance there is I cos a / (1 / cos a)^2 = I cos^3 a. Mitsuba's projector makes
-    pi times its texture there, so the texture is I cos^3 a / pi.
+    The table has the intensity of each direction.
+    """
+    lamp = {
+        "type": "projector",
+        "to_world": mi.ScalarTransform4f(part.to_world),
+        "fov": 90.0,
+        "fov_axis": "x",
+        "irradiance": {
+            **meshes.make_texture(_make_beam_image(part)),
+            "wrap_mode": "clamp",
+        },
+        "sampling_weight": part.weight,
+    }
+    return TranslatedPart({part.name: lamp}, (_make_pose_input(part.name, "to_world"),))
+
+
+def _make_beam_image(part: parts.BeamLamp) -> Float32Array:
+    """Return the texture (h, w, 3) of the projector of a headlamp's beam.
+
+    On a plane at distance 1, at an angle a to the axis, the distance is 1 / cos a and
+    the plane is tilted by a. So the irradiance there is I cos a / (1 / cos a)^2 = I
+    cos^3 a, for the intensity I in the table. Mitsuba's projector makes pi times its
+    texture there, so the texture is I cos^3 a / pi.
     """
     height, width = part.table.shape
     # Centers of the table's cells on that plane, in fractions of half its width and
@@ -483,16 +552,10 @@ def _translate_beam(part: parts.BeamLamp) -> TranslatedPart:
     # The field of view is 90 degrees along the width: at distance 1, half the width is
     # 1, and half the height is height / width.
     cosine = (1.0 + x[None] ** 2 + (y[:, None] * height / width) ** 2) ** -0.5
-    image = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
-    lamp = {
-        "type": "projector",
-        "to_world": mi.ScalarTransform4f(part.to_world),
-        "fov": 90.0,
-        "fov_axis": "x",
-        "irradiance": {**meshes.make_texture(image), "wrap_mode": "clamp"},
-        "sampling_weight": part.weight,
-    }
-    return TranslatedPart({part.name: lamp}, (_make_pose_input(part.name, "to_world"),))
+    image: Float64Array = (part.table * cosine**3 / np.pi)[..., None] * np.array(
+        part.tint
+    )
+    return image.astype(np.float32)
 
 
 @translate_part.register
@@ -502,39 +565,47 @@ def _translate_haze(part: parts.HazePart) -> TranslatedPart:
     No shape refers to Mitsuba's medium. It only holds density and albedo, as parameters
     that can be set, for our integrator.
     """
-    name = part.name
-    albedo = _make_rgb(part.albedo)
-    medium = mi.load_dict(
-        {"type": "homogeneous", "albedo": albedo, "sigma_t": part.density},
-        optimize=False,
-    )
+    medium = _load_haze_medium(part)
     # Mitsuba does not release media. So the medium is held as long as the registry
     # itself, that is forever.
     scene_registry.hold_objects(scene_registry, media=(medium,))
-    inputs = (
-        SceneInput(
-            f"{name}.density",
-            f"{name}.sigma_t.value.value",
-            convert_to_mitsuba=to_flat_array,
-            has_interior_adjoint=True,
-            shape=(1,),
-        ),
-        SceneInput(
-            f"{name}.albedo",
-            f"{name}.albedo.value.value",
-            convert_to_mitsuba=to_color,
-            has_interior_adjoint=True,
-            shape=(3,),
-        ),
-    )
     return TranslatedPart(
-        plugins={name: medium},
-        inputs=inputs,
+        plugins={part.name: medium},
+        inputs=_make_haze_inputs(part.name),
         integrator_entries={
             "type": "advsearch_haze",
             "medium": medium,
             "radius": part.radius,
         },
+    )
+
+
+def _load_haze_medium(part: parts.HazePart) -> Any:
+    """Return Mitsuba's medium of a haze."""
+    albedo = _make_rgb(part.albedo)
+    return mi.load_dict(
+        {"type": "homogeneous", "albedo": albedo, "sigma_t": part.density},
+        optimize=False,
+    )
+
+
+def _make_haze_inputs(name: str) -> tuple[SceneInput, ...]:
+    """Return the inputs of the haze with a name: its density and its albedo."""
+    return (
+        SceneInput(
+            name=f"{name}.density",
+            key=f"{name}.sigma_t.value.value",
+            convert_to_mitsuba=to_flat_array,
+            has_interior_adjoint=True,
+            shape=(1,),
+        ),
+        SceneInput(
+            name=f"{name}.albedo",
+            key=f"{name}.albedo.value.value",
+            convert_to_mitsuba=to_color,
+            has_interior_adjoint=True,
+            shape=(3,),
+        ),
     )
 
 
@@ -565,42 +636,69 @@ def make_scene_dict(
         resolution: height and width.
         filter, sampler: Mitsuba's types of reconstruction filter and sampler.
     """
+    camera = _make_camera_plugin(description, resolution, filter, sampler)
+    scene: Plugin = {"type": "scene", "camera": camera}
+    if description.environment is not None:
+        scene["environment"] = _make_environment(
+            description, description.environment.radiance
+        )
+    ground = _make_ground(description)
+    if ground is not None:
+        scene[GROUND_NAME] = ground
+    return scene
+
+
+def _make_camera_plugin(
+    description: SceneDescription,
+    resolution: tuple[int, int],
+    filter: str,
+    sampler: str,
+) -> Plugin:
+    """Return the dictionary of a scene's camera, with pose, film and sampler.
+
+    The arguments are those of `make_scene_dict`.
+    """
     height, width = resolution
     to_world = camera_to_world(description, width / height)
-    camera: Plugin = {
+    return {
         **_make_lens(description),
         # object sizes
         "near_clip": 0.01,
         "far_clip": 1e5,
         "to_world": mi.ScalarTransform4f(to_world),
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "pixel_format": "rgba" if description.backdrop else "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": filter},
-        },
+        "film": _make_film(description, resolution, filter),
         "sampler": {"type": sampler},
     }
-    scene: Plugin = {"type": "scene", "camera": camera}
-    if description.environment is not None:
-        radiance = description.environment.radiance
-        rotation = description.get_number("environment.rotation")
-        # Mitsuba's maps have y up. The last rotation is applied first: it turns y to z.
-        # Then the map is rotated about z.
-        scene["environment"] = {
-            "type": "envmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32)),
-            "scale": 2.0 ** description.get_number("environment.exposure"),
-            "to_world": mi.ScalarTransform4f()
-            .rotate([0, 0, 1], rotation)
-            .rotate([1, 0, 0], 90),
-        }
-    ground = _make_ground(description)
-    if ground is not None:
-        scene[GROUND_NAME] = ground
-    return scene
+
+
+def _make_film(
+    description: SceneDescription, resolution: tuple[int, int], filter: str
+) -> Plugin:
+    """Return the film of a size (height, width), with a reconstruction filter."""
+    height, width = resolution
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "pixel_format": "rgba" if description.backdrop else "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": filter},
+    }
+
+
+def _make_environment(description: SceneDescription, radiance: Float32Array) -> Plugin:
+    """Return the light of the surroundings, by a map (h, w, 3) of their radiance."""
+    rotation = description.get_number("environment.rotation")
+    # Mitsuba's maps have y up. The last rotation is applied first: it turns y to z.
+    # Then the map is rotated about z.
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32)),
+        "scale": 2.0 ** description.get_number("environment.exposure"),
+        "to_world": mi.ScalarTransform4f()
+        .rotate([0, 0, 1], rotation)
+        .rotate([1, 0, 0], 90),
+    }
 
 
 def _make_ground(description: SceneDescription) -> Any:
@@ -615,12 +713,8 @@ def _make_ground(description: SceneDescription) -> Any:
     `ground.size`. The result is None if that is 0, or if the ground is a road or a
     place, which has meshes of its own.
     """
-    photographed_ground = description.photograph
-    if photographed_ground is not None:
-        surface = meshes.make_diffuse(photographed_ground.base_color.numpy())
-        return meshes.make_mitsuba_mesh(
-            GROUND_NAME, photographed_ground.mesh, np.eye(4), surface
-        )
+    if description.photograph is not None:
+        return _make_photographed_mesh(description.photograph)
     size = description.get_number("ground.size")
     if not size > 0.0 or is_paved(description):
         return None
@@ -629,27 +723,41 @@ def _make_ground(description: SceneDescription) -> Any:
         if not has_plane(description):
             return None
         level = description.get_number("ground.level")
-    srgb = np.array(description.ground_color, np.float32)
-    reflectance = _make_rgb(srgb_to_linear(srgb).tolist())
-    bsdf: Plugin = {"type": "diffuse", "reflectance": reflectance}
-    gloss = description.get_number("ground.gloss")
-    if description.backdrop_photograph is not None and gloss > 0.0:
-        roughness = description.get_number("ground.roughness")
-        # a diffuse ground under a clear coat
-        bsdf = {
-            "type": "roughplastic",
-            "distribution": "ggx",
-            "alpha": max(roughness, MIN_PLANE_ROUGHNESS) ** 2,  # as in `_Coat`
-            "int_ior": compute_refractive_index(gloss),
-            "ext_ior": 1.0,
-            "diffuse_reflectance": reflectance,
-        }
+    return _make_square(size, level, _make_ground_surface(description))
+
+
+def _make_square(size: float, level: float, bsdf: Plugin) -> Plugin:
+    """Return a two-sided horizontal square of a width, at a height above 0."""
+    pose = mi.ScalarTransform4f().translate([0.0, 0.0, level])
     return {
         "type": "rectangle",
-        "to_world": mi.ScalarTransform4f()
-        .translate([0.0, 0.0, level])
-        .scale(size / 2.0),  # Mitsuba's rectangle is 2 wide
+        "to_world": pose.scale(size / 2.0),  # Mitsuba's rectangle is 2 wide
         "bsdf": {"type": "twosided", "bsdf": bsdf},
+    }
+
+
+def _make_photographed_mesh(ground: PhotographedGround) -> Any:
+    """Return the ground that the map of the environment shows, as a mesh."""
+    surface = meshes.make_diffuse(ground.base_color.numpy())
+    return meshes.make_mitsuba_mesh(GROUND_NAME, ground.mesh, np.eye(4), surface)
+
+
+def _make_ground_surface(description: SceneDescription) -> Plugin:
+    """Return the diffuse surface of the ground, in a photograph perhaps with a coat."""
+    srgb = np.array(description.ground_color, np.float32)
+    reflectance = _make_rgb(srgb_to_linear(srgb).tolist())
+    gloss = description.get_number("ground.gloss")
+    if description.backdrop_photograph is None or not gloss > 0.0:
+        return {"type": "diffuse", "reflectance": reflectance}
+    roughness = description.get_number("ground.roughness")
+    # a diffuse ground under a clear coat
+    return {
+        "type": "roughplastic",
+        "distribution": "ggx",
+        "alpha": max(roughness, MIN_PLANE_ROUGHNESS) ** 2,  # as in `_Coat`
+        "int_ior": compute_refractive_index(gloss),
+        "ext_ior": 1.0,
+        "diffuse_reflectance": reflectance,
     }
 
 
@@ -662,23 +770,27 @@ def convert_refusals(description: SceneDescription) -> Iterator[None]:
     Raises:
         InputError: Mitsuba refuses them.
     """
-    object_asset = description.object
-    # An object with finishes has a surface that we made from a table of materials.
-    has_user_surface = object_asset.surface is not None and not object_asset.finishes
-    has_user_plugins = any(
-        isinstance(part, parts.PluginPart) for part in description.parts
-    )
+    has_user_plugins = _has_user_plugins(description)
     try:
         with suppress_warnings():
             yield
     except (RuntimeError, TypeError, ValueError) as error:
-        if not has_user_surface and not has_user_plugins:
+        if not has_user_plugins:
             raise  # it is our own mistake
         reason = " ".join(str(error).split())
         raise InputError(
             f"{description.object_name}: Mitsuba refuses the scene: {reason}; change "
             "it there"
         ) from error
+
+
+def _has_user_plugins(description: SceneDescription) -> bool:
+    """Return whether the object's surface or a part is one of the user's plugins."""
+    object_asset = description.object
+    # An object with finishes has a surface that we made from a table of materials.
+    if object_asset.surface is not None and not object_asset.finishes:
+        return True
+    return any(isinstance(part, parts.PluginPart) for part in description.parts)
 
 
 def _check_background(
@@ -697,16 +809,21 @@ def _check_background(
             "leave one of the two out"
         )
     has_plain_backdrop = description.backdrop and not description.backdrop_photograph
-    # A lens has no name if its numbers are searched. Some numbers make a lens that
-    # folds (two directions fall on one point of the image), and leaves other parts
-    # black.
-    is_searched = not model.name
-    may_leave_black = model.black_fraction > 0.0 or is_searched
-    if has_plain_backdrop and may_leave_black:
+    if has_plain_backdrop and _may_leave_black(model):
         raise InputError(
             "background: it would show where the camera's lens sees nothing as well; "
             "leave the plain background out, or take a lens that fills the picture"
         )
+
+
+def _may_leave_black(model: CameraModel) -> bool:
+    """Return whether parts of the image may be black since a lens sees nothing there.
+
+    A lens has no name if its numbers are searched. Some numbers make a lens that folds
+    (two directions fall on one point of the image), and leaves other parts black.
+    """
+    is_searched = not model.name
+    return model.black_fraction > 0.0 or is_searched
 
 
 def _make_lens(description: SceneDescription) -> Plugin:
@@ -722,17 +839,7 @@ def _make_lens(description: SceneDescription) -> Plugin:
     model = description.camera_model
     drops = description.get_number("camera.drops")
     if model is None:
-        pinhole: Plugin = {
-            "type": "perspective",
-            "fov": description.get_number("camera.fov"),
-            "fov_axis": "larger",
-        }
-        if not description.thin_lens:
-            return pinhole
-        # Aperture and focus are inputs, which are set later. The type replaces the
-        # pinhole's, whose field of view stays.
-        thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
-        return pinhole | thin_lens
+        return _make_perspective_lens(description)
     _check_background(description, model, drops)
     camera: Plugin = {
         "type": "advsearch_camera",
@@ -741,21 +848,44 @@ def _make_lens(description: SceneDescription) -> Plugin:
         **model.intrinsic_by_name,
     }
     if drops > 0.0:
-        camera |= {
-            name: description.get_number(f"camera.{name}")
-            for name in ("drops", "drop_size", "drop_seed")
-        }
-        # Drops cover the part of the glass through which the lens sees. A lens has no
-        # name if its numbers are searched. Then its view changes, and it gets the drops
-        # of a pinhole with the camera's field of view.
-        is_searched = not model.name
-        if is_searched:
-            half_fov = math.radians(description.get_number("camera.fov")) / 2.0
-            camera["drop_tangent"] = math.tan(half_fov)
-        else:
-            # the larger one of width and height
-            camera["drop_tangent"] = max(model.inner_half_tangents)
+        camera |= _make_drop_entries(description, model)
     return camera
+
+
+def _make_perspective_lens(description: SceneDescription) -> Plugin:
+    """Return the plugin of a pinhole or of a thin lens."""
+    pinhole: Plugin = {
+        "type": "perspective",
+        "fov": description.get_number("camera.fov"),
+        "fov_axis": "larger",
+    }
+    if not description.thin_lens:
+        return pinhole
+    # Aperture and focus are inputs, which are set later. The type replaces the
+    # pinhole's, whose field of view stays.
+    thin_lens = {"type": "thinlens", "aperture_radius": 1e-4, "focus_distance": 1.0}
+    return pinhole | thin_lens
+
+
+def _make_drop_entries(description: SceneDescription, model: CameraModel) -> Plugin:
+    """Return the entries of our sensor for raindrops before a lens.
+
+    Drops cover the part of the glass through which the lens sees.
+    """
+    drops: Plugin = {
+        name: description.get_number(f"camera.{name}")
+        for name in ("drops", "drop_size", "drop_seed")
+    }
+    # A lens has no name if its numbers are searched. Then its view changes, and it gets
+    # the drops of a pinhole with the camera's field of view.
+    is_searched = not model.name
+    if is_searched:
+        half_fov = math.radians(description.get_number("camera.fov")) / 2.0
+        drops["drop_tangent"] = math.tan(half_fov)
+    else:
+        # the larger one of width and height
+        drops["drop_tangent"] = max(model.inner_half_tangents)
+    return drops
 
 
 # Mitsuba's names of numbers of the camera, by the names of our inputs
@@ -774,6 +904,36 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         resolution: (height, width) of the image. `camera.fov` is along its larger side,
             and is converted to Mitsuba's, which is along the width.
     """
+    return (
+        _make_pose_input("camera", "to_world"),
+        SceneInput(
+            name="camera.fov",
+            key="camera.x_fov",
+            convert_to_mitsuba=_make_fov_conversion(resolution),
+            shape=(1,),
+        ),
+        SceneInput("camera.lens", "camera.lens", shape=(len(NUMBER_NAMES),)),
+        *_make_camera_number_inputs(),
+        # (H, W + 2, 3): a copy of the last column before the first, and of the first
+        # after the last
+        SceneInput("environment.padded", "environment.data", has_interior_adjoint=True),
+        # pose of the plane that receives the shadow in a photograph
+        _make_pose_input(GROUND_NAME, "to_world"),
+        # (h, w, 3): colors of a ground that the map of the environment shows
+        SceneInput(
+            name="ground.reflectance",
+            key=f"{GROUND_NAME}.*.reflectance.data",
+            has_interior_adjoint=True,
+        ),
+    )
+
+
+def _make_fov_conversion(resolution: tuple[int, int]) -> Write:
+    """Return a function that converts a field of view to Mitsuba's.
+
+    Args:
+        resolution: (height, width) of the image.
+    """
     height, width = resolution
 
     def to_horizontal_fov(value: Any) -> Any:
@@ -785,7 +945,12 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         half_tangent = dr.tan(half_angle) * width_to_larger_side
         return mi.Float(2.0 * dr.rad2deg(dr.atan(half_tangent)))
 
-    camera_inputs = [
+    return to_horizontal_fov
+
+
+def _make_camera_number_inputs() -> list[SceneInput]:
+    """Return the inputs of the camera's numbers in `CAMERA_KEYS`."""
+    return [
         SceneInput(
             f"camera.{name}",
             f"camera.{key}",
@@ -794,25 +959,3 @@ def make_scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         )
         for name, key in CAMERA_KEYS.items()
     ]
-    return (
-        _make_pose_input("camera", "to_world"),
-        SceneInput(
-            "camera.fov",
-            "camera.x_fov",
-            convert_to_mitsuba=to_horizontal_fov,
-            shape=(1,),
-        ),
-        SceneInput("camera.lens", "camera.lens", shape=(len(NUMBER_NAMES),)),
-        *camera_inputs,
-        # (H, W + 2, 3): a copy of the last column before the first, and of the first
-        # after the last
-        SceneInput("environment.padded", "environment.data", has_interior_adjoint=True),
-        # pose of the plane that receives the shadow in a photograph
-        _make_pose_input(GROUND_NAME, "to_world"),
-        # (h, w, 3): colors of a ground that the map of the environment shows
-        SceneInput(
-            "ground.reflectance",
-            f"{GROUND_NAME}.*.reflectance.data",
-            has_interior_adjoint=True,
-        ),
-    )

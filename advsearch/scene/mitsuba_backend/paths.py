@@ -305,7 +305,10 @@ class LightPath:
         light *= dr.select(ds.delta, 1.0, _compute_weight(ds.pdf, pdf))
         radiance = dr.fma(self.throughput, value * light, self.radiance)
         self.radiance = dr.select(is_lit, radiance, self.radiance)
+        self._leave(si, sample, weight)
 
+    def _leave(self, si: Any, sample: Any, weight: Any) -> None:
+        """Leave a surface in the direction of a BSDF sample with a weight."""
         # the next segment; what it meets is weighted by the vertex and the density here
         self.ray = si.spawn_ray(si.to_world(sample.wo))
         self.throughput *= weight

@@ -149,47 +149,58 @@ class MitsubaScene:
             self.window: Window | None = None
             self._leave_out = frozenset(leave_out)
             # Recordings save work that is called "tracing": if that is left out, they
-            # are used. Dr.Jit can record neither a thin lens nor a textured emission.
-            can_be_recorded = not description.thin_lens and not any(
-                map(has_textured_emission, description.meshes.values())
+            # are used.
+            self._uses_recordings = "tracing" in leave_out and _can_be_recorded(
+                description
             )
-            self._uses_recordings = "tracing" in leave_out and can_be_recorded
             self._set_integrator(integrator)
-            self._pinhole = (
-                not description.thin_lens and description.camera_model is None
-            )
-            self._backdrop = description.backdrop
-            self.plane_radiance = compute_plane_radiance(description)
-            _check_emission(description)
-            self._guides = _make_guides_plugin(description)
-            self.is_volumetric = any(part.volumetric for part in description.parts)
-            # entries of every path integrator, which `_load_scene` fills in
-            self._path_entries: Plugin = {}
-            inputs = self._load_scene()
-            self._sensor = self._scene.sensors()[0]
-            self.parameters = mi.traverse(self._scene)
-            self._set_sampling_weights()
-            self._integrators: dict[tuple[str, int], Any] = {}
-            self._declare_inputs(inputs)
-            # base values of inputs that were changed at least once
-            self._base_values: dict[str, Any] = {}
-            # values of inputs that do not have their base value now
-            self._applied_values: dict[str, Tensor] = {}
-            self._recorded = Recordings()
-            scene_registry.hold_objects(
-                self,
-                self._scene,
-                self._integrators,
-                self.parameters,
-                media=self._find_media(),
-            )
-            # "uploads" is the work of setting inputs that do not change. If it is not
-            # left out, these base values of all inputs are set at each render.
-            self._values_to_upload: dict[str, Tensor] = {}
-            if "uploads" not in leave_out:
-                self._values_to_upload = {
-                    name: self.get_base_value(name) for name in sorted(self.input_names)
-                }
+            self._examine_description(description)
+            self._build_scene()
+            self._store_base_values()
+
+    def _examine_description(self, description: SceneDescription) -> None:
+        """Set what depends on the description alone, before the scene is loaded."""
+        self._pinhole = not description.thin_lens and description.camera_model is None
+        self._backdrop = description.backdrop
+        self.plane_radiance = compute_plane_radiance(description)
+        _check_emission(description)
+        self._guides = _make_guides_plugin(description)
+        self.is_volumetric = any(part.volumetric for part in description.parts)
+        # entries of every path integrator, which `_load_scene` fills in
+        self._path_entries: Plugin = {}
+
+    def _build_scene(self) -> None:
+        """Load Mitsuba's scene, find its inputs, and register its objects."""
+        inputs = self._load_scene()
+        self._sensor = self._scene.sensors()[0]
+        self.parameters = mi.traverse(self._scene)
+        self._set_sampling_weights()
+        self._integrators: dict[tuple[str, int], Any] = {}
+        self._declare_inputs(inputs)
+        self._recorded = Recordings()
+        scene_registry.hold_objects(
+            self,
+            self._scene,
+            self._integrators,
+            self.parameters,
+            media=self._find_media(),
+        )
+
+    def _store_base_values(self) -> None:
+        """Set which values of inputs are written, at first and at each render.
+
+        "uploads" is the work of setting inputs that do not change. If it is not left
+        out, the base values of all inputs are set at each render.
+        """
+        # base values of inputs that were changed at least once
+        self._base_values: dict[str, Any] = {}
+        # values of inputs that do not have their base value now
+        self._applied_values: dict[str, Tensor] = {}
+        self._values_to_upload: dict[str, Tensor] = {}
+        if "uploads" not in self._leave_out:
+            self._values_to_upload = {
+                name: self.get_base_value(name) for name in sorted(self.input_names)
+            }
 
     def _set_sampling_weights(self) -> None:
         """Set how often each mesh that emits light is sampled as a light."""
@@ -224,33 +235,32 @@ class MitsubaScene:
             description, self.resolution, filter_name, self.sampler_name
         )
         with parts.convert_refusals(description):
-            # Lobes of the principled plugin that have no effect, but take time. They
-            # are part of the plugin only if they are not left out.
-            idle_lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
-            translations = [
-                parts.translate_mesh(description.meshes[OBJECT], idle_lobes)
-            ]
-            # each part becomes Mitsuba's plugins, entries of integrators, and inputs
-            translations += [
-                parts.translate_part(get_positioned_part(description, part))
-                for part in description.parts
-            ]
+            translations = self._translate_parts(description)
             for translation in translations:
                 plugins |= translation.plugins
                 self._path_entries |= translation.integrator_entries
-            # Lamps that are dark by default are not sampled as lights. If an input
-            # switches one on, paths still find it when they meet it by chance.
             if "emitters" in self._leave_out:
-                for part in description.parts:
-                    if isinstance(part, Lamp) and part.dark:
-                        lamp = plugins[part.name]
-                        # a lamp is an emitter, or a shape that has one
-                        lamp.get("emitter", lamp)["sampling_weight"] = 0.0
+                _leave_out_dark_lamps(plugins, description)
             self._scene = mi.load_dict(plugins, optimize=False)
         inputs = list(parts.make_scene_inputs(self.resolution))
         for translation in translations:
             inputs += translation.inputs
         return inputs
+
+    def _translate_parts(
+        self, description: SceneDescription
+    ) -> list[parts.TranslatedPart]:
+        """Turn each part into Mitsuba's plugins, entries of integrators, and inputs."""
+        # Lobes of the principled plugin that have no effect, but take time. They
+        # are part of the plugin only if they are not left out.
+        idle_lobes = None if "lobes" in self._leave_out else parts.IDLE_LOBES
+        translations = [parts.translate_mesh(description.meshes[OBJECT], idle_lobes)]
+        # each part becomes Mitsuba's plugins, entries of integrators, and inputs
+        translations += [
+            parts.translate_part(get_positioned_part(description, part))
+            for part in description.parts
+        ]
+        return translations
 
     def _declare_inputs(self, inputs: Sequence[parts.SceneInput]) -> None:
         """Store the inputs that the scene really has, in `declared_inputs` and in sets.
@@ -263,23 +273,28 @@ class MitsubaScene:
             if key:  # empty if Mitsuba has no such parameter
                 self.declared_inputs[scene_input.name] = (key, scene_input)
         self.input_names = frozenset(self.declared_inputs)
-        self.interior_inputs = frozenset(
-            name
-            for name, (_, scene_input) in self.declared_inputs.items()
-            if scene_input.has_interior_adjoint
+        self.interior_inputs = self._select_inputs(
+            lambda _key, scene_input: scene_input.has_interior_adjoint
         )
         # Vertices and normals, which are written into the memory that they have.
-        self._buffers = frozenset(
-            name
-            for name, (key, _) in self.declared_inputs.items()
-            if key.endswith((POSITIONS, NORMALS))
+        self._buffers = self._select_inputs(
+            lambda key, _scene_input: key.endswith((POSITIONS, NORMALS))
         )
-        # Numbers that Mitsuba compiles into its kernels, as constants. They are the
-        # ones that are converted by `to_constant`.
-        self._constants = frozenset(
+        # Numbers that Mitsuba compiles into its kernels, as constants.
+        self._constants = self._select_inputs(
+            lambda _key, scene_input: (
+                scene_input.convert_to_mitsuba is parts.to_constant
+            )
+        )
+
+    def _select_inputs(
+        self, condition: Callable[[str, parts.SceneInput], bool]
+    ) -> frozenset[str]:
+        """Return the names of inputs whose key and definition meet a condition."""
+        return frozenset(
             name
-            for name, (_, scene_input) in self.declared_inputs.items()
-            if scene_input.convert_to_mitsuba is parts.to_constant
+            for name, (key, scene_input) in self.declared_inputs.items()
+            if condition(key, scene_input)
         )
 
     def _find_media(self) -> tuple[Any, ...]:
@@ -415,50 +430,42 @@ class MitsubaScene:
         """
         INTERRUPTS.raise_pending()  # stops here if the user has interrupted the run
         with mitsuba_lock, self._crop_film():
-
-            def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
-                """Render one image; this is the function that Dr.Jit records."""
-                image = integrator.render(
-                    scene,
-                    sensor=sensor,
-                    seed=seed,
-                    spp=spp,
-                    develop=True,
-                    evaluate=False,
-                )
-                # After the render the sampler's state refers to its full computation.
-                # A new seed, for a single sample, releases that.
-                sensor.sampler().seed(0, 1)
-                return image
-
             self._set_inputs_exactly(inputs)
             if scene_registry.unused_keys:
                 scene_registry.free_unused()
             spp = self.round_sample_count(spp)
             # All are loaded before the first render: to load one makes the recordings
             # stale.
-            integrators = [self._get_integrator(method) for method in seeds]
-            media = scene_registry.list_media() if self.is_volumetric else []
-            images: list[Tensor] = []
-            for (method, seed), integrator in zip(
-                seeds.items(), integrators, strict=True
-            ):
-                function: Callable[..., Any] = render
-                if self._uses_recordings:
-                    key = (method, spp, self.current_max_depth, self.window)
-                    function = self._recorded.get_or_record(key, render, media)
-                # opaque: a literal seed would be a constant of the recorded kernel
-                drjit_image = function(
-                    self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)
-                )
-                image = drjit_image.torch().clone()
-                if method == "guides":
-                    # Albedo and normal are the last six channels. There may be a color
-                    # before them.
-                    image = image[..., -6:]
-                    image[..., :3].clamp_(0.0, 1.0)
-                images.append(image)
-            return images
+            integrators = {method: self._get_integrator(method) for method in seeds}
+            return [
+                self._render_by_method(method, integrators[method], seed, spp)
+                for method, seed in seeds.items()
+            ]
+
+    def _render_by_method(
+        self, method: str, integrator: Any, seed: int, spp: int
+    ) -> Tensor:
+        """Render one image, see `render_images`; it is recorded if that saves time."""
+        render = self._get_render_function(method, spp)
+        # opaque: a literal seed would be a constant of the recorded kernel
+        opaque_seed = dr.opaque(mi.UInt32, seed)
+        drjit_image = render(self._scene, self._sensor, integrator, opaque_seed)
+        image: Tensor = drjit_image.torch().clone()
+        if method == "guides":
+            # Albedo and normal are the last six channels. There may be a color
+            # before them.
+            image = image[..., -6:]
+            image[..., :3].clamp_(0.0, 1.0)
+        return image
+
+    def _get_render_function(self, method: str, spp: int) -> Callable[..., Any]:
+        """Return the function that renders images by a method, recorded or not."""
+        render = _make_render_function(spp)
+        if not self._uses_recordings:
+            return render
+        media = scene_registry.list_media() if self.is_volumetric else []
+        key = (method, spp, self.current_max_depth, self.window)
+        return self._recorded.get_or_record(key, render, media)
 
     @property
     def mitsuba_shapes(self) -> list[Any]:
@@ -547,16 +554,22 @@ class MitsubaScene:
             hits = find_first_hits(
                 self._scene, self._sensor, (height * subdivision, width * subdivision)
             )
-            for part in self.description_and_filter[0].parts:
-                if isinstance(part, LampGlass):
-                    # The glass of a lamp was cut out of another mesh, its carrier. A
-                    # hit on it counts as a hit on that face of the carrier.
-                    on_glass = hits.visible_mask(part.name)
-                    carrier_face = torch.from_numpy(part.face_of_carrier)
-                    hits.face_index[on_glass] = carrier_face[hits.face_index[on_glass]]
-                    # ids count from 1, and 0 is no surface
-                    hits.id[on_glass] = hits.shape_names.index(part.carrier) + 1
+            self._map_glass_to_carriers(hits)
             return hits
+
+    def _map_glass_to_carriers(self, hits: Surfaces) -> None:
+        """Turn hits on the glass of lamps into hits on the meshes that carry it.
+
+        The glass was cut out of its carrier. A hit on it counts as a hit on that face
+        of the carrier.
+        """
+        for part in self.description_and_filter[0].parts:
+            if isinstance(part, LampGlass):
+                on_glass = hits.visible_mask(part.name)
+                carrier_face = torch.from_numpy(part.face_of_carrier)
+                hits.face_index[on_glass] = carrier_face[hits.face_index[on_glass]]
+                # ids count from 1, and 0 is no surface
+                hits.id[on_glass] = hits.shape_names.index(part.carrier) + 1
 
     def render_adjoint(
         self,
@@ -589,41 +602,57 @@ class MitsubaScene:
         """
         with mitsuba_lock:
             requested = tuple(inputs if wrt is None else wrt)
-            # Inputs that are differentiated although they are not requested. Usually
-            # there are none, since "gradients" is left out. To measure what these
-            # gradients take, it is not left out.
-            extra = set[str]()
-            if "gradients" not in self._leave_out:
-                extra = set(self.interior_inputs)
-            # The projective integrator supports no lens and no medium.
-            can_be_projective = (
-                method == "path" and self._pinhole and not self.is_volumetric
-            )
-            if can_be_projective and "boundary" not in self._leave_out:
-                method = "boundary"
-                extra = extra | self._buffers
-            # The integrator of images may be "path", which has no adjoint; "prb" has.
-            if method == "path" and self.integrator_name != "prb":
-                method = "adjoint"
+            method, extra = self._choose_adjoint(method)
             image_gradient = self._make_image_gradient(cotangent)
             self._set_inputs_exactly(inputs)
             names = (*sorted(extra - set(requested)), *requested)
             with self._tracked(names, inputs) as tracked, self._crop_film():
-                self._get_integrator(method).render_backward(
-                    self._scene,
-                    self.parameters,
-                    mi.TensorXf(image_gradient),
-                    sensor=self._sensor,
-                    seed=seed,
-                    spp=self.round_sample_count(spp),
-                )
-                return {
-                    name: dr.grad(tracked[name])
-                    .torch()
-                    .clone()
-                    .reshape(inputs[name].shape)
-                    for name in requested
-                }
+                self._backpropagate(method, image_gradient, seed, spp)
+                return _collect_gradients(tracked, requested, inputs)
+
+    def _choose_adjoint(self, method: str) -> tuple[str, set[str]]:
+        """Return the method of an integrator for the adjoint, and the inputs it adds.
+
+        These are differentiated although they are not requested. Usually there are
+        none, since "gradients" is left out. To measure what these gradients take, it is
+        not left out.
+
+        Args:
+            method: as in `render_adjoint`.
+        """
+        extra = set[str]()
+        if "gradients" not in self._leave_out:
+            extra = set(self.interior_inputs)
+        # The projective integrator supports no lens and no medium.
+        can_be_projective = (
+            method == "path" and self._pinhole and not self.is_volumetric
+        )
+        if can_be_projective and "boundary" not in self._leave_out:
+            method = "boundary"
+            extra = extra | self._buffers
+        # The integrator of images may be "path", which has no adjoint; "prb" has.
+        if method == "path" and self.integrator_name != "prb":
+            method = "adjoint"
+        return method, extra
+
+    def _backpropagate(
+        self, method: str, image_gradient: Tensor, seed: int, spp: int
+    ) -> None:
+        """Add the derivatives of an image's loss to the gradients of tracked inputs.
+
+        Args:
+            method: method of the integrator, see `_get_integrator`.
+            image_gradient: derivative of the loss by the channels of Mitsuba's image.
+            seed, spp: as in `render_adjoint`.
+        """
+        self._get_integrator(method).render_backward(
+            self._scene,
+            self.parameters,
+            mi.TensorXf(image_gradient),
+            sensor=self._sensor,
+            seed=seed,
+            spp=self.round_sample_count(spp),
+        )
 
     def _make_image_gradient(self, cotangent: Tensor) -> Tensor:
         """Return a cotangent with the channels of the image that Mitsuba renders.
@@ -665,37 +694,50 @@ class MitsubaScene:
         level = mi.log_level()
         try:
             for name in names:
-                key, scene_input = self.declared_inputs[name]
-                value = self.parameters[key]
-                # a copy: the parameter itself is replaced below
-                old_values[key] = type(value)(value)
-                if name in inputs:
-                    # `to_rendered` limits the value to what Mitsuba can render.
-                    tensor = mi.TensorXf(scene_input.to_rendered(inputs[name]))
-                else:
-                    tensor = mi.TensorXf(parts.to_torch(value))
-                dr.enable_grad(tensor)
-                tracked[name] = tensor
-                # Mitsuba's parameter may have another type than a tensor.
-                self.parameters[key] = (
-                    scene_input.convert_to_mitsuba(tensor)
-                    if scene_input.convert_to_mitsuba
-                    else tensor
-                )
+                tracked[name] = self._track_input(name, inputs.get(name), old_values)
             self.parameters.update()
             # Mitsuba warns at every call if a film samples beyond its border.
             mi.set_log_level(mi.LogLevel.Error)
             yield tracked
         finally:
             mi.set_log_level(level)
-            # Each value is taken out of the dictionary as it is put back, and its local
-            # name is deleted. If two objects owned its array, Dr.Jit would later write
-            # to a copy instead of the memory to which recordings refer, see `_write`.
-            while old_values:
-                key, value = old_values.popitem()
-                self.parameters[key] = value
-                del value
-            self.parameters.update()
+            self._restore_parameters(old_values)
+
+    def _track_input(
+        self, name: str, rendered: Tensor | None, old_values: dict[str, Any]
+    ) -> Any:
+        """Replace one input by a Dr.Jit tensor with gradients, and return that.
+
+        Args:
+            name: the input.
+            rendered: its value; None is the value that it has.
+            old_values: gets a copy of the parameter's value, by its key.
+        """
+        key, scene_input = self.declared_inputs[name]
+        value = self.parameters[key]
+        # a copy: the parameter itself is replaced below
+        old_values[key] = type(value)(value)
+        if rendered is None:
+            tensor = mi.TensorXf(parts.to_torch(value))
+        else:
+            # `to_rendered` limits the value to what Mitsuba can render.
+            tensor = mi.TensorXf(scene_input.to_rendered(rendered))
+        dr.enable_grad(tensor)
+        # Mitsuba's parameter may have another type than a tensor.
+        convert = scene_input.convert_to_mitsuba
+        self.parameters[key] = convert(tensor) if convert else tensor
+        return tensor
+
+    def _restore_parameters(self, old_values: dict[str, Any]) -> None:
+        """Put the values of parameters back, and empty the dictionary of them."""
+        # Each value is taken out of the dictionary as it is put back, and its local
+        # name is deleted. If two objects owned its array, Dr.Jit would later write
+        # to a copy instead of the memory to which recordings refer, see `_write`.
+        while old_values:
+            key, value = old_values.popitem()
+            self.parameters[key] = value
+            del value
+        self.parameters.update()
 
     def render_material_adjoint(
         self,
@@ -768,18 +810,8 @@ class MitsubaScene:
             self._set_inputs_exactly(inputs)
             key, _scene_input = self.declared_inputs[name]
             spp = self.round_sample_count(spp)
-            noise = mi.load_dict({"type": self.sampler_name, "sample_count": spp})
-            noise.set_samples_per_wavefront(spp)
-            n_samples = math.prod(self.window_size) * spp
-            # `opaque`: a literal seed would be compiled into the kernel as a constant.
-            noise.seed(dr.opaque(mi.UInt32, seed), n_samples)
-            # "mug.base_color" belongs to a mesh, and a pattern to a projector, which is
-            # one of Mitsuba's emitters.
-            part = name.partition(".")[0]
-            projector = None
-            if name.endswith(PATTERN_SUFFIX):
-                emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
-                projector = emitters.get(part)
+            noise = self._make_noise(seed, spp)
+            projector = self._find_projector_of(name)
             paths = collect_paths(
                 self._scene,
                 self.parameters,
@@ -792,21 +824,50 @@ class MitsubaScene:
                 unseen=self._find_plane(),  # its change is rendered apart
                 roulette_depth=self.roulette_depth,
             )
-            # The matrix that is made of the vertices repeats the texture. Texture
-            # coordinates are converted where Mitsuba does not: a projector's image ends
-            # at its border, and one of Mitsuba's own surfaces may mirror or clamp. A
-            # surface of ours (None) repeats, and its coordinates stay.
-            surface = None  # for `_to_repeating` a projector's image
-            if projector is None:
-                surface = self.description_and_filter[0].meshes[part].surface
-                if surface is None:
-                    return paths
-            texture_size = self.parameters[key].shape[:2]
-            vertices = [
-                replace(vertex, uv=_to_repeating(vertex.uv, surface, texture_size))
-                for vertex in paths.vertices
-            ]
-            return replace(paths, vertices=vertices)
+            if projector is not None:
+                size = self.parameters[key].shape[:2]
+                return _repeat_vertices(paths, surface=None, size=size)
+            return self._repeat_on_mesh(paths, name, key)
+
+    def _repeat_on_mesh(self, paths: TracedPaths, name: str, key: str) -> TracedPaths:
+        """Return paths with texture coordinates for the repeating texture of a mesh.
+
+        They change only on a surface of the user's: one of ours repeats already.
+
+        Args:
+            paths: the paths.
+            name: input of the texture, such as "mug.base_color".
+            key: Mitsuba's key of the texture.
+        """
+        description, _filter = self.description_and_filter
+        surface = description.meshes[name.partition(".")[0]].surface
+        if surface is None:
+            return paths
+        return _repeat_vertices(paths, surface, self.parameters[key].shape[:2])
+
+    def _make_noise(self, seed: int, spp: int) -> Any:
+        """Return Mitsuba's sampler, seeded for all samples of the window."""
+        noise = mi.load_dict({"type": self.sampler_name, "sample_count": spp})
+        noise.set_samples_per_wavefront(spp)
+        n_samples = math.prod(self.window_size) * spp
+        # `opaque`: a literal seed would be compiled into the kernel as a constant.
+        noise.seed(dr.opaque(mi.UInt32, seed), n_samples)
+        return noise
+
+    def _find_projector_of(self, input_name: str) -> Any:
+        """Return the projector to which an input belongs; None if it is no pattern.
+
+        "mug.base_color" belongs to a mesh, and a pattern to a projector, which is one
+        of Mitsuba's emitters.
+        """
+        if not input_name.endswith(PATTERN_SUFFIX):
+            return None
+        return self._find_projector(input_name.partition(".")[0])
+
+    def _find_projector(self, name: str) -> Any:
+        """Return the emitter of Mitsuba's scene with a name, or None."""
+        emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
+        return emitters.get(name)
 
     # ---- implementation
 
@@ -835,13 +896,17 @@ class MitsubaScene:
         if changes_constants:
             scene_registry.n_changes += 1
         for name, value in changes.items():
-            self._write(name, value)
-            if value is None:  # back to the base value
-                del self._applied_values[name]
-            else:
-                self._applied_values[name] = value.clone()
+            self._apply_change(name, value)
         if changes:
             self.parameters.update()
+
+    def _apply_change(self, name: str, value: Tensor | None) -> None:
+        """Write a value of an input, or its base value if it is None, and note that."""
+        self._write(name, value)
+        if value is None:  # back to the base value
+            del self._applied_values[name]
+        else:
+            self._applied_values[name] = value.clone()
 
     def _check_known(self, inputs: Mapping[str, Tensor]) -> None:
         """Check that the scene has all of these inputs."""
@@ -869,15 +934,18 @@ class MitsubaScene:
         for name, tensor in inputs.items():
             _key, scene_input = self.declared_inputs[name]
             value = scene_input.to_rendered(tensor)
-            applied = self._applied_values.get(name)
-            is_set = (
-                applied is not None
-                and applied.shape == value.shape
-                and torch.equal(applied, value)
-            )
-            if not is_set:
+            if not self._has_applied(name, value):
                 changes[name] = value
         return changes
+
+    def _has_applied(self, name: str, value: Tensor) -> bool:
+        """Return whether an input has a value already, and not its base value."""
+        applied = self._applied_values.get(name)
+        return (
+            applied is not None
+            and applied.shape == value.shape
+            and torch.equal(applied, value)
+        )
 
     def _write(self, name: str, tensor: Tensor | None) -> None:
         """Write a value of an input to Mitsuba, or its base value if it is None.
@@ -889,25 +957,15 @@ class MitsubaScene:
         """
         key, scene_input = self.declared_inputs[name]
         current = self.parameters[key]
-        if tensor is not None and scene_input.shape is not None:
-            if tensor.numel() != math.prod(scene_input.shape):
-                raise InputError(
-                    f"{name}: expected shape {scene_input.shape}, got "
-                    f"{tuple(tensor.shape)}, from what sets it"
-                )
+        _check_input_size(name, scene_input, tensor)
         is_buffer = name in self._buffers
         if name not in self._base_values:
-            # The memory of a buffer is copied, since it is overwritten in place below.
-            # Other values are replaced.
-            base = current.torch().clone() if is_buffer else current
-            self._base_values[name] = type(current)(base)
+            self._base_values[name] = _copy_parameter(current, is_buffer)
         if tensor is None:
             # a copy, so that the stored value is not what Mitsuba changes
             value = type(current)(self._base_values[name])
         else:
-            value = mi.TensorXf(tensor)
-            if scene_input.convert_to_mitsuba:
-                value = scene_input.convert_to_mitsuba(value)
+            value = _to_mitsuba(scene_input, tensor)
         if is_buffer:
             self._overwrite_buffer(current, value)
             self.parameters.set_dirty(key)
@@ -936,47 +994,167 @@ class MitsubaScene:
         """
         key = (method, self.current_max_depth)
         if key not in self._integrators:
-            # `_path_entries` has what a part of the scene needs. That of haze replaces
-            # the type, so that these entries come last.
-            adjoint = {
-                "type": "prb",
-                "max_depth": self.current_max_depth,
-                "rr_depth": self._gradient_roulette_depth,
-                **self._path_entries,
-            }
-            path = {
-                "type": self.integrator_name,
-                "max_depth": self.current_max_depth,
-                "rr_depth": self.roulette_depth,
-                **self._path_entries,
-            }
-            # Made of `adjoint`, since it has to have derivatives as well as images.
-            hidden = {**adjoint, "hide_emitters": True}
-            if self.plane_radiance is not None:
-                hidden["type"] = "advsearch_photograph"
-                # gloss and roughness of the plane's coat, by the names of the
-                # properties of `PhotographPath`
-                hidden["reflectance"] = self.description_and_filter[0].get_number(
-                    "ground.gloss"
-                )
-                hidden["roughness"] = self.description_and_filter[0].get_number(
-                    "ground.roughness"
-                )
-            recipes: dict[str, Plugin] = {
-                "path": path,
-                "adjoint": adjoint,
-                "hidden": hidden,
-                "guides": self._guides,
-                "boundary": {
-                    "type": "prb_projective",
-                    "max_depth": self.current_max_depth,
-                    "rr_depth": NO_ROULETTE_DEPTH,
-                    "guiding": "none",
-                },
-            }
-            self._integrators[key] = mi.load_dict(recipes[method])
+            recipe = self._list_integrators()[method]
+            self._integrators[key] = mi.load_dict(recipe)
             scene_registry.n_changes += 1
         return self._integrators[key]
+
+    def _list_integrators(self) -> dict[str, Plugin]:
+        """Return the plugins of integrators at the current depth, by the method."""
+        adjoint = self._make_path_integrator("prb", self._gradient_roulette_depth)
+        return {
+            "path": self._make_path_integrator(
+                self.integrator_name, self.roulette_depth
+            ),
+            "adjoint": adjoint,
+            "hidden": self._make_hidden_integrator(adjoint),
+            "guides": self._guides,
+            "boundary": {
+                "type": "prb_projective",
+                "max_depth": self.current_max_depth,
+                "rr_depth": NO_ROULETTE_DEPTH,
+                "guiding": "none",
+            },
+        }
+
+    def _make_path_integrator(self, kind: str, roulette_depth: int) -> Plugin:
+        """Return the plugin of a path integrator at the current depth.
+
+        Args:
+            kind: Mitsuba's type of the integrator.
+            roulette_depth: bounces from which on Russian roulette may end a path.
+        """
+        return {
+            "type": kind,
+            "max_depth": self.current_max_depth,
+            "rr_depth": roulette_depth,
+            # What a part of the scene needs. That of haze replaces the type, so that
+            # these entries come last.
+            **self._path_entries,
+        }
+
+    def _make_hidden_integrator(self, adjoint: Plugin) -> Plugin:
+        """Return the integrator that leaves out the environment that the camera sees.
+
+        It is made of `adjoint`, since it has to have derivatives as well as images.
+        """
+        hidden = {**adjoint, "hide_emitters": True}
+        if self.plane_radiance is None:
+            return hidden
+        description, _filter = self.description_and_filter
+        hidden["type"] = "advsearch_photograph"
+        # gloss and roughness of the plane's coat, by the names of the properties of
+        # `PhotographPath`
+        hidden["reflectance"] = description.get_number("ground.gloss")
+        hidden["roughness"] = description.get_number("ground.roughness")
+        return hidden
+
+
+def _copy_parameter(value: Any, is_buffer: bool) -> Any:
+    """Return a copy of a parameter's value.
+
+    The memory of a buffer is copied, since it is overwritten in place. Other values are
+    replaced.
+    """
+    return type(value)(value.torch().clone() if is_buffer else value)
+
+
+def _can_be_recorded(description: SceneDescription) -> bool:
+    """Return whether Dr.Jit can record renders of a scene.
+
+    It can record neither a thin lens nor a textured emission.
+    """
+    has_texture = any(map(has_textured_emission, description.meshes.values()))
+    return not description.thin_lens and not has_texture
+
+
+def _leave_out_dark_lamps(plugins: Plugin, description: SceneDescription) -> None:
+    """Leave lamps that are dark by default out of the sampling of lights.
+
+    If an input switches one on, paths still find it when they meet it by chance.
+    """
+    for part in description.parts:
+        if isinstance(part, Lamp) and part.dark:
+            lamp = plugins[part.name]
+            # a lamp is an emitter, or a shape that has one
+            lamp.get("emitter", lamp)["sampling_weight"] = 0.0
+
+
+def _make_render_function(spp: int) -> Callable[..., Any]:
+    """Return the function that renders one image, which Dr.Jit records.
+
+    Its only variable from outside is `spp`, since Dr.Jit reads those too.
+    """
+
+    def render(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
+        """Render one image; this is the function that Dr.Jit records."""
+        image = integrator.render(
+            scene,
+            sensor=sensor,
+            seed=seed,
+            spp=spp,
+            develop=True,
+            evaluate=False,
+        )
+        # After the render the sampler's state refers to its full computation.
+        # A new seed, for a single sample, releases that.
+        sensor.sampler().seed(0, 1)
+        return image
+
+    return render
+
+
+def _collect_gradients(
+    tracked: Mapping[str, Any], names: Sequence[str], inputs: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Return the gradients of tracked inputs with some names, in the inputs' shapes."""
+    gradients = {name: dr.grad(tracked[name]).torch().clone() for name in names}
+    return {
+        name: gradient.reshape(inputs[name].shape)
+        for name, gradient in gradients.items()
+    }
+
+
+def _repeat_vertices(
+    paths: TracedPaths, surface: Mapping[str, object] | None, size: Any
+) -> TracedPaths:
+    """Return paths with texture coordinates for a texture that repeats.
+
+    The matrix that is made of the vertices repeats the texture. Texture coordinates are
+    converted where Mitsuba does not: a projector's image ends at its border, and one of
+    Mitsuba's own surfaces may mirror or clamp. A surface of ours repeats, and its
+    coordinates stay.
+
+    Args:
+        paths: the paths.
+        surface: Mitsuba's dictionary of the surface; None for a projector's image.
+        size: rows and columns of the texture.
+    """
+    vertices = [
+        replace(vertex, uv=_to_repeating(vertex.uv, surface, size))
+        for vertex in paths.vertices
+    ]
+    return replace(paths, vertices=vertices)
+
+
+def _check_input_size(
+    name: str, scene_input: parts.SceneInput, tensor: Tensor | None
+) -> None:
+    """Raise InputError if a value of an input has the wrong number of elements."""
+    if tensor is not None and scene_input.shape is not None:
+        if tensor.numel() != math.prod(scene_input.shape):
+            raise InputError(
+                f"{name}: expected shape {scene_input.shape}, got "
+                f"{tuple(tensor.shape)}, from what sets it"
+            )
+
+
+def _to_mitsuba(scene_input: parts.SceneInput, tensor: Tensor) -> Any:
+    """Convert a value of an input to the type that Mitsuba's parameter has."""
+    value = mi.TensorXf(tensor)
+    if scene_input.convert_to_mitsuba:
+        value = scene_input.convert_to_mitsuba(value)
+    return value
 
 
 def _make_guides_plugin(description: SceneDescription) -> Plugin:

@@ -47,6 +47,7 @@ from advsearch.scene.mitsuba_backend.xml_files import (
     read_scene,
 )
 from advsearch.scene.parts import (
+    HazePart,
     MediumPart,
     PluginPart,
     PosedCamera,
@@ -100,18 +101,23 @@ def read_scene_dict(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[st
         tree = check_and_read_files(scene, read_scene(scene), notes)
     elif scene.get("type") == "scene":
         tree = to_plain(scene)
-        notes = [
-            f"scene: {name} is left out: expected a plugin's dictionary, got "
-            f"{type(entry).__name__}"
-            for name, entry in scene.items()
-            if name != "type" and not isinstance(entry, Mapping)
-        ]
+        notes = _describe_non_plugins(scene)
     else:
         raise InputError(
             f"scene: expected a dictionary of type 'scene', got {scene.get('type')!r}"
         )
     _check_numbers(tree, str(scene) if isinstance(scene, Path) else "scene")
     return tree, notes
+
+
+def _describe_non_plugins(scene: Mapping[str, object]) -> list[str]:
+    """Return warnings about entries of a scene's dictionary that are no plugins."""
+    return [
+        f"scene: {name} is left out: expected a plugin's dictionary, got "
+        f"{type(entry).__name__}"
+        for name, entry in scene.items()
+        if name != "type" and not isinstance(entry, Mapping)
+    ]
 
 
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
@@ -141,16 +147,28 @@ def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
                 inner_where = f"{where}: {format_name(key, quoted=False)}"
             _check_numbers(value, inner_where)
         elif key in NUMERIC_ENTRIES:
-            shape, expected = NUMERIC_ENTRIES[key]
-            try:
-                is_valid = np.asarray(value, np.float64).shape == shape
-            except (TypeError, ValueError):
-                is_valid = False
-            if not is_valid:
-                raise InputError(
-                    f"{where}: expected {expected} as {key} of its {plugin['type']}, "
-                    f"got {format_name(str(value))}"
-                )
+            _check_numeric_entry(key, value, plugin["type"], where)
+
+
+def _check_numeric_entry(key: str, value: object, kind: object, where: str) -> None:
+    """Check that an entry of `NUMERIC_ENTRIES` is numbers of the right shape.
+
+    Args:
+        key: key of the entry.
+        value: its value.
+        kind: type of its plugin, for errors.
+        where: beginning of error messages.
+    """
+    shape, expected = NUMERIC_ENTRIES[key]
+    try:
+        is_valid = np.asarray(value, np.float64).shape == shape
+    except (TypeError, ValueError):
+        is_valid = False
+    if not is_valid:
+        raise InputError(
+            f"{where}: expected {expected} as {key} of its {kind}, "
+            f"got {format_name(str(value))}"
+        )
 
 
 @dataclass(frozen=True)
@@ -179,15 +197,7 @@ def read_contents(path: Path) -> PluginContents:
         if kind in shapes.OBJECT_SHAPES and named[name].get("bsdf") != NULL_BSDF
     )
     cameras = tuple(name for name, kind in type_by_name.items() if kind in CAMERAS)
-    known_names = {*objects, *cameras}
-    # Integrators and sensors are replaced by our own; sensors in `cameras` also give
-    # these their poses. All other plugins stay unchanged.
-    replaced_types = INTEGRATOR_TYPES | SENSOR_TYPES
-    unchanged = {
-        name: kind
-        for name, kind in type_by_name.items()
-        if name not in known_names and kind not in replaced_types
-    }
+    unchanged = _select_unchanged(type_by_name, {*objects, *cameras})
     lights = tuple(name for name, plugin in named.items() if _emits_light(plugin))
     return PluginContents(
         objects=objects,
@@ -195,6 +205,22 @@ def read_contents(path: Path) -> PluginContents:
         lights=lights,
         cameras=tuple(map(_rename_reserved, cameras)),
     )
+
+
+def _select_unchanged(
+    type_by_name: Mapping[str, str], known_names: Collection[str]
+) -> dict[str, str]:
+    """Return the types of plugins that stay unchanged, without those of known names.
+
+    Integrators and sensors are replaced by our own; sensors that can be used also give
+    these their poses.
+    """
+    replaced_types = INTEGRATOR_TYPES | SENSOR_TYPES
+    return {
+        name: kind
+        for name, kind in type_by_name.items()
+        if name not in known_names and kind not in replaced_types
+    }
 
 
 def _rename_reserved(name: str) -> str:
@@ -233,57 +259,113 @@ def import_mitsuba_scene(
     where = scene.name if isinstance(scene, Path) else "scene"
     plugins = dict(_list_plugins(tree))
     object_id = _find_shape(plugins, object_id, where)
+    _check_plugin_count(plugins, where)
+    shape = _load_object_shape(plugins, object_id)
+    frame = _ObjectFrame(shape.mesh, object_id, z_up=_is_z_up(plugins))
+    # A haze replaces the plugins that it is made of.
+    haze, haze_names = _find_haze_and_names(plugins, frame)
+    clauses = shape.describe_changes(tree, hazy=haze is not None)
+    notes += [f"{where}: {clause}" for clause in clauses]
+    source = scene if isinstance(scene, Path) else Path("scene.xml")
+    asset = shape.make_asset(frame, source, where, notes)
+    surroundings: list[ScenePart] = [] if haze is None else [haze]
+    surroundings += _import_surroundings(plugins, {object_id, *haze_names}, frame)
+    cameras = _import_cameras(plugins, frame)
+    return ImportedScene(asset, tuple(surroundings), cameras)
+
+
+@dataclass(frozen=True, eq=False)
+class _ObjectShape:
+    """The shape of a scene that becomes the object."""
+
+    name: str  # its id
+    plugin: Mapping[str, object]  # its dictionary
+    surface: shapes.ShapeSurface
+    mesh: Mesh  # in the scene's coordinates
+    has_uvs: bool  # whether the file has texture coordinates of it
+
+    def describe_changes(self, tree: Mapping[str, object], *, hazy: bool) -> list[str]:
+        """Return clauses about what of a scene and this shape is not as in the file.
+
+        `hazy` is whether the medium that cameras stand in is rendered, as a haze.
+        """
+        lit = _find_radiance(self.plugin) is not None
+        return [
+            *_describe_left_out(tree, self.plugin, hazy=hazy, lit=lit),
+            *self.surface.notes,
+            *_describe_missing_attributes(self.surface.plugin, self.mesh),
+        ]
+
+    def make_asset(
+        self, frame: _ObjectFrame, source: Path, where: str, notes: list[str]
+    ) -> ObjectAsset:
+        """Make the object.
+
+        Args:
+            frame: its coordinates.
+            source: path of the scene.
+            where: the scene, for errors.
+            notes: warnings about the import.
+        """
+        mesh, base_color = _paint(
+            _make_upright(self.mesh, frame.rotation),
+            has_uvs=self.has_uvs,
+            surface=self.surface,
+            kind=str(self.plugin["type"]),
+            where=where,
+        )
+        return ObjectAsset(
+            name=f"{make_safe_name(source)}-{sanitize_name(self.name)}",
+            mesh=normalise_mesh(mesh),
+            base_color=base_color,
+            source=str(source),
+            warnings=tuple(notes),
+            up=FileAxis("z"),
+            surface=self.surface.plugin,
+            emission=_find_radiance(self.plugin),
+            extent=frame.size,
+        )
+
+
+def _load_object_shape(
+    plugins: Mapping[str, Mapping[str, object]], name: str
+) -> _ObjectShape:
+    """Load the shape with an id, and read its surface."""
+    plugin = plugins[name]
+    surface = shapes.read_surface(_find_surface(plugin, plugins))
+    mesh, has_uvs = shapes.load_shape_mesh(plugin, name)
+    return _ObjectShape(name, plugin, surface, mesh, has_uvs)
+
+
+def _check_plugin_count(plugins: Collection[str], where: str) -> None:
+    """Raise InputError if a scene has too many plugins at its top."""
     if len(plugins) > MAX_PLUGINS:
         raise InputError(
             f"{where}: expected at most {MAX_PLUGINS} plugins at the top, "
             f"got {len(plugins)}; join meshes"
         )
-    shape = plugins[object_id]
-    surface = shapes.read_surface(_find_surface(shape, plugins))
-    mesh, has_uvs = shapes.load_shape_mesh(shape, object_id)
-    frame = _ObjectFrame(mesh, object_id, z_up=_is_z_up(plugins))
-    # A haze replaces the plugins that it is made of: a ball and the medium in it.
-    haze = None
-    haze_names = frozenset[str]()
+
+
+def _find_haze_and_names(
+    plugins: Mapping[str, Mapping[str, object]], frame: _ObjectFrame
+) -> tuple[HazePart | None, frozenset[str]]:
+    """Return the haze of a scene, and the names of the plugins that it replaces.
+
+    These are a ball and the medium in it.
+    """
     haze_and_names = shapes.find_haze(plugins, frame.matrix)
-    if haze_and_names is not None:
-        haze, haze_names = haze_and_names
-    emission = _find_radiance(shape)
-    clauses = [
-        *_describe_left_out(
-            tree, shape, hazy=haze is not None, lit=emission is not None
-        ),
-        *surface.notes,
-        *_describe_missing_attributes(surface.plugin, mesh),
-    ]
-    notes += [f"{where}: {clause}" for clause in clauses]
-    mesh, base_color = _paint(
-        _make_upright(mesh, frame.rotation),
-        has_uvs=has_uvs,
-        surface=surface,
-        kind=str(shape["type"]),
-        where=where,
-    )
-    source = scene if isinstance(scene, Path) else Path("scene.xml")
-    asset = ObjectAsset(
-        name=f"{make_safe_name(source)}-{sanitize_name(object_id)}",
-        mesh=normalise_mesh(mesh),
-        base_color=base_color,
-        source=str(source),
-        warnings=tuple(notes),
-        up=FileAxis("z"),
-        surface=surface.plugin,
-        emission=emission,
-        extent=frame.size,
-    )
-    surroundings: list[ScenePart] = [] if haze is None else [haze]
-    surroundings += _import_surroundings(plugins, {object_id, *haze_names}, frame)
-    cameras = {
+    return (None, frozenset()) if haze_and_names is None else haze_and_names
+
+
+def _import_cameras(
+    plugins: Mapping[str, Mapping[str, object]], frame: _ObjectFrame
+) -> dict[str, PosedCamera]:
+    """Return the cameras of a scene by name, in the object's coordinates."""
+    return {
         _rename_reserved(name): _import_camera(plugin, frame)
         for name, plugin in plugins.items()
         if plugin["type"] in CAMERAS
     }
-    return ImportedScene(asset, tuple(surroundings), cameras)
 
 
 def _make_upright(mesh: Mesh, rotation: Float64Array) -> Mesh:
@@ -358,16 +440,22 @@ def _import_surroundings(
     for name, plugin in named.items():
         if name in used or plugin["type"] in replaced_types:
             continue
-        moved_plugin = _rename_references(frame.move_plugin(plugin))
-        has_medium = any(
-            inner.get("type") in MEDIUM_TYPES for inner in iterate_plugins(moved_plugin)
-        )
-        part_type = MediumPart if has_medium else PluginPart
-        yield part_type(
-            _rename_reserved(name),
-            plugin=moved_plugin,
-            emits_light=_emits_light(moved_plugin),
-        )
+        yield _import_plugin(name, plugin, frame)
+
+
+def _import_plugin(
+    name: str, plugin: Mapping[str, object], frame: _ObjectFrame
+) -> ScenePart:
+    """Return a plugin of a scene as a part, in the object's coordinates."""
+    moved_plugin = _rename_references(frame.move_plugin(plugin))
+    inner_types = (inner.get("type") for inner in iterate_plugins(moved_plugin))
+    has_medium = any(inner_type in MEDIUM_TYPES for inner_type in inner_types)
+    part_type = MediumPart if has_medium else PluginPart
+    return part_type(
+        _rename_reserved(name),
+        plugin=moved_plugin,
+        emits_light=_emits_light(moved_plugin),
+    )
 
 
 def _paint(
@@ -388,15 +476,37 @@ def _paint(
         where: the scene, for errors.
     """
     if surface.is_textured or surface.is_bound:
-        # to Mitsuba's v, which points down (1 - v), by the transform, and back
-        mitsuba_uvs = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
-        mitsuba_uvs = mitsuba_uvs @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
-        uvs = (mitsuba_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)
-        return replace(mesh, uvs=uvs), surface.base_color
+        return replace(
+            mesh, uvs=_apply_uv_matrix(mesh.uvs, surface.to_uv)
+        ), surface.base_color
     # On these shapes several points have the same texture coordinates.
     has_shared_uvs = kind in ("cube", "sphere", "cylinder", "disk")
     keeps_uvs = has_uvs and not has_shared_uvs
-    surface_color = ImportedSurface(color=surface.base_color[0, 0])
+    return _paint_evenly(mesh, surface.base_color[0, 0], keeps_uvs, where)
+
+
+def _apply_uv_matrix(uvs: Float32Array, to_uv: Float64Array) -> Float32Array:
+    """Return texture coordinates (V, 2) under a transform (3, 3) of Mitsuba's.
+
+    It is applied to Mitsuba's v, which points down (1 - v).
+    """
+    mitsuba_uvs = uvs * (1.0, -1.0) + (0.0, 1.0)
+    mitsuba_uvs = mitsuba_uvs @ to_uv[:2, :2].T + to_uv[:2, 2]
+    moved_uvs: Float32Array = (mitsuba_uvs * (1.0, -1.0) + (0.0, 1.0)).astype(
+        np.float32
+    )
+    return moved_uvs
+
+
+def _paint_evenly(
+    mesh: Mesh, color: Float32Array, keeps_uvs: bool, where: str
+) -> tuple[Mesh, Float32Array]:
+    """Return a mesh of one color (3,) with a texture of it.
+
+    The functions of mesh import make new texture coordinates, unless the mesh keeps
+    its.
+    """
+    surface_color = ImportedSurface(color=color)
     part = ImportedPart(
         vertices=mesh.vertices.astype(np.float64),
         faces=mesh.faces.astype(np.int64),
@@ -404,11 +514,8 @@ def _paint(
         uvs=mesh.uvs.astype(np.float64) if keeps_uvs else None,
         surface=surface_color,
     )
-    # The functions of mesh import make new texture coordinates if the part has none,
-    # and a texture of the color.
-    soup, maps = apply_textures(
-        join_parts([part], where, np.eye(3)), [surface_color], Notes(where)
-    )
+    part_soup = join_parts([part], where, np.eye(3))
+    soup, maps = apply_textures(part_soup, [surface_color], Notes(where))
     textured_mesh, *_others = make_mesh_from_soup(soup)
     return textured_mesh, maps.color
 
@@ -449,33 +556,48 @@ def _find_surface(
         UnknownNameError: a reference leads nowhere, or in a circle.
         InputError: the surface has too many plugins.
     """
-    n_plugins = 0  # how many have been resolved
+    references = _SurfaceReferences(named)
+    inner_plugins = (entry for entry in shape.values() if isinstance(entry, Mapping))
+    for plugin in inner_plugins:
+        if plugin["type"] not in LIGHT_TYPES | MEDIUM_TYPES:
+            return references.resolve(plugin, 0)
+    return {"type": "diffuse"}
 
-    def resolve(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
+
+class _SurfaceReferences:
+    """Replaces the references in one surface by the plugins to which they refer.
+
+    Args:
+        named: the scene's plugins by name.
+    """
+
+    def __init__(self, named: Mapping[str, Mapping[str, object]]) -> None:
+        """Begin with no plugins resolved."""
+        self._named = named
+        self._n_plugins = 0  # how many have been resolved
+
+    def resolve(self, plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
         """Return a plugin with the references in it resolved.
 
         `depth` counts the references on the way from the shape to this plugin.
         """
-        nonlocal n_plugins
-        n_plugins += 1
-        if n_plugins > MAX_PLUGINS:
+        self._n_plugins += 1
+        if self._n_plugins > MAX_PLUGINS:
             raise InputError(
                 f"object: expected a surface of at most {MAX_PLUGINS} "
                 "plugins, got more; make it simpler"
             )
         if plugin["type"] == "ref":
-            name = str(plugin["id"])
-            # more references than plugins: they go in a circle
-            if name not in named or depth > len(named):
-                raise UnknownNameError("material of the scene", name, list(named))
-            return resolve(named[name], depth + 1)
-        return map_inner_plugins(plugin, lambda inner: resolve(inner, depth))
+            target = self._look_up(str(plugin["id"]), depth)
+            return self.resolve(target, depth + 1)
+        return map_inner_plugins(plugin, lambda inner: self.resolve(inner, depth))
 
-    inner_plugins = (entry for entry in shape.values() if isinstance(entry, Mapping))
-    for plugin in inner_plugins:
-        if plugin["type"] not in LIGHT_TYPES | MEDIUM_TYPES:
-            return resolve(plugin, 0)
-    return {"type": "diffuse"}
+    def _look_up(self, name: str, depth: int) -> Mapping[str, object]:
+        """Return the plugin with a name; `depth` is that of `resolve`."""
+        # more references than plugins: they go in a circle
+        if name not in self._named or depth > len(self._named):
+            raise UnknownNameError("material of the scene", name, list(self._named))
+        return self._named[name]
 
 
 def _find_radiance(shape: Mapping[str, object]) -> Float32Array | None:
@@ -527,6 +649,16 @@ def _describe_left_out(
             yield from _describe_integrator(name, plugin)
         elif plugin["type"] in SENSOR_TYPES:
             yield from _describe_sensor(name, plugin, hazy=hazy)
+    yield from _describe_left_out_of_object(shape, lit=lit)
+
+
+def _describe_left_out_of_object(
+    shape: Mapping[str, object], *, lit: bool
+) -> Iterator[str]:
+    """Yield clauses about entries of the object's shape that are left out.
+
+    `lit` is whether the object keeps the light that it emits.
+    """
     for key, inner in shape.items():
         if not isinstance(inner, Mapping):
             if key not in shapes.SHAPE_ENTRIES:
@@ -616,16 +748,10 @@ class _ObjectFrame:
             raise InputError(
                 f"object {name}: expected a shape of some size, got one of {self.size}"
             )
-        translation = np.eye(4)
-        translation[:3, 3] = (
-            -(lower[0] + upper[0]) / 2,
-            -(lower[1] + upper[1]) / 2,
-            -lower[2],
-        )
         # The last factor is applied first: z up, then centered on the ground, then
         # scaled to the extent 1.
         scaling = np.diag([1.0 / self.size] * 3 + [1.0])
-        self.matrix = scaling @ translation @ to_z_up
+        self.matrix = scaling @ _make_centering(lower, upper) @ to_z_up
 
     def move_plugin(
         self, plugin: Mapping[str, object], *, at_top: bool = True
@@ -640,30 +766,42 @@ class _ObjectFrame:
             at_top: whether it is at the top of the scene; inside another plugin only
                 media and volumes change.
         """
+        if at_top and plugin["type"] == "merge":
+            # It has no pose: each shape in it is moved, as at the top of the scene.
+            return map_inner_plugins(plugin, self.move_plugin)
+        if at_top:
+            entries = self._move_entries(plugin)
+        else:
+            entries = self._scale_medium(plugin)
+        return map_inner_plugins(
+            entries, lambda inner: self.move_plugin(inner, at_top=False)
+        )
+
+    def _move_entries(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin at the top of the scene, moved without those inside of it."""
+        kind = plugin["type"]
+        if kind in SHAPE_TYPES - {"shapegroup"}:
+            return self._with_pose(plugin)
+        if kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
+            return self._move_distant_light(plugin)
+        if kind in ("point", "spot", "projector"):
+            return self._move_lamp(plugin)
+        return self._scale_medium(plugin)
+
+    def _scale_medium(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin in the object's coordinates if it is a medium or a volume.
+
+        Any other plugin stays as it is.
+        """
         kind = plugin["type"]
         if kind in MEDIUM_TYPES:
             # density is per length, and the object's unit of length is `size` times as
             # long as the scene's
             scale = float(np.asarray(plugin.get("scale", 1.0)))
-            entries = {**plugin, "scale": scale * self.size}
-        elif kind in ("gridvolume", "constvolume"):
-            entries = self._with_pose(plugin)
-        elif not at_top:
-            entries = dict(plugin)
-        elif kind == "merge":
-            # It has no pose: each shape in it is moved, as at the top of the scene.
-            return map_inner_plugins(plugin, self.move_plugin)
-        elif kind in SHAPE_TYPES - {"shapegroup"}:
-            entries = self._with_pose(plugin)
-        elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
-            entries = self._move_distant_light(plugin)
-        elif kind in ("point", "spot", "projector"):
-            entries = self._move_lamp(plugin)
-        else:
-            entries = dict(plugin)
-        return map_inner_plugins(
-            entries, lambda inner: self.move_plugin(inner, at_top=False)
-        )
+            return {**plugin, "scale": scale * self.size}
+        if kind in ("gridvolume", "constvolume"):
+            return self._with_pose(plugin)
+        return dict(plugin)
 
     def _with_pose(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin whose `to_world` leads to the object's coordinates."""
@@ -701,6 +839,20 @@ class _ObjectFrame:
         power = "irradiance" if kind == "projector" else "intensity"
         entries[power] = _scale_power(entries.get(power, 1.0), self.size**-2, kind)
         return entries
+
+
+def _make_centering(lower: Float64Array, upper: Float64Array) -> Float64Array:
+    """Return the translation (4, 4) that centers a box on the ground, z = 0.
+
+    The box goes from one corner (3,) to the other.
+    """
+    translation = np.eye(4)
+    translation[:3, 3] = (
+        -(lower[0] + upper[0]) / 2,
+        -(lower[1] + upper[1]) / 2,
+        -lower[2],
+    )
+    return translation
 
 
 def _scale_power(value: object, factor: float, kind: str) -> object:
@@ -775,10 +927,6 @@ def _read_film_size(film: Mapping[str, object]) -> tuple[float, float]:
 def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCamera:
     """Return a sensor's pose and field of view along the larger side.
 
-    The sensor's own field of view is along the axis that it states; that of a focal
-    length is along the film's diagonal. The tangent of half the field of view is
-    proportional to the film's length along the axis, by which it is converted.
-
     Args:
         sensor: the sensor's dictionary.
         frame: the object's coordinates.
@@ -790,23 +938,40 @@ def _import_camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PosedCa
     # types of films are "hdrfilm" and "specfilm"
     film = next((plugin for plugin in entries if "film" in str(plugin["type"])), {})
     width, height = _read_film_size(film)
+    fov = _compute_larger_fov(sensor, width, height)
+    return PosedCamera(matrix, fov)
+
+
+def _compute_larger_fov(
+    sensor: Mapping[str, object], width: float, height: float
+) -> float:
+    """Return a sensor's field of view along the larger side of its film, in degrees.
+
+    The sensor's own field of view is along the axis that it states; that of a focal
+    length is along the film's diagonal. The tangent of half the field of view is
+    proportional to the film's length along the axis, by which it is converted.
+    """
     axis = str(sensor.get("fov_axis", "x"))
     fov = float(np.asarray(sensor.get("fov", 0.0)))
     has_no_fov = fov == 0.0
     if has_no_fov:  # the sensor states a focal length, or nothing
         axis = "diagonal"
         fov = _compute_diagonal_fov(str(sensor.get("focal_length", "50mm")))
-    larger_side = max(width, height)
+    axis_length = _measure_film_axis(axis, width, height)
+    half_tangent = math.tan(math.radians(fov) / 2.0) * max(width, height) / axis_length
+    return 2.0 * math.degrees(math.atan(half_tangent))
+
+
+def _measure_film_axis(axis: str, width: float, height: float) -> float:
+    """Return the length of a film along an axis by Mitsuba's name of it."""
     length_of_axis = {
         "x": width,
         "y": height,
         "diagonal": math.hypot(width, height),
-        "larger": larger_side,
+        "larger": max(width, height),
         "smaller": min(width, height),
     }
-    axis_length = length_of_axis.get(axis, width)  # an unknown axis counts as x
-    half_tangent = math.tan(math.radians(fov) / 2.0) * larger_side / axis_length
-    return PosedCamera(matrix, 2.0 * math.degrees(math.atan(half_tangent)))
+    return length_of_axis.get(axis, width)  # an unknown axis counts as x
 
 
 def _compute_diagonal_fov(text: str) -> float:

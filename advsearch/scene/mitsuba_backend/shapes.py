@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -113,39 +113,50 @@ def load_shape_mesh(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]
         InputError: the shape has no triangles, or vertices that are not finite.
     """
     buffers = _load_any_buffers(shape, name)
+    _check_vertices(buffers, name)
+    has_uvs = buffers.uvs is not None
+    if shape.get("face_normals"):
+        buffers = buffers._replace(normals=None)
+    if buffers.uvs is None or buffers.normals is None:
+        # Default values belong to the corners of a face. So each corner becomes a
+        # vertex, with default values for what is missing.
+        buffers = _separate_faces(buffers)
+    normal_sign = -1.0 if shape.get("flip_normals") else 1.0
+    return _make_used_mesh(buffers, normal_sign), has_uvs
+
+
+def _check_vertices(buffers: Buffers, name: str) -> None:
+    """Raise InputError if a mesh has vertices that are not finite."""
     if not np.isfinite(buffers.vertices).all():
         raise InputError(
             f"object {name}: expected finite vertices, got NaN or infinite ones; "
             "repair the mesh"
         )
-    has_uvs = buffers.uvs is not None
-    if shape.get("face_normals"):
-        buffers = buffers._replace(normals=None)
-    vertices, faces, normals, uvs, attributes = buffers  # in the order of its fields
-    if uvs is None or normals is None:
-        # Default values belong to the corners of a face. So each corner becomes a
-        # vertex, with default values for what is missing.
-        vertices, faces, normals, uvs, attributes = _separate_faces(buffers)
 
-    # Leave out vertices that no face has.
-    used_vertices, vertex_index = np.unique(faces, return_inverse=True)
+
+def _make_used_mesh(buffers: Buffers, normal_sign: float) -> Mesh:
+    """Return the mesh of buffers, without vertices that no face has.
+
+    The buffers have normals, which are multiplied by `normal_sign`, and texture
+    coordinates.
+    """
+    assert buffers.normals is not None and buffers.uvs is not None
+    used_vertices, vertex_index = np.unique(buffers.faces, return_inverse=True)
     faces = vertex_index.reshape(-1, 3)
-    vertices = vertices[used_vertices]
+    vertices = buffers.vertices[used_vertices]
     # v points up in our meshes and down in Mitsuba's, so that it becomes 1 - v.
-    uvs = uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
-    normal_sign = -1.0 if shape.get("flip_normals") else 1.0
+    uvs = buffers.uvs[used_vertices] * (1.0, -1.0) + (0.0, 1.0)
     # The normals of a face without area are NaN.
-    normals = np.nan_to_num(normals)[used_vertices] * normal_sign
+    normals = np.nan_to_num(buffers.normals)[used_vertices] * normal_sign
     if _has_opposite_winding(vertices, faces, normals):
         faces = faces[:, ::-1]
-    mesh = Mesh(
-        vertices.astype(np.float32),
-        np.ascontiguousarray(faces, np.uint32),
-        normals.astype(np.float32),
-        uvs.astype(np.float32),
-        _select_vertices(attributes, used_vertices),
+    return Mesh(
+        vertices=vertices.astype(np.float32),
+        faces=np.ascontiguousarray(faces, np.uint32),
+        normals=normals.astype(np.float32),
+        uvs=uvs.astype(np.float32),
+        attributes=_select_vertices(buffers.attributes, used_vertices),
     )
-    return mesh, has_uvs
 
 
 def _has_opposite_winding(
@@ -180,17 +191,11 @@ def _select_vertices(
     }
 
 
-def _separate_faces(
-    buffers: Buffers,
-) -> tuple[Float64Array, IntArray, Float64Array, Float64Array, dict[str, Float32Array]]:
+def _separate_faces(buffers: Buffers) -> Buffers:
     """Return buffers in which every corner of a face is a vertex of its own.
 
     Missing normals are replaced by those of the faces, and missing texture coordinates
     by `DEFAULT_FACE_UVS`.
-
-    Returns:
-        Vertices (3 F, 3), faces (F, 3), normals (3 F, 3), texture coordinates (3 F, 2),
-        and attributes by name.
     """
     corners = buffers.faces.reshape(-1)
     vertices = buffers.vertices[corners]
@@ -205,7 +210,7 @@ def _separate_faces(
     else:
         uvs = buffers.uvs[corners]
     attributes = _select_vertices(buffers.attributes, corners)
-    return vertices, faces, normals, uvs, attributes
+    return Buffers(vertices, faces, normals, uvs, attributes)
 
 
 def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
@@ -221,6 +226,29 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
     Raises:
         InputError: Mitsuba refuses the mesh, or it has no faces.
     """
+    mesh = _load_geometry(shape, name)
+    parameters = mi.traverse(mesh)
+    vertices = _read_buffer_rows(parameters, POSITIONS, width=3)
+    faces = np.array(parameters[FACES], np.int64).reshape(-1, 3)
+    if not len(faces):
+        raise InputError(
+            f"object {name}: expected a mesh with faces, got none; export triangles"
+        )
+    normals = None
+    if mesh.has_vertex_normals():
+        normals = _read_buffer_rows(parameters, NORMALS, width=3)
+    uvs = None
+    if mesh.has_vertex_texcoords():
+        uvs = _read_buffer_rows(parameters, TEXCOORDS, width=2)
+    attributes = _read_attributes(parameters, len(vertices), len(faces))
+    return Buffers(vertices, faces, normals, uvs, attributes)
+
+
+def _load_geometry(shape: Mapping[str, object], name: str) -> Any:
+    """Return Mitsuba's mesh of a shape, without surface and light.
+
+    If Mitsuba refuses it, an InputError says so.
+    """
     entries = {key: value for key, value in shape.items() if key in MESH_ENTRIES}
     try:
         with suppress_warnings():
@@ -229,21 +257,12 @@ def _load_buffers(shape: Mapping[str, object], name: str) -> Buffers:
         raise InputError(
             f"object {name}: Mitsuba refuses the shape: {error}; change it there"
         ) from error
-    parameters = mi.traverse(mesh)
+    return mesh
 
-    def get_rows(key: str, width: int) -> Float64Array:
-        return np.array(parameters[key], np.float64).reshape(-1, width)
 
-    vertices = get_rows(POSITIONS, 3)
-    faces = np.array(parameters[FACES], np.int64).reshape(-1, 3)
-    if not len(faces):
-        raise InputError(
-            f"object {name}: expected a mesh with faces, got none; export triangles"
-        )
-    normals = get_rows(NORMALS, 3) if mesh.has_vertex_normals() else None
-    uvs = get_rows(TEXCOORDS, 2) if mesh.has_vertex_texcoords() else None
-    attributes = _read_attributes(parameters, len(vertices), len(faces))
-    return Buffers(vertices, faces, normals, uvs, attributes)
+def _read_buffer_rows(parameters: Any, key: str, width: int) -> Float64Array:
+    """Return a flat buffer of a mesh as rows (n, width)."""
+    return np.array(parameters[key], np.float64).reshape(-1, width)
 
 
 def _read_attributes(
@@ -288,13 +307,8 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     Raises:
         InputError: its pose has a determinant of 0, so that it has no extent.
     """
-    vertices, faces, normals, uvs = _make_unit_shape(kind)
-    shape_pose = np.eye(4)
-    if kind == "sphere":
-        shape_pose[:3, :3] *= _get_radius(shape)
-        shape_pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
-    elif kind == "cylinder":
-        shape_pose = _compute_cylinder_pose(shape)
+    vertices, faces, normals, uvs = _make_unit_shape(kind)  # in its fields' order
+    shape_pose = _compute_shape_pose(kind, shape)
     # without faces that have no area, such as those at a pole
     areas = np.linalg.norm(compute_area_vectors(vertices[faces]), axis=1)
     faces = faces[areas > 1e-9]
@@ -311,41 +325,84 @@ def _tessellate(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
     return Buffers(posed_vertices, faces, posed_normals, uvs, attributes={})
 
 
-def _make_unit_shape(
-    kind: str,
-) -> tuple[Float64Array, IntArray, Float64Array, Float64Array]:
-    """Return the triangles of one of `TESSELLATED_SHAPES` as Mitsuba's unit shape.
-
-    Returns:
-        Vertices (V, 3), faces (F, 3), normals (V, 3) and texture coordinates (V, 2).
-    """
-    turns = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # fractions of a full turn
-    normals = None  # for flat shapes, (0, 0, 1) below
+def _compute_shape_pose(kind: str, shape: Mapping[str, object]) -> Float64Array:
+    """Return the pose (4, 4) of a unit shape by the shape's own numbers."""
+    if kind == "cylinder":
+        return _compute_cylinder_pose(shape)
+    pose = np.eye(4)
     if kind == "sphere":
-        # u goes around, and v from pole to pole, with half as many segments.
-        uvs, faces = _make_grid(turns, turns[::2])
-        polar = np.pi * uvs[:, 1]
-        x, y = np.sin(polar) * _compute_circle_points(uvs[:, 0])
-        vertices = np.stack([x, y, np.cos(polar)], axis=1)
-        normals = vertices
-    elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        # u goes around, and v along the axis.
-        uvs, faces = _make_grid(turns, np.array([0.0, 1.0]))
-        x, y = _compute_circle_points(uvs[:, 0])
-        vertices = np.stack([x, y, uvs[:, 1]], axis=1)
-        normals = vertices * (1.0, 1.0, 0.0)
-    elif kind == "disk":
-        # v goes around. u is the radius, along which the disk is flat: an eighth of the
-        # segments is enough.
-        uvs, faces = _make_grid(turns[::8], turns)
-        x, y = uvs[:, 0] * _compute_circle_points(uvs[:, 1])
-        vertices = np.stack([x, y, np.zeros(len(uvs))], axis=1)
-    else:  # a rectangle
-        uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-        vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
-    if normals is None:
-        normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
-    return vertices, faces, normals, uvs
+        pose[:3, :3] *= _get_radius(shape)
+        pose[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
+    return pose
+
+
+class _UnitShape(NamedTuple):
+    """The triangles of one of Mitsuba's shapes before it is posed."""
+
+    vertices: Float64Array  # (V, 3)
+    faces: IntArray  # (F, 3)
+    normals: Float64Array  # (V, 3)
+    uvs: Float64Array  # (V, 2) texture coordinates
+
+
+def _make_unit_shape(kind: str) -> _UnitShape:
+    """Return the triangles of one of `TESSELLATED_SHAPES` as Mitsuba's unit shape."""
+    turns = np.linspace(0.0, 1.0, ROUND_SEGMENTS + 1)  # fractions of a full turn
+    if kind == "sphere":
+        return _make_unit_sphere(turns)
+    if kind == "cylinder":
+        return _make_unit_cylinder(turns)
+    if kind == "disk":
+        return _make_unit_disk(turns)
+    return _make_unit_rectangle()
+
+
+def _make_unit_sphere(turns: Float64Array) -> _UnitShape:
+    """Return a sphere of radius 1, whose segments have borders at fractions of a turn.
+
+    u goes around, and v from pole to pole, with half as many segments.
+    """
+    uvs, faces = _make_grid(turns, turns[::2])
+    polar = np.pi * uvs[:, 1]
+    x, y = np.sin(polar) * _compute_circle_points(uvs[:, 0])
+    vertices = np.stack([x, y, np.cos(polar)], axis=1)
+    return _UnitShape(vertices, faces, normals=vertices, uvs=uvs)
+
+
+def _make_unit_cylinder(turns: Float64Array) -> _UnitShape:
+    """Return a cylinder of radius and height 1, open at both ends, as Mitsuba's.
+
+    u goes around, with segments that have borders at fractions of a turn, and v along
+    the axis.
+    """
+    uvs, faces = _make_grid(turns, np.array([0.0, 1.0]))
+    x, y = _compute_circle_points(uvs[:, 0])
+    vertices = np.stack([x, y, uvs[:, 1]], axis=1)
+    return _UnitShape(vertices, faces, normals=vertices * (1.0, 1.0, 0.0), uvs=uvs)
+
+
+def _make_unit_disk(turns: Float64Array) -> _UnitShape:
+    """Return a disk of radius 1, whose segments have borders at fractions of a turn.
+
+    v goes around. u is the radius, along which the disk is flat: an eighth of the
+    segments is enough.
+    """
+    uvs, faces = _make_grid(turns[::8], turns)
+    x, y = uvs[:, 0] * _compute_circle_points(uvs[:, 1])
+    vertices = np.stack([x, y, np.zeros(len(uvs))], axis=1)
+    return _UnitShape(vertices, faces, _make_upward_normals(vertices), uvs)
+
+
+def _make_unit_rectangle() -> _UnitShape:
+    """Return a square from -1 to 1 along x and y."""
+    uvs, faces = _make_grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
+    return _UnitShape(vertices, faces, _make_upward_normals(vertices), uvs)
+
+
+def _make_upward_normals(vertices: Float64Array) -> Float64Array:
+    """Return the normal +z for each of the vertices (V, 3) of a flat shape."""
+    return np.tile((0.0, 0.0, 1.0), (len(vertices), 1))
 
 
 def _get_radius(shape: Mapping[str, object]) -> float:
@@ -364,19 +421,29 @@ def _compute_cylinder_pose(shape: Mapping[str, object]) -> Float64Array:
     radius = _get_radius(shape)
     length = float(np.linalg.norm(end - start))
     axis = (end - start) / max(length, 1e-30)  # not by 0
-    x, y, z = axis
-    # Two axes perpendicular to it, as in Mitsuba's `coordinate_system` (Duff et al.
-    # 2017), which is not called because it computes in float32. The sign keeps the
-    # divisor away from 0.
-    sign = np.copysign(1.0, z)
-    factor = -1.0 / (sign + z)
-    x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
-    y_axis = np.array([x * y * factor, sign + y * y * factor, -y])
+    x_axis, y_axis = _compute_perpendicular_axes(axis)
     pose = np.eye(4)
     pose[:3] = np.stack(
         [x_axis * radius, y_axis * radius, axis * length, start], axis=1
     )
     return pose
+
+
+def _compute_perpendicular_axes(
+    axis: Float64Array,
+) -> tuple[Float64Array, Float64Array]:
+    """Return two unit vectors (3,) perpendicular to an axis and to each other.
+
+    They are those of Mitsuba's `coordinate_system` (Duff et al. 2017), which is not
+    called because it computes in float32.
+    """
+    x, y, z = axis
+    # The sign keeps the divisor away from 0.
+    sign = np.copysign(1.0, z)
+    factor = -1.0 / (sign + z)
+    x_axis = np.array([1.0 + sign * x * x * factor, sign * x * y * factor, -sign * x])
+    y_axis = np.array([x * y * factor, sign + y * y * factor, -y])
+    return x_axis, y_axis
 
 
 def _make_grid(u: Float64Array, v: Float64Array) -> tuple[Float64Array, IntArray]:
@@ -416,6 +483,7 @@ MIN_ALBEDO = 1e-3  # smallest albedo of a haze
 MAX_CENTER_OFFSET = 0.05
 _OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
 _OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
+_UNIFORM_OR_GRID_MEDIA = ("homogeneous", "heterogeneous")
 
 
 def find_haze(
@@ -442,7 +510,29 @@ def find_haze(
     if names is None:
         return None
     ball_name, medium_name = names
-    ball = named[ball_name]
+    radius = _measure_haze_ball(named[ball_name], matrix)
+    if radius is None:
+        return None
+    coefficients = _read_haze_medium(named[medium_name], matrix)
+    if coefficients is None:
+        return None
+    extinction, albedo = coefficients
+    haze = HazePart(ball_name, radius, extinction, albedo)
+    return haze, frozenset((ball_name, medium_name))
+
+
+def _measure_haze_ball(
+    ball: Mapping[str, object], matrix: Float64Array
+) -> float | None:
+    """Return the radius of a haze's ball, in object sizes.
+
+    The result is None if the ball's center is not near the object's.
+
+    Args:
+        ball: the ball's dictionary.
+        matrix: (4, 4) from the scene to the object's coordinates, with one scale for
+            all directions.
+    """
     pose = matrix @ get_pose(ball)
     # Numbers that are not understood are NaN here, for which the comparisons below are
     # false.
@@ -453,15 +543,7 @@ def find_haze(
     radius = scene_radius * float(np.cbrt(abs(np.linalg.det(pose[:3, :3]))))
     # Our haze is a ball around the object, which is at the origin of these coordinates.
     is_centered = float(np.linalg.norm(center[:3])) <= MAX_CENTER_OFFSET * radius
-    if not (radius > 0.0 and is_centered):
-        return None
-
-    coefficients = _read_haze_medium(named[medium_name], matrix)
-    if coefficients is None:
-        return None
-    extinction, albedo = coefficients
-    haze = HazePart(ball_name, radius, extinction, albedo)
-    return haze, frozenset((ball_name, medium_name))
+    return radius if radius > 0.0 and is_centered else None
 
 
 def _read_haze_medium(
@@ -506,35 +588,51 @@ def _find_haze_plugins(named: Plugins) -> tuple[str, str] | None:
     # Of all plugins only cameras have an entry "medium", the one that they stand in.
     camera_media = {_get_reference(plugin.get("medium")) for plugin in named.values()}
     camera_media.discard(None)
-    # spheres that are filled with it
-    ball_names = [
-        name
-        for name, plugin in named.items()
-        if plugin["type"] == "sphere"
-        and _get_reference(plugin.get("interior")) in camera_media
-    ]
-    medium_names = [
-        name
-        for name, plugin in named.items()
-        if plugin["type"] in ("homogeneous", "heterogeneous")
-    ]
+    ball_names = _find_filled_balls(named, camera_media)
+    medium_names = _list_media(named)
     is_single_haze = len(camera_media) == len(ball_names) == len(medium_names) == 1
     if not is_single_haze:
         return None
     (ball_name,) = ball_names
     (medium_name,) = medium_names
-    ball = named[ball_name]
-    medium = named[medium_name]
+    is_plain = _is_plain_ball(named[ball_name]) and _is_plain_medium(named[medium_name])
+    if not (is_plain and camera_media == {medium_name}):
+        return None
+    return ball_name, medium_name
+
+
+def _list_media(named: Plugins) -> list[str]:
+    """Return the names of the media of a scene."""
+    return [
+        name
+        for name, plugin in named.items()
+        if plugin["type"] in _UNIFORM_OR_GRID_MEDIA
+    ]
+
+
+def _find_filled_balls(named: Plugins, media: Collection[str | None]) -> list[str]:
+    """Return the names of spheres that are filled with one of some media."""
+    return [
+        name
+        for name, plugin in named.items()
+        if plugin["type"] == "sphere"
+        and _get_reference(plugin.get("interior")) in media
+    ]
+
+
+def _is_plain_ball(ball: Mapping[str, object]) -> bool:
+    """Return whether a ball has no surface, and no entry that a haze has not."""
+    return set(ball) <= _OF_BALL and ball.get("bsdf") == {"type": "null"}
+
+
+def _is_plain_medium(medium: Mapping[str, object]) -> bool:
+    """Return whether a medium is homogeneous and isotropic, and has no other entry."""
     isotropic_phase = {"type": "isotropic"}
-    is_plain_ball = set(ball) <= _OF_BALL and ball.get("bsdf") == {"type": "null"}
-    is_plain_medium = (
+    return (
         set(medium) <= _OF_MEDIUM
         and medium["type"] == "homogeneous"
         and medium.get("phase", isotropic_phase) == isotropic_phase
     )
-    if not (is_plain_ball and is_plain_medium and camera_media == {medium_name}):
-        return None
-    return ball_name, medium_name
 
 
 def _get_reference(plugin: object) -> str | None:
@@ -550,10 +648,7 @@ def _parse_numbers(value: object) -> Float64Array:
     A color may be a plugin, such as `{"type": "rgb", "value": [0.1, 0.2, 0.3]}`.
     """
     not_understood = np.full(1, np.nan)
-    if isinstance(value, Mapping):
-        is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
-        # None, of any other plugin, becomes NaN below.
-        value = value.get("value") if is_constant else None
+    value = _unwrap_constant(value)  # None, of another plugin, becomes NaN below
     # NumPy would convert a string or a bool to a number
     if isinstance(value, (str, bool)):
         return not_understood
@@ -565,6 +660,17 @@ def _parse_numbers(value: object) -> Float64Array:
     if is_number_or_color and np.isfinite(numbers).all():
         return numbers
     return not_understood
+
+
+def _unwrap_constant(value: object) -> object:
+    """Return the value of a plugin that is one color; of any other plugin, None.
+
+    What is no plugin is returned as it is.
+    """
+    if not isinstance(value, Mapping):
+        return value
+    is_constant = value.get("type") in ("rgb", "uniform", "spectrum", "srgb")
+    return value.get("value") if is_constant else None
 
 
 # ---- The surface of a Mitsuba shape: its base color, which is searched; all the rest
@@ -635,31 +741,47 @@ def read_surface(bsdf: Mapping[str, object]) -> ShapeSurface:
     the result's notes say so.
     """
     surface, color = _take_base_color(bsdf)
-    if color is None:
-        grey = np.full(
-            (CONSTANT_SIZE, CONSTANT_SIZE, 3), DEFAULT_REFLECTANCE, np.float32
-        )
-        color = _Color(linear=grey, options={})
-    linear = color.linear
-    # `_parse_base_color` gives a constant color this size. A larger image is a texture,
-    # even if all its texels are equal.
-    has_constant_size = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE)
-    varies = bool(np.ptp(linear, axis=(0, 1)).any())
-    is_constant = has_constant_size and not varies
-    # to the mesh's own texture coordinates or attributes
-    is_bound = any(
-        plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
-        for plugin in iterate_plugins(surface)
-    )
+    linear = _make_default_color() if color is None else color.linear
+    transform = None if color is None else color.to_uv
+    is_bound = _is_mesh_bound(surface)
     notes = _describe_surface(surface, linear)
-    surface, to_uv = _apply_uv_transform(surface, color.to_uv)
+    surface, to_uv = _apply_uv_transform(surface, transform)
     return ShapeSurface(
         plugin=surface,
         base_color=linear_to_srgb(np.clip(linear, 0.0, 1.0)),
-        is_textured=not is_constant,
+        is_textured=not _is_constant_color(linear),
         to_uv=to_uv,
         is_bound=is_bound,
         notes=tuple(notes),
+    )
+
+
+def _make_default_color() -> Float32Array:
+    """Return the base color (H, W, 3) of a surface that has none: grey."""
+    size = (CONSTANT_SIZE, CONSTANT_SIZE, 3)
+    return np.full(size, DEFAULT_REFLECTANCE, np.float32)
+
+
+def _is_constant_color(linear: Float32Array) -> bool:
+    """Return whether a base color (H, W, 3) is a constant and no texture.
+
+    `_parse_base_color` gives a constant color one size. A larger image is a texture,
+    even if all its texels are equal.
+    """
+    has_constant_size = linear.shape[:2] == (CONSTANT_SIZE, CONSTANT_SIZE)
+    varies = bool(np.ptp(linear, axis=(0, 1)).any())
+    return has_constant_size and not varies
+
+
+def _is_mesh_bound(surface: Plugin) -> bool:
+    """Return whether a surface depends on texture coordinates or attributes of the
+    mesh.
+
+    The base color is not counted.
+    """
+    return any(
+        plugin["type"] in MESH_BOUND_PLUGINS or ANISOTROPIC_ENTRIES & set(plugin)
+        for plugin in iterate_plugins(surface)
     )
 
 
@@ -697,11 +819,7 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
     clauses = []
     types = {str(plugin["type"]) for plugin in iterate_plugins(surface)}
     if BASE_COLOR not in types:
-        unsupported_colors = sorted(types & {"mesh_attribute", "volume"})
-        if unsupported_colors:
-            reason = f"its color is a {unsupported_colors[0]}"
-        else:
-            reason = f"a {surface['type']} has none"
+        reason = _explain_missing_color(surface, types)
         clauses.append(
             f"it has no base color that can be searched ({reason}), so that the "
             "controls texture, patch and material cannot be used on it"
@@ -710,6 +828,17 @@ def _describe_surface(surface: Plugin, linear: Float32Array) -> list[str]:
     if not (linear.min() >= 0.0 and linear.max() <= 1.0 + 1e-4):
         clauses.append("its base color is clipped to reflectances from 0 to 1")
     return clauses
+
+
+def _explain_missing_color(surface: Plugin, types: set[str]) -> str:
+    """Return why a surface has no base color that can be searched, as a clause.
+
+    `types` are those of the surface and of all plugins in it.
+    """
+    unsupported_colors = sorted(types & {"mesh_attribute", "volume"})
+    if unsupported_colors:
+        return f"its color is a {unsupported_colors[0]}"
+    return f"a {surface['type']} has none"
 
 
 def _apply_uv_transform(
@@ -732,10 +861,7 @@ def _apply_uv_transform(
         texture coordinates.
     """
     to_uv = np.eye(3) if transform is None else to_uv_matrix(transform)
-    uses_tangents = any(
-        plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
-        for plugin in iterate_plugins(surface)
-    )
+    uses_tangents = _has_tangents(surface)
     # A step along u must remain one along u, in the same direction: it must not change
     # v, and the new u must grow with the old one.
     keeps_tangents = to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0
@@ -747,6 +873,14 @@ def _apply_uv_transform(
         # all textures but the base color, whose placeholder is none of these types
         surface = _with_transform(surface, inverse, *UV_TEXTURES)
     return surface, to_uv
+
+
+def _has_tangents(surface: Plugin) -> bool:
+    """Return whether a surface looks different with other tangents along u."""
+    return any(
+        plugin["type"] in ("normalmap", "hair") or ANISOTROPIC_ENTRIES & set(plugin)
+        for plugin in iterate_plugins(surface)
+    )
 
 
 def _with_transform(
@@ -793,7 +927,12 @@ def _parse_base_color(value: object) -> _Color | None:
         return None
     if value["type"] == "checkerboard":
         return _parse_checkerboard(value)
-    pixels = _read_pixels(value) if value["type"] == "bitmap" else None
+    return _parse_bitmap(value) if value["type"] == "bitmap" else None
+
+
+def _parse_bitmap(value: Mapping[str, object]) -> _Color | None:
+    """Return a bitmap as a base color; None if it cannot be read here."""
+    pixels = _read_pixels(value)
     if pixels is None:
         return None
     # What is left is how the image is looked up. `IMAGE_ENTRIES` also has `to_uv`,
@@ -852,11 +991,7 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
     """
     image = value.get("bitmap")
     if isinstance(image, np.ndarray):
-        if image.ndim == 2:  # grey
-            image = image[:, :, None]
-        # without alpha, the second or the fourth channel
-        image = image[:, :, :1] if image.shape[2] == 2 else image[:, :, :3]
-        return np.broadcast_to(image, (*image.shape[:2], 3)).astype(np.float32)
+        return _expand_to_rgb(image)
     if image is None and "filename" not in value:
         return None
     try:
@@ -869,6 +1004,15 @@ def _read_pixels(value: Mapping[str, object]) -> Float32Array | None:
         bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False),
         dtype=np.float32,
     )
+
+
+def _expand_to_rgb(image: np.ndarray[Any, Any]) -> Float32Array:
+    """Return an image (H, W) or (H, W, channels) as (H, W, 3), without its alpha."""
+    if image.ndim == 2:  # grey
+        image = image[:, :, None]
+    # without alpha, the second or the fourth channel
+    image = image[:, :, :1] if image.shape[2] == 2 else image[:, :, :3]
+    return np.broadcast_to(image, (*image.shape[:2], 3)).astype(np.float32)
 
 
 def parse_constant_color(value: object) -> Float32Array | None:

@@ -8,7 +8,7 @@ random numbers. Every sample is bit for bit that of an image that is traced in f
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,10 +114,7 @@ class SharedPaths:
             for name, value in inputs.items()
             if name not in self._changeable_inputs
         }
-        is_same = fixed.keys() == self._fixed.keys() and all(
-            torch.equal(value, self._fixed[name]) for name, value in fixed.items()
-        )
-        if not is_same:
+        if not _have_equal_values(fixed, self._fixed):
             self._stored.clear()
             self._fixed = {
                 name: value.detach().clone() for name, value in fixed.items()
@@ -136,16 +133,29 @@ class SharedPaths:
         if key in self._stored:
             # Taken out, and stored again below: so the seed used last is at the end.
             stored = self._stored.pop(key)
-            for samples in stored.changed_sample_indices:
-                if dr.width(samples):
-                    _unchanged, values, _has_met = self._trace(seed, spp, samples)
-                    _add_samples(changing, samples, values, spp)
+            self._trace_again(seed, spp, stored, changing)  # adds to `changing`
         else:
             stored = self._trace_all(seed, spp, changing)  # adds to `changing`
         self._store(key, stored)
         image = torch.from_numpy((stored.channel_sums + changing) / spp).float()
         image = image.reshape(height, width, N_CHANNELS)
         return image[..., :3].contiguous(), image[..., 3:].contiguous()
+
+    def _trace_again(
+        self, seed: int, spp: int, stored: StoredPaths, changing: Float64Array
+    ) -> None:
+        """Trace the samples again whose path has met a changed surface, and add them.
+
+        Args:
+            seed: seed of the image.
+            spp: samples per pixel.
+            stored: the light of the seed's images, with the indices of these samples.
+            changing: (pixels, channels) array to which their light is added, in place.
+        """
+        for samples in stored.changed_sample_indices:
+            if dr.width(samples):
+                _unchanged, values, _has_met = self._trace(seed, spp, samples)
+                _add_samples(changing, samples, values, spp)
 
     def _trace_all(self, seed: int, spp: int, changing: Float64Array) -> StoredPaths:
         """Trace all samples of a seed.
@@ -173,11 +183,7 @@ class SharedPaths:
             met = dr.gather(mi.UInt32, samples, index)
             dr.eval(met)
             met_samples.append(met)
-            if dr.width(met):
-                met_values = [
-                    dr.gather(mi.Float, value, index) for value in changing_values
-                ]
-                _add_samples(changing, met, met_values, spp)
+            _add_selected_samples(changing, met, changing_values, index, spp)
         return StoredPaths(common, met_samples)
 
     def _trace(self, seed: int, spp: int, samples: Any) -> tuple[Any, Any, Any]:
@@ -192,33 +198,26 @@ class SharedPaths:
             Nine channels (radiance, albedo, normal) that do not depend on the changed
             surfaces; nine that do; and whether a path has met such a surface.
         """
-        # imported here, since its classes need Mitsuba's variant
-        from advsearch.scene.mitsuba_backend import paths
-
-        is_stratified = self.scene.sampler_name == "multijitter"
         depth = self.scene.current_max_depth
         roulette_depth = self.scene.roulette_depth
-
-        def trace(
-            scene: Any, sensor: Any, changed: Any, seed: Any, samples: Any
-        ) -> Any:
-            """Trace paths; this is the function that Dr.Jit records."""
-            numbers = paths.PathSamples(seed, samples, spp, is_stratified)
-            ray = paths.sample_rays(sensor, numbers, samples)
-            return paths.trace_paths(
-                scene, ray, numbers, changed, depth, roulette_depth
-            )
-
-        shape_ids = self._changeable_shapes
-        changed = [
-            shape for shape in self.scene.mitsuba_shapes if shape.id() in shape_ids
-        ]
-        key = ("shared paths", *sorted(shape_ids), spp, depth, roulette_depth)
+        is_stratified = self.scene.sampler_name == "multijitter"
+        trace = _make_sample_tracer(spp, is_stratified, depth, roulette_depth)
+        shape_ids = sorted(self._changeable_shapes)
+        key = ("shared paths", *shape_ids, spp, depth, roulette_depth)
+        changed = self._list_changed_shapes()
         traced: tuple[Any, Any, Any] = self.scene.run_recorded(
             key, trace, changed, dr.opaque(mi.UInt32, seed), samples
         )
         dr.eval(traced)
         return traced
+
+    def _list_changed_shapes(self) -> list[Any]:
+        """Return Mitsuba's shapes whose surfaces may have changed."""
+        return [
+            shape
+            for shape in self.scene.mitsuba_shapes
+            if shape.id() in self._changeable_shapes
+        ]
 
     def _store(self, key: tuple[Any, ...], paths: StoredPaths) -> None:
         """Store the common light of a seed's images; drop the least recently used."""
@@ -227,6 +226,55 @@ class SharedPaths:
         while n_bytes > MAX_STORED_BYTES and len(self._stored) > 1:
             oldest_key = next(iter(self._stored))
             n_bytes -= self._stored.pop(oldest_key).n_bytes
+
+
+def _have_equal_values(
+    first: Mapping[str, Tensor], second: Mapping[str, Tensor]
+) -> bool:
+    """Return whether two mappings have the same names with equal tensors."""
+    return first.keys() == second.keys() and all(
+        torch.equal(value, second[name]) for name, value in first.items()
+    )
+
+
+def _add_selected_samples(
+    sums: Float64Array, samples: Any, channels: Any, index: Any, spp: int
+) -> None:
+    """Add those values of samples to their pixels that an index selects.
+
+    Args:
+        sums: (pixels, channels) array that is changed.
+        samples: Dr.Jit's indices of the selected samples in the image.
+        channels: values of all samples of a launch.
+        index: indices of the selected samples in the launch.
+        spp: samples per pixel.
+    """
+    if dr.width(samples):
+        values = [dr.gather(mi.Float, value, index) for value in channels]
+        _add_samples(sums, samples, values, spp)
+
+
+def _make_sample_tracer(
+    spp: int, is_stratified: bool, depth: int, roulette_depth: int
+) -> Callable[..., Any]:
+    """Return the function that traces samples of an image, which Dr.Jit records.
+
+    Args:
+        spp: samples per pixel.
+        is_stratified: whether the sampler is `multijitter`.
+        depth: longest path in segments.
+        roulette_depth: bounces from which on Russian roulette may end a path.
+    """
+    # imported here, since its classes need Mitsuba's variant
+    from advsearch.scene.mitsuba_backend import paths
+
+    def trace(scene: Any, sensor: Any, changed: Any, seed: Any, samples: Any) -> Any:
+        """Trace paths; this is the function that Dr.Jit records."""
+        numbers = paths.PathSamples(seed, samples, spp, is_stratified)
+        ray = paths.sample_rays(sensor, numbers, samples)
+        return paths.trace_paths(scene, ray, numbers, changed, depth, roulette_depth)
+
+    return trace
 
 
 def can_share_paths(scene: MitsubaScene) -> bool:

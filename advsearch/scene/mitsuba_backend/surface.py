@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -159,12 +159,7 @@ class ViewTracer:
         self._widths = tuple(widths)
         self._photograph_height = photograph_height
         self._center = center.tolist()
-        # the six tables of the first surface, then those of the next one
-        tables_of_surfaces = [
-            np.concatenate([getattr(surface, name) for name in texel_rays.LOBE_TABLES])
-            for surface in lobes
-        ]
-        self._lobe_tables = np.concatenate(tables_of_surfaces).astype(np.float32)
+        self._lobe_tables = _join_lobe_tables(lobes)
         self._lens = None if model is None else self._make_lens_table(model)
         self._recordings = Recordings()
 
@@ -206,28 +201,8 @@ class ViewTracer:
         with mitsuba_lock:
             height, width = self._scene.resolution
             count = len(cameras)
-            camera_rows = np.stack(
-                [_make_camera_numbers(inputs, height, width) for inputs in cameras]
-            ).astype(np.float32)
-
-            # Maps are arguments of the recorded function, so that the recording also
-            # works for other light whose maps have the same sizes.
-            def trace(
-                mitsuba_scene: Any,
-                lane: Any,
-                tables: Any,
-                camera_numbers: Any,
-                lens: Any,
-                texels: Any,
-                sky: Any,
-                blurred: Any,
-            ) -> Any:
-                """Trace all rays; arguments are Dr.Jit arrays, see `_trace`."""
-                light_maps = replace(lit, texels=texels, sky=sky, blurred=blurred)
-                return self._trace(
-                    mitsuba_scene, lane, tables, camera_numbers, lens, light_maps
-                )
-
+            camera_numbers = _join_camera_numbers(cameras, height, width)
+            trace = self._make_ray_tracer(lit)
             recording = self._recordings.get_or_record(
                 (count, lit.sky_shape, lit.blurred_shape), trace, media=[]
             )
@@ -242,13 +217,38 @@ class ViewTracer:
                 self._scene._scene,
                 lane,
                 mi.Float(self._lobe_tables),
-                mi.Float(camera_rows.ravel()),
+                mi.Float(camera_numbers),
                 mi.Float(lens),
                 lit.texels,
                 lit.sky,
                 lit.blurred,
             )
         return lambda: _fetch(channels, (count, height, width))
+
+    def _make_ray_tracer(self, lit: LightMaps) -> Callable[..., Any]:
+        """Return the function that traces all rays, which Dr.Jit records.
+
+        Maps are arguments of the recorded function, so that the recording also works
+        for other light whose maps have the same sizes.
+        """
+
+        def trace(
+            mitsuba_scene: Any,
+            lane: Any,
+            tables: Any,
+            camera_numbers: Any,
+            lens: Any,
+            texels: Any,
+            sky: Any,
+            blurred: Any,
+        ) -> Any:
+            """Trace all rays; arguments are Dr.Jit arrays, see `_trace`."""
+            light_maps = replace(lit, texels=texels, sky=sky, blurred=blurred)
+            return self._trace(
+                mitsuba_scene, lane, tables, camera_numbers, lens, light_maps
+            )
+
+        return trace
 
     def _trace(
         self,
@@ -296,11 +296,10 @@ class ViewTracer:
                 ray, ray_flags, coherent=layer == 0, active=active
             )
             is_hit = active & si.is_valid()
-            # The last layer stops all light that is left.
-            stopped_fraction = transmittance
-            if layer < n_layers:
-                opacity = 1.0 - texel_rays.eval_transmittance(si, is_hit)
-                stopped_fraction = transmittance * opacity
+            is_last = layer == n_layers
+            stopped_fraction = _compute_stopped_light(
+                si, is_hit, transmittance, is_last=is_last
+            )
             surface_radiance, diffuse, side = self._shade(
                 mitsuba_scene, si, is_hit, direction, tables, lit
             )
@@ -311,13 +310,9 @@ class ViewTracer:
             sky_radiance = _look_up_sky(lit, direction, to_local)
             radiance += dr.select(escapes, transmittance * sky_radiance, 0.0)
             coverage += dr.select(is_hit, stopped_fraction / RAYS_PER_PIXEL, 0.0)
-            # The diffuse radiance of a base color c under an irradiance E is
-            # diffuse c E / pi. `side` is 0 where the texture is not hit, so that u and
-            # v there do not matter.
-            texture_weight = (
-                side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL)
+            texture_channels += _list_texture_channels(
+                si, side, stopped_fraction, diffuse
             )
-            texture_channels += [si.uv.x, si.uv.y, texture_weight]
             transmittance = transmittance - stopped_fraction
             active = is_hit & (transmittance > MIN_TRANSMITTANCE)
             ray = si.spawn_ray(direction)
@@ -325,10 +320,7 @@ class ViewTracer:
         # Evaluated at once: otherwise the kernel of each channel's sum would trace all
         # rays again.
         dr.eval(radiance, coverage, texture_channels)
-        pixel_sums = [
-            dr.block_sum(channel, RAYS_PER_PIXEL) for channel in (*radiance, coverage)
-        ]
-        return [*pixel_sums, *texture_channels]
+        return [*_sum_over_pixels([*radiance, coverage]), *texture_channels]
 
     def _make_rays(self, lane: Any, camera_numbers: Any, lens: Any) -> tuple[Any, Any]:
         """Return the ray of each lane, and whether the lens has one there.
@@ -342,29 +334,34 @@ class ViewTracer:
         """
         height, width = self._scene.resolution
         camera_index = lane // RAYS_PER_PIXEL // (height * width)
-        camera = [
-            dr.gather(mi.Float, camera_numbers, camera_index * CAMERA_SIZE + index)
-            for index in range(CAMERA_SIZE)
-        ]
-        # three numbers for each axis of the camera
-        left = camera[0:3]
-        up = camera[3:6]
-        forward = camera[6:9]
-        position = camera[9:12]
+        camera = _gather_camera(camera_numbers, camera_index)
         if self._lens is None:
-            x, y, z = self._compute_pinhole_direction(lane, camera[12:])
+            x, y, z = self._compute_pinhole_direction(lane, camera.film_numbers)
             active = mi.Bool(True)
         else:
-            # The table, four numbers for each ray, is the same for all cameras.
-            entry = 4 * (lane % (height * width * RAYS_PER_PIXEL))
-            x = dr.gather(mi.Float, lens, entry)
-            y = dr.gather(mi.Float, lens, entry + 1)
-            z = dr.gather(mi.Float, lens, entry + 2)
-            active = dr.gather(mi.Float, lens, entry + 3) > 0.0
+            x, y, z, active = self._look_up_lens_direction(lane, lens)
+        axes = zip(camera.left, camera.up, camera.forward, strict=True)
         direction = mi.Vector3f(
-            *(left[axis] * x + up[axis] * y + forward[axis] * z for axis in range(3))
+            *(left * x + up * y + forward * z for left, up, forward in axes)
         )
-        return mi.Ray3f(mi.Point3f(*position), dr.normalize(direction)), active
+        return mi.Ray3f(mi.Point3f(*camera.position), dr.normalize(direction)), active
+
+    def _look_up_lens_direction(
+        self, lane: Any, lens: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """Return the direction of each ray of a lens in the camera's axes.
+
+        The fourth value is whether the lens has a ray there. The arguments are those of
+        `_make_rays`.
+        """
+        height, width = self._scene.resolution
+        # The table, four numbers for each ray, is the same for all cameras.
+        entry = 4 * (lane % (height * width * RAYS_PER_PIXEL))
+        x = dr.gather(mi.Float, lens, entry)
+        y = dr.gather(mi.Float, lens, entry + 1)
+        z = dr.gather(mi.Float, lens, entry + 2)
+        active = dr.gather(mi.Float, lens, entry + 3) > 0.0
+        return x, y, z, active
 
     def _compute_pinhole_direction(
         self, lane: Any, film_numbers: Sequence[Any]
@@ -471,10 +468,7 @@ class ViewTracer:
             One value for each of `LOBE_TABLES`.
         """
         n_tables = len(texel_rays.LOBE_TABLES)
-        surface_start = mi.UInt32(0)  # first entry of the tables of the surface
-        for index, mask in enumerate(masks):
-            first_entry = mi.UInt32(index * n_tables * texel_rays.N_ANGLES)
-            surface_start = dr.select(mask, first_entry, surface_start)
+        surface_start = _find_lobe_tables(masks)  # first entry of the surface's tables
         # entry i is for the cosine (i + 0.5) / N_ANGLES
         position = dr.clip(
             cosine * texel_rays.N_ANGLES - 0.5, 0.0, texel_rays.N_ANGLES - 1.0
@@ -484,9 +478,7 @@ class ViewTracer:
         values = []
         for index in range(n_tables):
             entry = surface_start + index * texel_rays.N_ANGLES + lower
-            lower_value = dr.gather(mi.Float, tables, entry)
-            upper_value = dr.gather(mi.Float, tables, entry + 1)
-            values.append(lower_value + fraction * (upper_value - lower_value))
+            values.append(_lerp_entries(tables, entry, fraction))
         return values
 
     def _reflect(
@@ -518,11 +510,7 @@ class ViewTracer:
             lit: the light.
         """
         up, along, core, tail = lobe_shape
-        cosine = -dr.dot(normal, view_direction)
-        # The part of the direction along the surface. A ray along the normal has none,
-        # and without the 1e-8 its zeros would be normalized to NaN.
-        tangent = dr.normalize(view_direction + normal * cosine + 1e-8)
-        direction = dr.normalize(normal * up + tangent * along)
+        direction = _compute_lobe_direction(view_direction, normal, up, along)
         hit = texel_rays.find_opaque_hits(
             mitsuba_scene,
             mi.Ray3f(si.p + normal * texel_rays.RAY_OFFSET, direction),
@@ -532,13 +520,18 @@ class ViewTracer:
         masks = texel_rays.find_hit_grids(mitsuba_scene, self._grids, hit, direction)
         blurred = self._look_up_lobe(si, direction, core, tail, lit)
         texel = self._look_up_texel(hit, masks, lit)
-        is_ground = mi.Bool(False)
-        for grid, mask in zip(self._grids, masks, strict=True):
-            is_ground |= mask & grid.is_ground
+        is_ground = self._is_on_ground(masks)
         # `texel` is one of the ground where `is_ground`; elsewhere this is not used.
         ground = self._blend_ground(hit, masks, texel, blurred, (core, tail), lit)
         surface = dr.select(is_ground, ground, texel)
         return dr.select(hit.is_valid(), surface, blurred)
+
+    def _is_on_ground(self, masks: Sequence[Any]) -> Any:
+        """Return whether a hit is on a ground, by the masks of hits on all grids."""
+        is_ground = mi.Bool(False)
+        for grid, mask in zip(self._grids, masks, strict=True):
+            is_ground |= mask & grid.is_ground
+        return is_ground
 
     def _look_up_lobe(
         self, si: Any, direction: Any, core: Any, tail: Any, lit: LightMaps
@@ -644,8 +637,27 @@ class ViewTracer:
             masks: for each grid whether the hit is on it.
             lit: the light.
         """
-        # The grid of each lane. Without one, these are those of a single cell, whose
-        # color is replaced by 0 in the end.
+        position = self._find_grid_positions(si, masks)
+        # Rows and columns are integers at the centers of cells.
+        row = position.y * mi.Float(position.n_rows) - 0.5
+        column = position.x * mi.Float(position.n_columns) - 0.5
+        radiance = _look_up_bilinear(
+            lit.texels,
+            position.first_cell,
+            position.n_rows,
+            position.n_columns,
+            row,
+            column,
+        )
+        return dr.select(position.on_any_grid, radiance, 0.0)
+
+    def _find_grid_positions(self, si: Any, masks: Sequence[Any]) -> _GridPosition:
+        """Return the grid of texels on which each hit is, and where in that grid.
+
+        Args:
+            si: surface interaction of the hit.
+            masks: for each grid whether the hit is on it.
+        """
         first_cell = mi.UInt32(0)
         n_rows = mi.UInt32(1)
         n_columns = mi.UInt32(1)
@@ -660,20 +672,154 @@ class ViewTracer:
             first_cell = dr.select(mask, mi.UInt32(grid.first_cell_index), first_cell)
             n_rows = dr.select(mask, mi.UInt32(grid.shape[0]), n_rows)
             n_columns = dr.select(mask, mi.UInt32(grid.shape[1]), n_columns)
-        # y and x are fractions of the grid's height and width. Rows and columns are
-        # integers at the centers of cells.
-        row = y * mi.Float(n_rows) - 0.5
-        column = x * mi.Float(n_columns) - 0.5
-        radiance = _look_up_bilinear(
-            lit.texels, first_cell, n_rows, n_columns, row, column
-        )
-        return dr.select(on_any_grid, radiance, 0.0)
+        return _GridPosition(first_cell, n_rows, n_columns, y, x, on_any_grid)
+
+
+def _join_lobe_tables(lobes: Sequence[texel_rays.Lobes]) -> Float32Array:
+    """Return the tables of all surfaces, flat: the six of the first, then the next.
+
+    The tables of a surface are in the order of `LOBE_TABLES`.
+    """
+    tables_of_surfaces = [
+        np.concatenate([getattr(surface, name) for name in texel_rays.LOBE_TABLES])
+        for surface in lobes
+    ]
+    return np.concatenate(tables_of_surfaces).astype(np.float32)
+
+
+class _GridPosition(NamedTuple):
+    """Where hits lie in grids of texels, one value in each lane.
+
+    A hit on no grid has a grid of a single cell.
+    """
+
+    first_cell: Any  # index of the grid's first cell among the cells of all grids
+    n_rows: Any
+    n_columns: Any
+    y: Any  # fraction of the grid's height
+    x: Any  # fraction of its width
+    on_any_grid: Any  # whether the hit is on a grid
+
+
+def _lerp_entries(table: Any, entry: Any, fraction: Any) -> Any:
+    """Interpolate between an entry of a flat table and the next one."""
+    lower_value = dr.gather(mi.Float, table, entry)
+    upper_value = dr.gather(mi.Float, table, entry + 1)
+    return lower_value + fraction * (upper_value - lower_value)
+
+
+class _CameraNumbers(NamedTuple):
+    """The numbers of a camera, one value in each lane, see `_make_camera_numbers`."""
+
+    left: list[Any]  # x, y and z of the axis to the left
+    up: list[Any]
+    forward: list[Any]
+    position: list[Any]
+    film_numbers: list[Any]  # the last four, which only a pinhole needs
+
+
+def _gather_camera(camera_numbers: Any, camera_index: Any) -> _CameraNumbers:
+    """Return the numbers of each lane's camera, from a flat array for all cameras."""
+    first = camera_index * CAMERA_SIZE
+    numbers = [
+        dr.gather(mi.Float, camera_numbers, first + index)
+        for index in range(CAMERA_SIZE)
+    ]
+    return _CameraNumbers(
+        left=numbers[0:3],
+        up=numbers[3:6],
+        forward=numbers[6:9],
+        position=numbers[9:12],
+        film_numbers=numbers[12:],
+    )
+
+
+def _compute_stopped_light(
+    si: Any, is_hit: Any, transmittance: Any, *, is_last: bool
+) -> Any:
+    """Return the fraction of a ray's light that one layer of surfaces stops.
+
+    Args:
+        si: surface interactions of the rays in this layer.
+        is_hit: lanes in which the ray hits a surface.
+        transmittance: fraction of the light that is left before the layer.
+        is_last: whether this layer is the last one, which stops all that is left.
+    """
+    if is_last:
+        return transmittance
+    opacity = 1.0 - texel_rays.eval_transmittance(si, is_hit)
+    return transmittance * opacity
+
+
+def _sum_over_pixels(channels: list[Any]) -> list[Any]:
+    """Return the sum over the rays of each pixel, for channels with one value a ray."""
+    return [dr.block_sum(channel, RAYS_PER_PIXEL) for channel in channels]
+
+
+def _list_texture_channels(
+    si: Any, side: Any, stopped_fraction: Any, diffuse: Any
+) -> list[Any]:
+    """Return u, v and weight of the searched texture for one layer of all rays.
+
+    Args:
+        si: surface interactions of the rays.
+        side: 1 on the texture's front, -1 on its back, 0 elsewhere, so that u and v
+            there do not matter.
+        stopped_fraction: fraction of a ray's light that the surface stops.
+        diffuse: diffuse fraction of its reflection.
+    """
+    # The diffuse radiance of a base color c under an irradiance E is diffuse c E / pi.
+    weight = side * stopped_fraction * diffuse / (math.pi * RAYS_PER_PIXEL)
+    return [si.uv.x, si.uv.y, weight]
+
+
+def _find_lobe_tables(masks: Sequence[Any]) -> Any:
+    """Return the index of the first entry of the tables of the surface that was hit.
+
+    `masks` are for each surface whether it was hit. The tables are those of
+    `LOBE_TABLES`, one surface after the other.
+    """
+    n_entries = len(texel_rays.LOBE_TABLES) * texel_rays.N_ANGLES
+    surface_start = mi.UInt32(0)
+    for index, mask in enumerate(masks):
+        surface_start = dr.select(mask, mi.UInt32(index * n_entries), surface_start)
+    return surface_start
+
+
+def _compute_lobe_direction(
+    view_direction: Any, normal: Any, up: Any, along: Any
+) -> Any:
+    """Return the mean direction of a lobe by its components, see `Lobes`.
+
+    Args:
+        view_direction: unit directions from the viewer to the surface.
+        normal: unit shading normals, towards the viewer.
+        up, along: components of the mean direction along normal and tangent.
+    """
+    cosine = -dr.dot(normal, view_direction)
+    # The part of the direction along the surface. A ray along the normal has none,
+    # and without the 1e-8 its zeros would be normalized to NaN.
+    tangent = dr.normalize(view_direction + normal * cosine + 1e-8)
+    return dr.normalize(normal * up + tangent * along)
 
 
 def _turn_to_viewer(normal: Any, direction: Any) -> Any:
     """Return normals turned over where a ray in a direction comes from behind."""
     is_from_behind = dr.dot(normal, direction) > 0.0
     return dr.select(is_from_behind, -normal, normal)
+
+
+def _join_camera_numbers(
+    cameras: Sequence[Mapping[str, Tensor]], height: int, width: int
+) -> Float32Array:
+    """Return the `CAMERA_SIZE` numbers of all cameras, one after the other, flat.
+
+    Args:
+        cameras: inputs of each camera, as for `_make_camera_numbers`.
+        height, width: size of the image in pixels.
+    """
+    rows = [_make_camera_numbers(inputs, height, width) for inputs in cameras]
+    return np.stack(rows).astype(np.float32).ravel()
 
 
 def _make_camera_numbers(
@@ -724,14 +870,8 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
         radiance = np.stack([channel.numpy() for channel in channels[:3]], axis=-1)
         # A copy, since `numpy` may return memory that belongs to Dr.Jit.
         coverage = channels[3].numpy().copy()
-        # after the four channels of the image: u, v and weight of the first layer, then
-        # those of the next one
-        layer_channels = [channel.numpy() for channel in channels[N_IMAGE_CHANNELS:]]
-        n_layers = len(layer_channels) // 3
-        # each (rays x layers,), all layers of a ray side by side
-        u, v, weight = (
-            np.stack(layer_channels[index::3], axis=1).ravel() for index in range(3)
-        )
+        n_layers = (len(channels) - N_IMAGE_CHANNELS) // 3
+        u, v, weight = _stack_layers(channels[N_IMAGE_CHANNELS:])
         (hits,) = np.nonzero(weight)
         # A hit is an index into these: ray * n_layers + layer.
         ray = hits // n_layers
@@ -743,6 +883,16 @@ def _fetch(channels: Sequence[Any], size: tuple[int, int, int]) -> ViewSamples:
             diffuse_weight=torch.from_numpy(np.abs(weight[hits])),
             is_back=torch.from_numpy(weight[hits] < 0.0),
         )
+
+
+def _stack_layers(channels: Sequence[Any]) -> list[Float32Array]:
+    """Return u, v and weight of all rays and layers, each (rays x layers,).
+
+    The channels are u, v and weight of the first layer, then those of the next one. In
+    the result all layers of a ray are side by side.
+    """
+    layer_channels = [channel.numpy() for channel in channels]
+    return [np.stack(layer_channels[index::3], axis=1).ravel() for index in range(3)]
 
 
 def _look_up_bilinear(
@@ -770,26 +920,34 @@ def _look_up_bilinear(
     upper = mi.UInt32(y)
     y_fraction = y - dr.floor(y)
     lower = dr.minimum(upper + 1, n_rows - 1)
+    left, right, x_fraction = _find_neighbor_columns(x, n_columns, wraps)
+
+    upper_start = first_cell + upper * n_columns
+    lower_start = first_cell + lower * n_columns
+    above = _lerp_cells(values, upper_start + left, upper_start + right, x_fraction)
+    below = _lerp_cells(values, lower_start + left, lower_start + right, x_fraction)
+    return above * (1.0 - y_fraction) + below * y_fraction
+
+
+def _lerp_cells(values: Any, left: Any, right: Any, fraction: Any) -> Any:
+    """Interpolate between the colors of two cells, by their indices in a flat array."""
+    left_color = _gather_color(values, left) * (1.0 - fraction)
+    return left_color + _gather_color(values, right) * fraction
+
+
+def _find_neighbor_columns(x: Any, n_columns: Any, wraps: bool) -> tuple[Any, Any, Any]:
+    """Return the columns to the left and right of positions, and the fraction between.
+
+    The arguments are those of `_look_up_bilinear`.
+    """
     if wraps:
         x = dr.select(x < 0.0, x + mi.Float(n_columns), x)
-    else:
-        x = dr.clip(x, 0.0, mi.Float(n_columns) - 1.0)
+        left = mi.UInt32(x)
+        return left % n_columns, (left + 1) % n_columns, x - dr.floor(x)
+    # beyond the border the cells at the border count
+    x = dr.clip(x, 0.0, mi.Float(n_columns) - 1.0)
     left = mi.UInt32(x)
-    x_fraction = x - dr.floor(x)
-    if wraps:
-        right = (left + 1) % n_columns
-        left = left % n_columns
-    else:
-        right = dr.minimum(left + 1, n_columns - 1)
-
-    def look_up_row(row: Any) -> Any:
-        row_start = first_cell + row * n_columns
-        return (
-            _gather_color(values, row_start + left) * (1.0 - x_fraction)
-            + _gather_color(values, row_start + right) * x_fraction
-        )
-
-    return look_up_row(upper) * (1.0 - y_fraction) + look_up_row(lower) * y_fraction
+    return left, dr.minimum(left + 1, n_columns - 1), x - dr.floor(x)
 
 
 def _compute_wideness(core: Any, tail: Any) -> Any:
@@ -854,27 +1012,39 @@ def _look_up_blurred(
         widths: root mean square angles of the maps, radians.
     """
     n_rows, n_columns = lit.blurred_shape
-    level = dr.clip(
-        dr.log2(dr.maximum(spread, 1e-4) / widths[0]), 0.0, len(widths) - 1.0
-    )
+    level = _compute_blur_level(spread, widths)
     # at most the last but one, so that there is a next map
     lower_level = dr.minimum(mi.UInt32(level), max(0, len(widths) - 2))
     x, y = texel_rays.compute_map_position(direction, to_local)
     row = y * n_rows - 0.5
     column = x * n_columns - 0.5
-
-    def look_up_level(index: Any) -> Any:
-        """Look up the map with an index; maps follow one another in memory."""
-        return _look_up_bilinear(
-            lit.blurred,
-            index * (n_rows * n_columns),
-            mi.UInt32(n_rows),
-            mi.UInt32(n_columns),
-            row,
-            column,
-            wraps=True,
-        )
-
-    narrow = look_up_level(lower_level)
-    wide = look_up_level(lower_level + 1)  # if there is one width, it counts 0
+    narrow = _look_up_level(lit, lower_level, row, column)
+    # if there is one width, this counts 0
+    wide = _look_up_level(lit, lower_level + 1, row, column)
     return narrow + (level - mi.Float(lower_level)) * (wide - narrow)
+
+
+def _look_up_level(lit: LightMaps, index: Any, row: Any, column: Any) -> Any:
+    """Look up the blurred map with an index; maps follow one another in memory.
+
+    Rows and columns are integers at the centers of texels.
+    """
+    n_rows, n_columns = lit.blurred_shape
+    return _look_up_bilinear(
+        lit.blurred,
+        index * (n_rows * n_columns),
+        mi.UInt32(n_rows),
+        mi.UInt32(n_columns),
+        row,
+        column,
+        wraps=True,
+    )
+
+
+def _compute_blur_level(spread: Any, widths: Sequence[float]) -> Any:
+    """Return the index of the blurred map for a spread, with a fraction between maps.
+
+    The arguments are those of `_look_up_blurred`.
+    """
+    level = dr.log2(dr.maximum(spread, 1e-4) / widths[0])
+    return dr.clip(level, 0.0, len(widths) - 1.0)

@@ -95,10 +95,7 @@ def trace_texel_rays(
         # one lane for each ray, texel by texel
         lane = dr.arange(mi.UInt32, (batch.stop - start) * n_rays)
         texel = lane // n_rays
-        ray_index = lane % n_rays
-        shift = _to_drjit_points(mi.Point2f, shifts[batch], texel)
-        square = dr.gather(mi.Point2f, points, ray_index) + shift
-        square -= dr.floor(square)  # shifted points come in at the other edge
+        square = _shift_points(points, lane % n_rays, shifts[batch], texel)
         met = _trace_batch(
             scene,
             grids,
@@ -110,6 +107,21 @@ def trace_texel_rays(
         )
         met_cells[batch] = met.numpy().reshape(-1, n_rays)
     return met_cells
+
+
+def _shift_points(points: Any, ray_index: Any, shifts: Float32Array, texel: Any) -> Any:
+    """Return the point of each ray, shifted by its texel's shift in the unit square.
+
+    Args:
+        points: points that all texels have.
+        ray_index: index of each ray's point.
+        shifts: (n, 2) shift of each texel.
+        texel: index of each ray's texel.
+    """
+    shift = _to_drjit_points(mi.Point2f, shifts, texel)
+    square = dr.gather(mi.Point2f, points, ray_index) + shift
+    square -= dr.floor(square)  # shifted points come in at the other edge
+    return square
 
 
 def _spread_points(count: int) -> Float64Array:
@@ -183,11 +195,26 @@ def _trace_batch(
 
     # Rays that leave the scene meet a cell of the environment. Its cells are counted
     # after those of all grids.
-    n_cells = grids[-1].first_cell_index + grids[-1].n_cells
-    sky_cell = mi.Int32(n_cells + _find_sky_cell(scene, direction, sky_shape))
+    n_grid_cells = grids[-1].first_cell_index + grids[-1].n_cells
+    sky_cell = mi.Int32(n_grid_cells + _find_sky_cell(scene, direction, sky_shape))
     met = dr.select(si.is_valid(), mi.Int32(-1), sky_cell)
 
     # Other rays meet a texel, or a shape without texels, which counts as dark (-1).
+    return _put_texel_cells(mitsuba_scene, grids, si, direction, met)
+
+
+def _put_texel_cells(
+    mitsuba_scene: Any, grids: Grids, si: Any, direction: Any, met: Any
+) -> Any:
+    """Return the cells that rays meet, with those of texels put in.
+
+    Args:
+        mitsuba_scene: the scene.
+        grids: grids of texels of all surfaces.
+        si: first hits of the rays.
+        direction: their unit directions.
+        met: cells of the rays that meet no texel.
+    """
     masks = find_hit_grids(mitsuba_scene, grids, si, direction)
     for grid, is_hit in zip(grids, masks, strict=True):
         # A grid with the side 0 has hits on both sides of its faces.
@@ -217,9 +244,7 @@ def compute_visible_cosines(
     Returns:
         (n, k) cosines; 0 where something blocks the light.
     """
-    world_to_map = np.array(get_world_to_map(scene))
-    # For rows v, `v @ world_to_map` is v turned from the map's axes to the world's.
-    world_directions = (directions @ world_to_map).astype(np.float32)
+    world_directions = _rotate_to_world(scene, directions)
     n_directions = len(world_directions)
     lane = dr.arange(mi.UInt32, len(positions) * n_directions)
     texel = lane // n_directions
@@ -228,8 +253,25 @@ def compute_visible_cosines(
     direction = _to_drjit_points(mi.Vector3f, world_directions, lane % n_directions)
     cosine = dr.dot(normal, direction)
     is_above = cosine > 0.0  # light from below the surface does not count
-    active = is_above  # rays that may still be blocked
     ray = mi.Ray3f(position + normal * RAY_OFFSET, direction)
+    transmittance = _trace_transmittance(scene, ray, is_above)
+    received = dr.select(is_above, cosine * transmittance, 0.0)
+    return np.asarray(received.numpy().reshape(len(positions), n_directions))
+
+
+def _rotate_to_world(scene: MitsubaScene, directions: Float32Array) -> Float32Array:
+    """Return directions (k, 3) in the world, from the axes of the environment's map."""
+    world_to_map = np.array(get_world_to_map(scene))
+    # For rows v, `v @ world_to_map` is v turned from the map's axes to the world's.
+    world_directions: Float32Array = (directions @ world_to_map).astype(np.float32)
+    return world_directions
+
+
+def _trace_transmittance(scene: MitsubaScene, ray: Any, active: Any) -> Any:
+    """Return the fraction of light along rays that passes cut-outs; 0 if it is blocked.
+
+    `active` are the lanes that are traced.
+    """
     transmittance = mi.Float(1.0)
     # A ray that meets nothing more is not blocked, and keeps its transmittance.
     for _ in range(count_cut_out_layers(scene)):
@@ -244,9 +286,7 @@ def compute_visible_cosines(
         ray = si.spawn_ray(ray.d)
     # What is left of a ray after all layers is stopped by any further surface.
     is_blocked = scene._scene.ray_test(ray, active)
-    transmittance = dr.select(is_blocked, 0.0, transmittance)
-    received = dr.select(is_above, cosine * transmittance, 0.0)
-    return np.asarray(received.numpy().reshape(len(positions), n_directions))
+    return dr.select(is_blocked, 0.0, transmittance)
 
 
 def is_visible_from_behind(
@@ -520,35 +560,68 @@ def measure_lobes(
     with mitsuba_lock:
         samples = _sample_bsdf(scene, inputs, grid, position, normal, cosine)
     gloss = samples.weight.mean(axis=1)
-    mean_x = (samples.weight * samples.x).mean(axis=1)
-    mean_z = (samples.weight * samples.z).mean(axis=1)
-    length = np.linalg.norm(np.stack([mean_x, mean_z]), axis=0)
-
-    # Components of the lobe's mean direction: along the surface towards the viewer, and
-    # along the normal. Without gloss the mirrored direction stands for it.
-    no_gloss = gloss < 1e-6
-    towards_viewer = np.where(
-        no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
-    )
-    up = np.where(no_gloss, cosine, mean_z / np.maximum(length, 1e-12))
-    # The squared angle from each sample to the mean direction, approximated by the
-    # squared distance of unit vectors, 2 - 2 cos(angle).
-    squared_angle = 2.0 * np.maximum(
-        0.0, 1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
-    )
+    towards_viewer, up = _measure_mean_direction(samples, gloss, cosine)
+    squared_angle = _measure_squared_angles(samples, towards_viewer, up)
     core, tail = _measure_spreads(samples.weight, squared_angle)
-    # The base color of `grey` is 0.5 and that of `black` is 0. Their difference is the
-    # diffuse part; dividing by 0.5 gives it for a base color of 1.
-    by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
-    diffuse = np.maximum(by_color, 0.0) / 0.5
     return Lobes(
-        diffuse=diffuse.astype(np.float32),
+        diffuse=_measure_diffuse_fraction(samples).astype(np.float32),
         gloss=gloss.astype(np.float32),
         up=up.astype(np.float32),
         along=(-towards_viewer).astype(np.float32),
         core=core.astype(np.float32),
         tail=tail.astype(np.float32),
     )
+
+
+def _measure_squared_angles(
+    samples: _BsdfSamples, towards_viewer: Float64Array, up: Float64Array
+) -> Float64Array:
+    """Return the squared angle from each sample of the gloss to its mean direction.
+
+    It is approximated by the squared distance of unit vectors, 2 - 2 cos(angle).
+
+    Args:
+        samples: samples of the BSDF.
+        towards_viewer, up: (N_ANGLES,) components of the mean direction.
+    """
+    one_minus_cosine = (
+        1.0 - samples.x * towards_viewer[:, None] - samples.z * up[:, None]
+    )
+    return np.asarray(2.0 * np.maximum(0.0, one_minus_cosine))
+
+
+def _measure_diffuse_fraction(samples: _BsdfSamples) -> Float64Array:
+    """Return the fraction (N_ANGLES,) of even light reflected diffusely, for a base color of 1.
+
+    The base color of `grey` is 0.5 and that of `black` is 0. Their difference is the
+    diffuse part; dividing by 0.5 gives it for a base color of 1.
+    """
+    by_color = samples.grey.mean(axis=1) - samples.black.mean(axis=1)
+    return np.asarray(np.maximum(by_color, 0.0) / 0.5)
+
+
+def _measure_mean_direction(
+    samples: _BsdfSamples, gloss: Float64Array, cosine: Float64Array
+) -> tuple[Float64Array, Float64Array]:
+    """Return both components (N_ANGLES,) of the mean direction of gloss.
+
+    They are along the surface towards the viewer, and along the normal. Without gloss
+    the mirrored direction stands for it.
+
+    Args:
+        samples: samples of the BSDF.
+        gloss: (N_ANGLES,) fraction of the gloss.
+        cosine: (N_ANGLES,) cosine of the angle of view.
+    """
+    mean_x = (samples.weight * samples.x).mean(axis=1)
+    mean_z = (samples.weight * samples.z).mean(axis=1)
+    length = np.linalg.norm(np.stack([mean_x, mean_z]), axis=0)
+    no_gloss = gloss < 1e-6
+    towards_viewer = np.where(
+        no_gloss, -np.sqrt(1.0 - cosine**2), mean_x / np.maximum(length, 1e-12)
+    )
+    up = np.where(no_gloss, cosine, mean_z / np.maximum(length, 1e-12))
+    return towards_viewer, up
 
 
 def _sample_bsdf(
@@ -571,35 +644,22 @@ def _sample_bsdf(
         position, normal: (3,) point on the shape and its unit normal.
         cosines: cosines of the angle of view.
     """
-    n_samples = N_ANGLES * N_LOBE_SAMPLES
-    # one lane for each sample, angle by angle
-    cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), N_LOBE_SAMPLES)
-    # in the frame of the surface, whose z is the normal
-    to_viewer = mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
+    to_viewer = _make_viewer_directions(cosines)
     noise = mi.load_dict({"type": "independent"})
-    noise.seed(0, n_samples)
+    noise.seed(0, N_ANGLES * N_LOBE_SAMPLES)
     sample1 = noise.next_1d()
     sample2 = noise.next_2d()
     cosine_direction = mi.warp.square_to_cosine_hemisphere(sample2)
-    context = mi.BSDFContext()
 
     mitsuba_scene = _set_base_color(scene, inputs, grid.name, 0.5)
     si = _hit_point(mitsuba_scene, position, normal, to_viewer)
-    opacity = _eval_opacity(si)
-    grey = dr.mean(si.bsdf().eval(context, si, cosine_direction) / opacity)
+    grey = _eval_opaque_bsdf(si, cosine_direction, _eval_opacity(si))
 
     mitsuba_scene = _set_base_color(scene, inputs, grid.name, 0.0)
     si = _hit_point(mitsuba_scene, position, normal, to_viewer)
-    bsdf = si.bsdf()
     opacity = _eval_opacity(si)
-    black = dr.mean(bsdf.eval(context, si, cosine_direction) / opacity)
-    # A black surface reflects nothing but gloss, so that samples of its BSDF are
-    # samples of the gloss. A direction below the surface (z < 0) is transmitted, and is
-    # none.
-    bsdf_sample, bsdf_weight = bsdf.sample(context, si, sample1, sample2)
-    is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
-    weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
-    weight = dr.select(dr.isfinite(weight), weight, 0.0)
+    black = _eval_opaque_bsdf(si, cosine_direction, opacity)
+    bsdf_sample, weight = _sample_gloss(si, opacity, sample1, sample2)
 
     # density of `cosine_direction`, by which the values of `grey` and `black` are
     # divided
@@ -611,6 +671,43 @@ def _sample_bsdf(
         x=_to_table(bsdf_sample.wo.x.numpy()),
         z=_to_table(bsdf_sample.wo.z.numpy()),
     )
+
+
+def _make_viewer_directions(cosines: Float64Array) -> Any:
+    """Return directions to viewers, one lane for each sample, angle by angle.
+
+    They are in the frame of the surface, whose z is the normal. `cosines` (N_ANGLES,)
+    are those of the angles of view.
+    """
+    cosine = dr.repeat(mi.Float(cosines.astype(np.float32)), N_LOBE_SAMPLES)
+    return mi.Vector3f(dr.sqrt(1.0 - cosine * cosine), 0.0, cosine)
+
+
+def _eval_opaque_bsdf(si: Any, direction: Any, opacity: Any) -> Any:
+    """Return the grey value of a BSDF, as that of a surface without cut-outs.
+
+    `opacity` is the fraction of light that the surface stops, see `_eval_opacity`.
+    """
+    return dr.mean(si.bsdf().eval(mi.BSDFContext(), si, direction) / opacity)
+
+
+def _sample_gloss(si: Any, opacity: Any, sample1: Any, sample2: Any) -> tuple[Any, Any]:
+    """Sample the BSDF of a black surface, and return samples and weights.
+
+    A black surface reflects nothing but gloss, so that samples of its BSDF are samples
+    of the gloss. A direction below the surface (z < 0) is transmitted, and is none.
+
+    Args:
+        si: surface interactions.
+        opacity: fraction of light that the surface stops.
+        sample1, sample2: random numbers that choose the lobe and the direction.
+    """
+    context = mi.BSDFContext()
+    bsdf_sample, bsdf_weight = si.bsdf().sample(context, si, sample1, sample2)
+    is_reflected = (bsdf_sample.pdf > 0.0) & (bsdf_sample.wo.z > 0.0)
+    weight = dr.select(is_reflected, dr.mean(bsdf_weight) / opacity, 0.0)
+    weight = dr.select(dr.isfinite(weight), weight, 0.0)
+    return bsdf_sample, weight
 
 
 def _set_base_color(

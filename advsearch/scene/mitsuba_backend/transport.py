@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -296,9 +296,7 @@ def _fetch_paths(
     n_samples = size[0] * size[1] * spp
     has_weight = _find_weighted_samples(vertices, n_samples)
     dr.eval(channels, vertices, has_weight)  # one kernel for the whole path
-    means = [dr.block_sum(channel, spp) / spp for channel in channels]
-    dr.eval(means)
-    image = torch.stack([mean.torch() for mean in means], dim=1).reshape(*size, -1)
+    image = _average_samples(channels, size, spp)
     radiance, coverage, background, albedo, normal = torch.split(
         image, [3, 1, 3, 3, 3], dim=-1
     )
@@ -313,6 +311,17 @@ def _fetch_paths(
             for vertex, mask in zip(vertices, has_weight, strict=True)
         ],
     )
+
+
+def _average_samples(channels: list[Any], size: tuple[int, int], spp: int) -> Tensor:
+    """Return the mean (H, W, channels) of each pixel's samples.
+
+    The arguments are those of `_fetch_paths`.
+    """
+    means = [dr.block_sum(channel, spp) / spp for channel in channels]
+    dr.eval(means)
+    stacked = torch.stack([mean.torch() for mean in means], dim=1)
+    return stacked.reshape(*size, -1)
 
 
 def _fetch_vertices(
@@ -331,10 +340,7 @@ def _fetch_vertices(
     """
     sample: Any = dr.compress(mask)
     if dr.width(sample) == 0:
-        empty = torch.zeros(0)
-        return PathVertices(
-            empty.long(), empty.reshape(0, 2), empty.reshape(0, 3), empty.bool()
-        )
+        return _make_no_vertices()
     uv = dr.gather(mi.Point2f, uv, sample)
     weight = dr.gather(mi.Color3f, weight, sample) / spp
     pixel = sample // spp  # the samples of a pixel follow one another
@@ -345,6 +351,14 @@ def _fetch_vertices(
         torch.stack([axis.torch() for axis in uv], dim=1),
         torch.stack([channel.torch() for channel in weight], dim=1),
         is_sharp.torch().bool(),
+    )
+
+
+def _make_no_vertices() -> PathVertices:
+    """Return vertices of no path."""
+    empty = torch.zeros(0)
+    return PathVertices(
+        empty.long(), empty.reshape(0, 2), empty.reshape(0, 3), empty.bool()
     )
 
 
@@ -425,10 +439,18 @@ class Bounce:
 
 
 class _FirstHit:
-    """Reflectance and shading normal of what the camera sees first on each path."""
+    """What the camera sees first on each path: a surface, or the background.
+
+    Attributes:
+        coverage: 1 where a path meets a surface first, else 0.
+        background: emission of the environment where it meets none.
+        albedo, normal: reflectance and shading normal of the surface.
+    """
 
     def __init__(self, count: int) -> None:
         """Start with black, and no normal, for `count` paths."""
+        self.coverage = dr.zeros(mi.Float, count)
+        self.background = dr.zeros(mi.Spectrum, count)
         self.albedo = dr.zeros(mi.Color3f, count)
         self.normal = dr.zeros(mi.Normal3f, count)
 
@@ -437,6 +459,15 @@ class _FirstHit:
         reflectance = bsdf.eval_diffuse_reflectance(si, mask)
         self.albedo = dr.select(mask, reflectance, self.albedo)
         self.normal = dr.select(mask, si.sh_frame.n, self.normal)
+
+    def separate_background(self, is_covered: Any, emission: Any) -> None:
+        """Store which paths meet a surface first, and the emission behind the others."""
+        self.coverage = dr.select(is_covered, mi.Float(1.0), 0.0)
+        self.background = dr.select(is_covered, 0.0, emission)
+
+    def split_channels(self) -> list[Any]:
+        """Return coverage, background, reflectance and normal, channel by channel."""
+        return [self.coverage, *self.background, *self.albedo, *self.normal]
 
 
 def _has_cut_outs(scene: Any) -> bool:
@@ -488,11 +519,9 @@ def _trace_paths(
         emitted.append(_eval_emission(scene, si, prev_si, prev_pdf, prev_delta, active))
         bsdf = si.bsdf(ray)
         if segment == 0:
-            is_covered = si.is_valid()
-            coverage = dr.select(is_covered, mi.Float(1.0), 0.0)
-            background = dr.select(is_covered, 0.0, emitted[0])
+            first_hit.separate_background(si.is_valid(), emission=emitted[0])
             if not has_cut_outs:
-                first_hit.put(si, bsdf, is_covered)
+                first_hit.put(si, bsdf, si.is_valid())
         is_last = segment + 1 == depth
         active &= si.is_valid() & mi.Bool(not is_last)
         if is_last:  # the last vertex emits light, and reflects none
@@ -517,17 +546,34 @@ def _trace_paths(
         # only one more segment.
         n_bounces = segment + 1
         if roulette_depth <= n_bounces < depth - 1:
-            survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
-            active &= noise.next_1d(active) < survival
-            bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
-            throughput = throughput * bounce.next_weight
+            active, throughput = _play_roulette(bounce, throughput, noise, active)
         is_sharp = is_sharp & is_delta
         prev_si = si
         prev_pdf = bounce.bsdf_sample.pdf
         prev_delta = is_delta
         ray = si.spawn_ray(si.to_world(bounce.bsdf_sample.wo))
-    images = [coverage, *background, *first_hit.albedo, *first_hit.normal]
-    return images, emitted, bounces
+    return first_hit.split_channels(), emitted, bounces
+
+
+def _play_roulette(
+    bounce: Bounce, throughput: Any, noise: Any, active: Any
+) -> tuple[Any, Any]:
+    """Play Russian roulette after a bounce, and set the bounce's `next_weight`.
+
+    Args:
+        bounce: the bounce.
+        throughput: throughput of the path after it.
+        noise: the sampler.
+        active: lanes whose path goes on so far.
+
+    Returns:
+        The lanes whose path goes on, and the throughput.
+    """
+    survival = dr.minimum(dr.max(throughput), MAX_SURVIVAL)
+    active &= noise.next_1d(active) < survival
+    bounce.next_weight = dr.select(active, dr.rcp(survival), 0.0)
+    throughput = throughput * bounce.next_weight
+    return active, throughput
 
 
 def _eval_emission(
@@ -573,23 +619,9 @@ def _sample_bounce(
         noise: the sampler.
         active: lanes whose path goes on here.
     """
-    context = mi.BSDFContext()
-    mis_weight = mi.ad.integrators.common.mis_weight
-
-    # Towards a light. A BSDF sample cannot meet a point light, whose sample has all of
-    # the weight.
-    ds, em_weight = scene.sample_emitter_direction(
-        si, noise.next_2d(active), test_visibility=True, active=active
-    )
-    active_em = active & (ds.pdf > 0.0)
-    wo_em = si.to_local(ds.d)
-    bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(context, si, wo_em, active_em)
-    mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf_em))
-    em_weight = dr.select(active_em, em_weight * mis, 0.0)
-
-    # Along the path.
+    light = _sample_light_of_bounce(scene, si, bsdf, noise.next_2d(active), active)
     bsdf_sample, bsdf_weight = bsdf.sample(
-        context, si, noise.next_1d(active), noise.next_2d(active), active
+        mi.BSDFContext(), si, noise.next_1d(active), noise.next_2d(active), active
     )
     active_next = active & (bsdf_sample.pdf > 0.0)
     is_delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
@@ -598,15 +630,49 @@ def _sample_bounce(
         bsdf=bsdf,
         throughput=throughput,
         is_sharp=sharp,
-        wo_em=wo_em,
-        active_em=active_em,
-        em_weight=em_weight,
-        bsdf_value_em=bsdf_value_em,
+        wo_em=light.wo,
+        active_em=light.active,
+        em_weight=light.weight,
+        bsdf_value_em=light.bsdf_value,
         bsdf_sample=bsdf_sample,
         # a mirror's value has no derivative that could be evaluated
         active_bsdf=active_next & ~is_delta,
         bsdf_weight=dr.select(active_next, bsdf_weight, 0.0),
     )
+
+
+class _LightSample(NamedTuple):
+    """A light that was sampled from a vertex; the fields are those of `Bounce`."""
+
+    wo: Any  # direction to the light, in the frame of the surface
+    active: Any  # lanes in which a light was sampled
+    weight: Any  # radiance over the density, with its MIS weight
+    bsdf_value: Any  # the BSDF times the cosine for the direction
+
+
+def _sample_light_of_bounce(
+    scene: Any, si: Any, bsdf: Any, numbers: Any, active: Any
+) -> _LightSample:
+    """Sample a light from a vertex.
+
+    A BSDF sample cannot meet a point light, whose sample has all of the MIS weight.
+
+    Args:
+        scene: Mitsuba's scene.
+        si, bsdf: the vertex and its BSDF.
+        numbers: random numbers in [0, 1)^2.
+        active: lanes whose path goes on here.
+    """
+    mis_weight = mi.ad.integrators.common.mis_weight
+    ds, weight = scene.sample_emitter_direction(
+        si, numbers, test_visibility=True, active=active
+    )
+    active = active & (ds.pdf > 0.0)
+    wo = si.to_local(ds.d)
+    bsdf_value, bsdf_pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+    mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf))
+    weight = dr.select(active, weight * mis, 0.0)
+    return _LightSample(wo=wo, active=active, weight=weight, bsdf_value=bsdf_value)
 
 
 def find_first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:

@@ -50,15 +50,22 @@ def import_mitsuba() -> ModuleType:
         mitsuba.set_variant(VARIANT)
         is_new = True
     if is_new:
-        import drjit  # not before libLLVM is chosen
-
-        mitsuba.set_log_level(mitsuba.LogLevel.Warn)
-        drjit.set_log_level(drjit.LogLevel.Warn)
-        threads.apply_to_drjit()
-        # Every change of the scenes calls the garbage collector. Without freezing, it
-        # would take 0.2 s each time for the objects of the imported modules.
-        gc.freeze()
+        _set_up_libraries(mitsuba)
     return mitsuba
+
+
+def _set_up_libraries(mitsuba: ModuleType) -> None:
+    """Set log levels and threads, and exempt imported objects from garbage collection.
+
+    Every change of the scenes calls the garbage collector. Without freezing, it would
+    take 0.2 s each time for the objects of the imported modules.
+    """
+    import drjit  # not before libLLVM is chosen
+
+    mitsuba.set_log_level(mitsuba.LogLevel.Warn)
+    drjit.set_log_level(drjit.LogLevel.Warn)
+    threads.apply_to_drjit()
+    gc.freeze()
 
 
 class _LazyModule:

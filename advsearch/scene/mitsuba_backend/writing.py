@@ -75,45 +75,87 @@ def write_scene(
     Raises:
         InputError: something in it is no part of stock Mitsuba.
     """
-    description, filter_name = scene.description_and_filter
+    _check_has_stock_lens(scene)
+    xml_scene = _make_xml_scene(scene, hide_environment)
+    # inputs that are not in the dictionary yet: `_put_part` takes some of them out
+    remaining_inputs = _convert_to_arrays(inputs)
+    _put_camera_and_map(xml_scene, remaining_inputs)
+    description, _filter = scene.description_and_filter
+    _put_photographed_ground(xml_scene, description)
+    for part in (description.meshes[OBJECT], *description.parts):
+        _put_part(xml_scene, description, part, remaining_inputs)
+    _put_all_inputs(xml_scene, scene, remaining_inputs)
+    meshes = _list_file_meshes(scene, inputs, xml_scene)
+    write_xml(path, xml_scene, meshes, note)
+
+
+def _convert_to_arrays(inputs: Mapping[str, Tensor]) -> dict[str, Float32Array]:
+    """Return inputs as arrays, by name."""
+    return {
+        name: value.detach().cpu().numpy().astype(np.float32)
+        for name, value in inputs.items()
+    }
+
+
+def _list_file_meshes(
+    scene: MitsubaScene, inputs: Mapping[str, Tensor], xml_scene: Plugin
+) -> dict[str, Any]:
+    """Return Mitsuba's meshes with inputs set, by their entries in a dictionary."""
+    return {
+        shape.id(): shape
+        for shape in scene.set_inputs(inputs).shapes()
+        if shape.is_mesh() and shape.id() in xml_scene
+    }
+
+
+def _check_has_stock_lens(scene: MitsubaScene) -> None:
+    """Raise InputError if the camera has a lens that stock Mitsuba does not have."""
+    description, _filter = scene.description_and_filter
     if description.camera_model is not None:
         raise InputError(
             "camera: stock Mitsuba has no sensor with distortion; export "
             "the run as glTF (.glb) instead"
         )
-    xml_scene: Plugin = {
+
+
+def _make_xml_scene(scene: MitsubaScene, hide_environment: bool) -> Plugin:
+    """Return the dictionary of a scene and its integrator, without its inputs."""
+    description, filter_name = scene.description_and_filter
+    return {
         "integrator": _make_integrator(scene, hide_environment),
         **make_scene_dict(
             description, scene.resolution, filter_name, scene.sampler_name
         ),
     }
-    # inputs that are not in the dictionary yet: `_put_part` takes some of them out
-    remaining_inputs = {
-        name: value.detach().cpu().numpy().astype(np.float32)
-        for name, value in inputs.items()
-    }
+
+
+def _put_camera_and_map(xml_scene: Plugin, remaining_inputs: Plugin) -> None:
+    """Put the field of view into a scene's dictionary, and prepare the map's input.
+
+    Args:
+        xml_scene: the scene's dictionary, which is changed.
+        remaining_inputs: inputs that are not in the dictionary yet; the field of view
+            is removed, and the map gets the columns that a dictionary has.
+    """
     if "camera.fov" in remaining_inputs:  # along the larger side, as in the dictionary
         xml_scene["camera"]["fov"] = float(remaining_inputs.pop("camera.fov")[0])
     if "environment.padded" in remaining_inputs:
         # without the copied columns at both ends, which only the loaded scene has
         padded = remaining_inputs["environment.padded"]
         remaining_inputs["environment.padded"] = padded[:, 1:-1]
-    # A photographed ground is a mesh. `write_xml` writes its file, as those of all
-    # entries of the type "ply".
+
+
+def _put_photographed_ground(xml_scene: Plugin, description: SceneDescription) -> None:
+    """Put a ground that the map of the environment shows into a scene's dictionary.
+
+    It is a mesh. `write_xml` writes its file, as those of all entries of the type
+    "ply".
+    """
     if description.photograph is not None:
         xml_scene[GROUND_NAME] = {
             "type": "ply",
             "bsdf": make_diffuse(description.photograph.base_color.numpy()),
         }
-    for part in (description.meshes[OBJECT], *description.parts):
-        _put_part(xml_scene, description, part, remaining_inputs)
-    _put_all_inputs(xml_scene, scene, remaining_inputs)
-    meshes = {
-        shape.id(): shape
-        for shape in scene.set_inputs(inputs).shapes()
-        if shape.is_mesh() and shape.id() in xml_scene
-    }
-    write_xml(path, xml_scene, meshes, note)
 
 
 def _make_integrator(scene: MitsubaScene, hide_environment: bool) -> Plugin:
@@ -153,12 +195,19 @@ def _put_part(
         )
     else:
         xml_scene |= translate_part(get_positioned_part(description, part)).plugins
-    # A part may have no entry of its own name. An entry that is no dictionary is an
-    # object of a plugin that stock Mitsuba does not have.
-    entry = xml_scene.get(part.name, {})
+    _check_entry(xml_scene, part.name)
+
+
+def _check_entry(xml_scene: Plugin, name: str) -> None:
+    """Raise InputError if the entry of a name is of no plugin of stock Mitsuba.
+
+    A part may have no entry of its own name. An entry that is no dictionary is an
+    object of a plugin that stock Mitsuba does not have.
+    """
+    entry = xml_scene.get(name, {})
     if not isinstance(entry, Mapping):
         raise InputError(
-            f"out: stock Mitsuba has nothing for {part.name}; export a run without it"
+            f"out: stock Mitsuba has nothing for {name}; export a run without it"
         )
 
 
@@ -207,11 +256,28 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> 
     albedo = remaining_inputs.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
     if not density[0] > 0.0:
         return  # without haze its inputs have no effect
+    _put_haze_ball(scene, haze, density[0], albedo)
+    scene["integrator"]["max_depth"] += EXTRA_DEPTH
+
+
+def _put_haze_ball(
+    scene: Plugin, haze: parts.HazePart, density: float, albedo: list[float]
+) -> None:
+    """Put the ball and the medium of a haze into a scene's dictionary.
+
+    The camera gets the medium as well, since it stands in it.
+
+    Args:
+        scene: the scene's dictionary, which is changed.
+        haze: the haze.
+        density: its extinction per object size.
+        albedo: its albedo (RGB).
+    """
     medium_name = f"{haze.name}-medium"
     medium_reference = {"type": "ref", "id": medium_name}
     scene[medium_name] = {
         "type": "homogeneous",
-        "sigma_t": density[0],
+        "sigma_t": density,
         "albedo": {"type": "rgb", "value": albedo},
     }
     scene[haze.name] = {
@@ -221,7 +287,6 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, remaining_inputs: Plugin) -> 
         "interior": medium_reference,
     }
     scene["camera"]["medium"] = medium_reference
-    scene["integrator"]["max_depth"] += EXTRA_DEPTH
 
 
 def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> bool:
@@ -237,15 +302,8 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     Returns:
         Whether the dictionary has such an entry.
     """
-    name, *inner_parts = key_parts
-    if name.startswith("brdf_") and name not in plugin:
-        # Mitsuba has a surface for each side, "brdf_0" and "brdf_1". A dictionary has
-        # one for both, which is the only inner plugin.
-        inner_names = [key for key in plugin if isinstance(plugin[key], Mapping)]
-        if inner_names:
-            name = inner_names[0]
-    if name == "data":  # what a loaded texture calls its texels
-        name = "bitmap"
+    first_part, *inner_parts = key_parts
+    name = _find_entry_name(plugin, first_part)
     entry = plugin.get(name)
     if isinstance(entry, Mapping):
         # The key leads on into a copy of the inner plugin.
@@ -255,13 +313,31 @@ def _put_input(plugin: Plugin, key_parts: list[str], value: Float32Array) -> boo
     # the key leads into a value, or to nothing
     if inner_parts or is_missing:
         return False
-    if name == "bitmap":
-        plugin[name] = mi.Bitmap(np.ascontiguousarray(value))
-    elif value.shape == (4, 4):
-        plugin[name] = mi.ScalarTransform4f(value)
-    else:
-        plugin[name] = value.tolist() if value.size > 1 else float(value[0])
+    plugin[name] = _to_entry(name, value)
     return True
+
+
+def _find_entry_name(plugin: Plugin, key_part: str) -> str:
+    """Return the name of a dictionary's entry by the part of Mitsuba's key for it."""
+    name = key_part
+    if name.startswith("brdf_") and name not in plugin:
+        # Mitsuba has a surface for each side, "brdf_0" and "brdf_1". A dictionary has
+        # one for both, which is the only inner plugin.
+        inner_names = [key for key in plugin if isinstance(plugin[key], Mapping)]
+        if inner_names:
+            name = inner_names[0]
+    if name == "data":  # what a loaded texture calls its texels
+        name = "bitmap"
+    return name
+
+
+def _to_entry(name: str, value: Float32Array) -> object:
+    """Convert the value of an input to an entry of a dictionary."""
+    if name == "bitmap":
+        return mi.Bitmap(np.ascontiguousarray(value))
+    if value.shape == (4, 4):
+        return mi.ScalarTransform4f(value)
+    return value.tolist() if value.size > 1 else float(value[0])
 
 
 def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
@@ -275,19 +351,8 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
         remaining_inputs: inputs that are not in the dictionary yet; those that are set
             here or dropped are removed.
     """
-    part_inputs = {
-        name.partition(".")[2]: remaining_inputs.pop(name)
-        for name in list(remaining_inputs)
-        if name.startswith(f"{part.name}.")
-    }
-    if "base_color" in part_inputs:
-        linear = torch.from_numpy(part_inputs.pop("base_color"))
-        part = replace(part, base_color=linear_to_srgb(linear).numpy())
-    if "radiance" in part_inputs:
-        radiance = part_inputs.pop("radiance")
-        if radiance.ndim == 1:  # one color (3,), and no texture (h, w, 3)
-            radiance = radiance.reshape(1, 1, 3)
-        part = replace(part, emission=radiance)
+    part_inputs = _pop_part_inputs(remaining_inputs, part.name)
+    part = _set_color_and_light(part, part_inputs)
     # This also removes the numbers of the surface from `part_inputs`.
     surface = _make_surface(part, part_inputs)
     # Vertices and normals are in the file of the mesh.
@@ -302,6 +367,31 @@ def _make_mesh(part: parts.MeshPart, remaining_inputs: Plugin) -> Plugin:
     if light:
         mesh["emitter"] = light
     return mesh
+
+
+def _pop_part_inputs(inputs: Plugin, part_name: str) -> Plugin:
+    """Remove the inputs of a part, and return them without the part's name."""
+    return {
+        name.partition(".")[2]: inputs.pop(name)
+        for name in list(inputs)
+        if name.startswith(f"{part_name}.")
+    }
+
+
+def _set_color_and_light(part: parts.MeshPart, part_inputs: Plugin) -> parts.MeshPart:
+    """Return a mesh with the base color and the light of its inputs.
+
+    These are removed from the inputs.
+    """
+    if "base_color" in part_inputs:
+        linear = torch.from_numpy(part_inputs.pop("base_color"))
+        part = replace(part, base_color=linear_to_srgb(linear).numpy())
+    if "radiance" in part_inputs:
+        radiance = part_inputs.pop("radiance")
+        if radiance.ndim == 1:  # one color (3,), and no texture (h, w, 3)
+            radiance = radiance.reshape(1, 1, 3)
+        part = replace(part, emission=radiance)
+    return part
 
 
 def _make_surface(part: parts.MeshPart, part_inputs: Plugin) -> Plugin:
@@ -344,32 +434,52 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
         if name == "type":
             continue
         if plugin["type"] == "ply" and name in meshes:
-            file = files.reserve(name, ".ply")
-            meshes[name].write_ply(str(file))
-            plugin = {
-                key: entry for key, entry in plugin.items() if key not in BAKED_ENTRIES
-            }
-            plugin["filename"] = file.name
+            plugin = _write_mesh_file(files.reserve(name, ".ply"), plugin, meshes[name])
         xml_scene[name] = files.write_files_of(name, plugin)
+    text = _format_xml(xml_scene)
+    # XML allows no double hyphen in a comment.
+    comment = note.replace("--", "- -")
+    path.write_text(f"<!-- {comment} -->\n{text}\n", "utf-8")
+
+
+def _write_mesh_file(file: Path, plugin: Plugin, mesh: Any) -> Plugin:
+    """Write a mesh of Mitsuba's, and return its plugin with the name of the file."""
+    mesh.write_ply(str(file))
+    entries = {key: entry for key, entry in plugin.items() if key not in BAKED_ENTRIES}
+    return {**entries, "filename": file.name}
+
+
+def _format_xml(scene: Plugin) -> str:
+    """Return a scene's dictionary as XML, in which each plugin at the top has an id.
+
+    Mitsuba names the parameters of a scene by the ids of plugins. Its writer gives an
+    id only to plugins to which others refer, and a name to the rest: this becomes their
+    id.
+
+    Raises:
+        InputError: the scene cannot be written.
+    """
+    root = ElementTree.fromstring(_format_with_mitsuba(scene))
+    for entry in root.findall("*[@type]"):
+        entry.set("id", entry.attrib.pop("name"))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _format_with_mitsuba(scene: Plugin) -> str:
+    """Return a scene's dictionary as XML, as Mitsuba writes it.
+
+    Raises:
+        InputError: the scene cannot be written.
+    """
     try:
-        text = mi.parser.write_string(
-            mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), xml_scene)
-        )
+        state = mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), scene)
+        text: str = mi.parser.write_string(state)
     except (RuntimeError, TypeError) as error:
         raise InputError(
             f"out: the scene cannot be written as XML of Mitsuba: {error}; export "
             "another run"
         ) from error
-    root = ElementTree.fromstring(text)
-    # Mitsuba names the parameters of a scene by the ids of plugins. Its writer gives an
-    # id only to plugins to which others refer, and a name to the rest: this becomes
-    # their id.
-    for entry in root.findall("*[@type]"):
-        entry.set("id", entry.attrib.pop("name"))
-    text = ElementTree.tostring(root, encoding="unicode")
-    # XML allows no double hyphen in a comment.
-    comment = note.replace("--", "- -")
-    path.write_text(f"<!-- {comment} -->\n{text}\n", "utf-8")
+    return text
 
 
 class _SceneFiles:

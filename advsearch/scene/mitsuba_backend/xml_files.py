@@ -22,7 +22,7 @@ from xml.parsers import expat
 import numpy as np
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Float64Array
+from advsearch.scene.assets import Float32Array, Float64Array
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     damaged,
@@ -70,6 +70,39 @@ def read_scene(path: Path) -> Plugin:
         FileFormatError: it is missing, corrupt, too large, or no Mitsuba scene.
     """
     text = _SceneText(path, ReferencedFiles(path))
+    root = _parse_root(path, text)
+    text.fill_element(root)
+    root.set("version", "3.0.0")
+    state = _parse_with_mitsuba(path, text, root)
+    referred_ids: set[str] = set()
+    scene = _convert_plugin(path, state, 0, referred_ids)  # 0 is the scene itself
+    _copy_referred_plugins(path, state, scene, referred_ids)
+    return scene
+
+
+def _copy_referred_plugins(
+    path: Path, state: Any, scene: Plugin, referred_ids: set[str]
+) -> None:
+    """Copy inner plugins that are referred to to the top of a scene's dictionary.
+
+    Mitsuba's loader resolves a reference only to a plugin there.
+
+    Args:
+        path: path of the file, for errors.
+        state: what Mitsuba's parser returns.
+        scene: the dictionary, which is changed.
+        referred_ids: ids of the plugins.
+    """
+    for plugin_id in sorted(referred_ids):
+        name = _make_plain_name(plugin_id)
+        if name not in scene and plugin_id in state.id_to_index:
+            index = state.id_to_index[plugin_id]
+            # What this plugin refers to in turn is not copied: its ids are discarded.
+            scene[name] = _convert_plugin(path, state, index, referred_ids=set())
+
+
+def _parse_root(path: Path, text: _SceneText) -> ElementTree.Element:
+    """Return the root of a scene file's tree, in which nothing is filled in yet."""
     root = text.parse(read_bytes(path, "scene", (SUFFIX,)))
     if root.tag != "scene":
         raise damaged(
@@ -77,20 +110,7 @@ def read_scene(path: Path) -> Plugin:
             "a Mitsuba scene, which begins with <scene version=...>",
             f"<{format_name(root.tag)}>",
         )
-    text.fill_element(root)
-    root.set("version", "3.0.0")
-    state = _parse_with_mitsuba(path, text, root)
-    referred_ids: set[str] = set()
-    scene = _convert_plugin(path, state, 0, referred_ids)  # 0 is the scene itself
-    # Mitsuba's loader resolves a reference only to a plugin at the top of the scene, so
-    # inner plugins that are referred to are copied there.
-    for plugin_id in sorted(referred_ids):
-        name = _make_plain_name(plugin_id)
-        if name not in scene and plugin_id in state.id_to_index:
-            index = state.id_to_index[plugin_id]
-            # What this plugin refers to in turn is not copied: its ids are discarded.
-            scene[name] = _convert_plugin(path, state, index, referred_ids=set())
-    return scene
+    return root
 
 
 def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element) -> Any:
@@ -112,15 +132,22 @@ def _parse_with_mitsuba(path: Path, text: _SceneText, root: ElementTree.Element)
                 config, ElementTree.tostring(root, encoding="unicode")
             )
     except RuntimeError as error:
-        line_match = _ERROR_LINE.match(str(error))
-        where = ""
-        # The lines of included files are inserted into the text that Mitsuba has
-        # parsed, so that a line is known only without any.
-        if line_match and not text.included:
-            where = f"line {int(line_match[1]) + text.lines_before}: "
+        where = _find_error_line(text, str(error))
         raise FileFormatError(
             f"{path}: {where}{_ERROR_LINE.sub('', str(error))}; correct it"
         ) from error
+
+
+def _find_error_line(text: _SceneText, message: str) -> str:
+    """Return the line of an error of Mitsuba's parser, such as "line 12: ".
+
+    It is empty if the line is not known. The lines of included files are inserted into
+    the text that Mitsuba has parsed, so that a line is known only without any.
+    """
+    line_match = _ERROR_LINE.match(message)
+    if line_match and not text.included:
+        return f"line {int(line_match[1]) + text.lines_before}: "
+    return ""
 
 
 @dataclass
@@ -159,12 +186,7 @@ class _SceneText:
                 f"{self.size:,}",
             )
         root = self._parse_tree(data)
-        version = root.get("version", "3.0.0")
-        if root.tag == "scene" and not re.match(r"[23]\.", version):
-            raise FileFormatError(
-                f"{self.path}: expected a scene of Mitsuba 2 or 3, got version "
-                f"{format_name(version)}; convert it"
-            )
+        _check_version(self.path, root)
         return root
 
     def _parse_tree(self, data: bytes) -> ElementTree.Element:
@@ -175,14 +197,11 @@ class _SceneText:
         """
         parser = expat.ParserCreate()
         tree = ElementTree.TreeBuilder(insert_comments=True)
-        self._set_handlers(parser, tree)
+        _TreeHandlers(self, parser, tree).attach()
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
-            got = describe_content(data)
-            if data.lstrip().startswith(b"<"):
-                message = expat.errors.messages[error.code]
-                got = f"{message} in line {error.lineno}"
+            got = _describe_parse_error(data, error)
             raise damaged(self.path, "an XML file", got) from error
         # an encoding that Python does not have
         except (LookupError, ValueError) as error:
@@ -192,54 +211,6 @@ class _SceneText:
                 f"one in an unknown encoding ({format_name(str(error))})",
             ) from error
         return tree.close()
-
-    def _set_handlers(
-        self, parser: expat.XMLParserType, tree: ElementTree.TreeBuilder
-    ) -> None:
-        """Set the parser's callbacks, which build a tree and refuse some things.
-
-        They refuse document types, entities, the elements `alias` and `path`, and
-        elements that are more or nested deeper than the limits. Texts and comments
-        outside of the root element are left out.
-        """
-        depth = 0  # how many elements are open
-
-        def refuse(*_: object) -> None:
-            raise FileFormatError(
-                f"{self.path}: declares a document type or entities, "
-                "which no scene needs; remove it"
-            )
-
-        def start(tag: str, attributes: dict[str, str]) -> None:
-            """Begin an element of the tree, after the checks."""
-            nonlocal depth
-            if not self.elements:  # the root
-                self.lines_before = parser.CurrentLineNumber - 1
-            depth += 1
-            self.elements += 1
-            if self.elements > scale_limit(MAX_ELEMENTS) or depth > MAX_NESTING:
-                max_elements = scale_limit(MAX_ELEMENTS)
-                raise FileFormatError(
-                    f"{self.path}: expected at most {max_elements:,} elements, "
-                    f"{MAX_NESTING} deep, got more; split the scene up"
-                )
-            if tag in ("alias", "path"):
-                where = f"{self.path}: line {parser.CurrentLineNumber}"
-                raise FileFormatError(
-                    f"{where}: <{tag}> is not read; write the scene without it"
-                )
-            tree.start(tag, attributes)
-
-        def end(tag: str) -> None:
-            nonlocal depth
-            depth -= 1
-            tree.end(tag)
-
-        parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
-        parser.StartElementHandler = start
-        parser.EndElementHandler = end
-        parser.CharacterDataHandler = lambda text: tree.data(text) if depth else None
-        parser.CommentHandler = lambda text: tree.comment(text) if depth else None
 
     def fill_element(self, element: ElementTree.Element) -> None:
         """Replace `$names` by their values and includes by the files' elements, in
@@ -275,22 +246,22 @@ class _SceneText:
                 f"{self.path}: includes more than {MAX_INCLUDES} files; does one "
                 "include itself?"
             )
+        root = self._parse_included(name)
+        if root.tag != "scene":
+            root = _wrap_in_scene(root)
+        self.fill_element(root)
+        return list(root)
+
+    def _parse_included(self, name: str) -> ElementTree.Element:
+        """Return the root of the tree of a file that is included by its name."""
         try:
-            root = self.parse(self.references.read_file(name))
+            return self.parse(self.references.read_file(name))
         except FileNotFoundError:
             # The file that was requested last is the last one with a refusal.
             reason = next(reversed(self.references.refusal_by_name.values()))
             raise FileFormatError(
                 f"{self.path}: includes {format_name(name)}, which {reason}"
             ) from None
-        if root.tag != "scene":
-            # The root is the only element: it gets a parent, as elements of a scene
-            # have.
-            single = root
-            root = ElementTree.Element("scene")
-            root.append(single)
-        self.fill_element(root)
-        return list(root)
 
     def fill_text(self, text: str) -> str:
         """Replace every `$name` in a text by its value, as in "$folder/mug.ply".
@@ -303,12 +274,7 @@ class _SceneText:
         # piece
         for index, piece in enumerate(re.split(r"\$(\w+)", text)):
             is_name = index % 2 == 1
-            if is_name and piece not in self.values:
-                name = format_name(piece, quoted=False)
-                raise FileFormatError(
-                    f"{self.path}: ${name} has no value: no <default> has that name"
-                )
-            filled += self.values[piece] if is_name else piece
+            filled += self._get_named_value(piece) if is_name else piece
             # The length is limited because values may grow exponentially: a <default>
             # may name another one twice, which names others twice, and so on. A text
             # that is long without names has only a first piece, and is accepted.
@@ -319,6 +285,123 @@ class _SceneText:
                     f"{self.path}: {format_name(text)}: {limit}; write the value out"
                 )
         return filled
+
+    def _get_named_value(self, name: str) -> str:
+        """Return the value of a `$name`, or raise FileFormatError if it has none."""
+        if name not in self.values:
+            name = format_name(name, quoted=False)
+            raise FileFormatError(
+                f"{self.path}: ${name} has no value: no <default> has that name"
+            )
+        return self.values[name]
+
+
+def _wrap_in_scene(element: ElementTree.Element) -> ElementTree.Element:
+    """Return a `<scene>` around an element, which so gets a parent."""
+    root = ElementTree.Element("scene")
+    root.append(element)
+    return root
+
+
+def _describe_parse_error(data: bytes, error: expat.ExpatError) -> str:
+    """Return what the mistake in XML is; of other data, what they are instead."""
+    if not data.lstrip().startswith(b"<"):
+        return describe_content(data)
+    message = expat.errors.messages[error.code]
+    return f"{message} in line {error.lineno}"
+
+
+def _check_version(path: Path, root: ElementTree.Element) -> None:
+    """Raise FileFormatError for a scene of another version of Mitsuba."""
+    version = root.get("version", "3.0.0")
+    if root.tag == "scene" and not re.match(r"[23]\.", version):
+        raise FileFormatError(
+            f"{path}: expected a scene of Mitsuba 2 or 3, got version "
+            f"{format_name(version)}; convert it"
+        )
+
+
+class _TreeHandlers:
+    """A parser's callbacks, which build a tree and refuse some things.
+
+    They refuse document types, entities, the elements `alias` and `path`, and elements
+    that are more or nested deeper than the limits. Texts and comments outside of the
+    root element are left out.
+
+    Args:
+        text: text of the scene, whose elements are counted.
+        parser: the parser.
+        tree: the tree.
+    """
+
+    def __init__(
+        self,
+        text: _SceneText,
+        parser: expat.XMLParserType,
+        tree: ElementTree.TreeBuilder,
+    ) -> None:
+        """Begin outside of the root element."""
+        self._text = text
+        self._parser = parser
+        self._tree = tree
+        self._depth = 0  # how many elements are open
+
+    def attach(self) -> None:
+        """Set the callbacks of the parser."""
+        parser = self._parser
+        parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = (
+            self._refuse_declaration
+        )
+        parser.StartElementHandler = self._start_element
+        parser.EndElementHandler = self._end_element
+        parser.CharacterDataHandler = self._add_data
+        parser.CommentHandler = self._add_comment
+
+    def _refuse_declaration(self, *_: object) -> None:
+        """Raise FileFormatError for what no scene needs."""
+        raise FileFormatError(
+            f"{self._text.path}: declares a document type or entities, "
+            "which no scene needs; remove it"
+        )
+
+    def _start_element(self, tag: str, attributes: dict[str, str]) -> None:
+        """Begin an element of the tree, after the checks."""
+        text = self._text
+        if not text.elements:  # the root
+            text.lines_before = self._parser.CurrentLineNumber - 1
+        self._depth += 1
+        text.elements += 1
+        self._check_element_limits()
+        if tag in ("alias", "path"):
+            where = f"{text.path}: line {self._parser.CurrentLineNumber}"
+            raise FileFormatError(
+                f"{where}: <{tag}> is not read; write the scene without it"
+            )
+        self._tree.start(tag, attributes)
+
+    def _check_element_limits(self) -> None:
+        """Raise FileFormatError if there are too many elements, or too deep ones."""
+        max_elements = scale_limit(MAX_ELEMENTS)
+        if self._text.elements > max_elements or self._depth > MAX_NESTING:
+            raise FileFormatError(
+                f"{self._text.path}: expected at most {max_elements:,} elements, "
+                f"{MAX_NESTING} deep, got more; split the scene up"
+            )
+
+    def _end_element(self, tag: str) -> None:
+        """End an element of the tree."""
+        self._depth -= 1
+        self._tree.end(tag)
+
+    def _add_data(self, data: str) -> None:
+        """Add a text to the tree."""
+        if self._depth:
+            self._tree.data(data)
+
+    def _add_comment(self, comment: str) -> None:
+        """Add a comment to the tree."""
+        if self._depth:
+            self._tree.comment(comment)
 
 
 def _convert_plugin(
@@ -332,42 +415,76 @@ def _convert_plugin(
         index: index of the plugin in it; 0 is the scene.
         referred_ids: is extended by the ids that the plugin refers to.
     """
-    types = mi.Properties.Type
     props = state.nodes[index].props
     entries: Plugin = {"type": props.plugin_name()}
     # Entries that have no name of their own may get the same: "bsdf", "bsdf-2". This is
     # the last number of each name, 1 for the name without a number.
     last_number: dict[str, int] = {}
-
-    def put(plain_name: str, entry: object) -> None:
-        """Add an entry, with a number behind its name if there is one already."""
-        name = plain_name
-        number = last_number.get(plain_name, 1)
-        while name in entries:
-            number += 1
-            name = f"{plain_name}-{number}"
-        last_number[plain_name] = number
-        entries[name] = entry
-
-    # Entries are inner plugins, references to other plugins, and plain values.
     for key in props.keys():
-        kind = props.type(key)
-        value = props[key]
-        # The parser calls what has no name in the file "_arg_0", "_arg_1", ...
-        argument = "" if key.startswith("_arg_") else key
-        if kind == types.ResolvedReference:
-            node = state.nodes[value.index()]
-            name = _get_node_name(node, argument, at_top=index == 0)
-            inner_plugin = _convert_plugin(path, state, value.index(), referred_ids)
-            put(_make_plain_name(name), inner_plugin)
-        elif kind == types.Reference:
-            referred_ids.add(str(value.id()))
-            reference = {"type": "ref", "id": _make_plain_name(str(value.id()))}
-            put(argument or "ref", reference)
-        else:
-            where = f"{path}: {format_name(key, quoted=False)}"
-            put(key, _convert_value(where, kind, value))
+        plain_name, entry = _convert_entry(
+            path, state, props, key, referred_ids, at_top=index == 0
+        )
+        name = _find_free_name(entries, plain_name, last_number)
+        entries[name] = entry
     return entries
+
+
+def _find_free_name(
+    entries: Plugin, plain_name: str, last_number: dict[str, int]
+) -> str:
+    """Return the name of a new entry, with a number behind it if there is one already.
+
+    Args:
+        entries: the entries so far.
+        plain_name: the name without a number.
+        last_number: the last number of each name, which is updated.
+    """
+    name = plain_name
+    number = last_number.get(plain_name, 1)
+    while name in entries:
+        number += 1
+        name = f"{plain_name}-{number}"
+    last_number[plain_name] = number
+    return name
+
+
+def _convert_entry(
+    path: Path,
+    state: Any,
+    props: Any,
+    key: str,
+    referred_ids: set[str],
+    *,
+    at_top: bool,
+) -> tuple[str, object]:
+    """Return one entry of a parsed plugin, and its name.
+
+    It is an inner plugin, a reference to another plugin, or a plain value.
+
+    Args:
+        path: path of the file, for errors.
+        state: what Mitsuba's parser returns.
+        props: the plugin's properties in it.
+        key: the parser's name of the entry.
+        referred_ids: is extended by the ids that the entry refers to.
+        at_top: whether the plugin is the scene.
+    """
+    types = mi.Properties.Type
+    kind = props.type(key)
+    value = props[key]
+    # The parser calls what has no name in the file "_arg_0", "_arg_1", ...
+    argument = "" if key.startswith("_arg_") else key
+    if kind == types.ResolvedReference:
+        node = state.nodes[value.index()]
+        name = _get_node_name(node, argument, at_top=at_top)
+        inner_plugin = _convert_plugin(path, state, value.index(), referred_ids)
+        return _make_plain_name(name), inner_plugin
+    if kind == types.Reference:
+        referred_ids.add(str(value.id()))
+        reference = {"type": "ref", "id": _make_plain_name(str(value.id()))}
+        return argument or "ref", reference
+    where = f"{path}: {format_name(key, quoted=False)}"
+    return key, _convert_value(where, kind, value)
 
 
 def _get_node_name(node: Any, argument: str, *, at_top: bool) -> str:
@@ -401,15 +518,9 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     """
     types = mi.Properties.Type
     if kind == types.Transform:
-        matrix = np.array(value.matrix, np.float64)
-        _check_finite(where, matrix)
-        _check_affine(where, matrix)
-        return matrix
+        return _convert_transform(where, value)
     if kind == types.Spectrum:
-        # A spectrum without wavelengths has a single value, and no pairs.
-        pairs = list(zip(value.wavelengths, value.values, strict=False))
-        _check_finite(where, pairs or value.values)
-        return {"type": "spectrum", "value": pairs or value.values[0]}
+        return _convert_spectrum(where, value)
     if kind in (types.Color, types.Vector):
         numbers = list(value)
         _check_finite(where, numbers)
@@ -417,6 +528,24 @@ def _convert_value(where: str, kind: Any, value: Any) -> object:
     if kind in (types.Float, types.Integer):
         _check_finite(where, value)
     return value
+
+
+def _convert_transform(where: str, transform: Any) -> Float64Array:
+    """Return a transform as an array (4, 4); `where` begins error messages."""
+    matrix = np.array(transform.matrix, np.float64)
+    _check_finite(where, matrix)
+    _check_affine(where, matrix)
+    return matrix
+
+
+def _convert_spectrum(where: str, spectrum: Any) -> dict[str, object]:
+    """Return a spectrum as a plugin; `where` begins error messages.
+
+    A spectrum without wavelengths has a single value, and no pairs.
+    """
+    pairs = list(zip(spectrum.wavelengths, spectrum.values, strict=False))
+    _check_finite(where, pairs or spectrum.values)
+    return {"type": "spectrum", "value": pairs or spectrum.values[0]}
 
 
 def _check_finite(where: str, numbers: Any) -> None:
@@ -535,6 +664,15 @@ class _FileReader:
                 only by Mitsuba; or the name of a material is not a single word.
         """
         kind = str(plugin["type"])
+        self._check_kind_and_material(kind, plugin)
+        entries = map_inner_plugins(plugin, self.check)
+        if "filename" not in entries and kind not in self._readers:
+            return entries
+        self._check_filename(kind, entries)
+        return self._readers[kind](entries)
+
+    def _check_kind_and_material(self, kind: str, plugin: Mapping[str, object]) -> None:
+        """Raise FileFormatError for a plugin or a material that is not known."""
         if kind not in STOCK_PLUGINS:
             raise FileFormatError(
                 f"{self._path}: {format_name(kind)} is no plugin that comes with "
@@ -546,15 +684,17 @@ class _FileReader:
                 f"{self._path}: {format_name(str(plugin['material']))} is no name of a "
                 "material"
             )
-        entries = map_inner_plugins(plugin, self.check)
+
+    def _check_filename(self, kind: str, entries: Plugin) -> None:
+        """Raise FileFormatError if a plugin lacks a file, or names one that is not
+        read.
+        """
         # Without a filename Mitsuba's bitmap plugin crashes the process.
-        if kind in self._readers and "filename" not in entries:
+        if "filename" not in entries:
             raise FileFormatError(
                 f"{self._path}: expected a filename in each {kind}, got none; name the "
                 "file"
             )
-        if "filename" not in entries:
-            return entries
         if kind not in self._readers:
             filename = format_name(str(entries["filename"]))
             raise FileFormatError(
@@ -562,7 +702,6 @@ class _FileReader:
                 "reads, without checks; convert it to a .ply mesh or a picture, or "
                 "give the scene as a dictionary from Python"
             )
-        return self._readers[kind](entries)
 
     def _find_file(self, kind: str, name: object) -> Path:
         """Return the path of a file that a scene names, which is in the scene's folder.
@@ -577,17 +716,7 @@ class _FileReader:
         Raises:
             FileFormatError: there is no such file.
         """
-        try:
-            # checks that the name is allowed; its content is not needed
-            self._references.read_file(str(name))
-        except FileNotFoundError:
-            # The file that was requested last is the last one with a refusal.
-            refusal_by_name = self._references.refusal_by_name
-            last_name = next(reversed(refusal_by_name))
-            reason = refusal_by_name.get(last_name, "is missing")
-            raise FileFormatError(
-                f"{self._path}: {kind} needs {format_name(str(name))}, which {reason}"
-            ) from None
+        self._check_is_readable(kind, str(name))
         directory = self._path.parent
         for candidate in (str(name), os.path.basename(str(name))):
             file = Path(os.path.realpath(os.path.join(directory, candidate)))
@@ -598,6 +727,20 @@ class _FileReader:
             f"{self._path}: {kind} needs {format_name(str(name))}; write its "
             "name as it is in the folder"
         )
+
+    def _check_is_readable(self, kind: str, name: str) -> None:
+        """Raise FileFormatError if a file may not be read; `kind` is what needs it."""
+        try:
+            # checks that the name is allowed; its content is not needed
+            self._references.read_file(name)
+        except FileNotFoundError:
+            # The file that was requested last is the last one with a refusal.
+            refusal_by_name = self._references.refusal_by_name
+            last_name = next(reversed(refusal_by_name))
+            reason = refusal_by_name.get(last_name, "is missing")
+            raise FileFormatError(
+                f"{self._path}: {kind} needs {format_name(name)}, which {reason}"
+            ) from None
 
     def _check_mesh(self, plugin: Plugin) -> Plugin:
         """Read a mesh once, so that a corrupt one is found, and set its full name."""
@@ -623,16 +766,21 @@ class _FileReader:
             if not is_raw:
                 image = srgb_to_linear(image)
             return {**plugin, "bitmap": image, "raw": True}
+        linear = self._read_radiance_texture(file)
+        return {**plugin, "bitmap": linear, "raw": True}
+
+    def _read_radiance_texture(self, file: Path) -> Float32Array:
+        """Return the linear values (H, W, 3) of a file, of at most `TEXTURE_LIMIT` a
+        side.
+        """
         light = read_light(file, "texture")
         self._notes.extend(f"{file.name}: {note}" for note in light.notes)
         height, width = light.size
         scale = min(1.0, TEXTURE_LIMIT / max(light.size))
         if scale == 1.0:
-            linear = light.read_rows(0, height)
-        else:
-            reduced_size = (max(1, round(height * scale)), max(1, round(width * scale)))
-            linear = average_in_bands(light.read_rows, light.size, reduced_size)
-        return {**plugin, "bitmap": linear, "raw": True}
+            return light.read_rows(0, height)
+        reduced_size = (max(1, round(height * scale)), max(1, round(width * scale)))
+        return average_in_bands(light.read_rows, light.size, reduced_size)
 
     def _read_envmap(self, plugin: Plugin) -> Plugin:
         """Read an environment as linear values."""
