@@ -361,19 +361,22 @@ def measure_cosines(
     """
     base_plan = bench.renderer.plan
     for groups, factors in _list_controls(base_plan):
-        yield from _measure_cosines_of_control(bench, groups, factors, counts)
+        yield from _measure_cosines_of_control(
+            bench, base_plan, groups, factors, counts
+        )
 
 
 def _measure_cosines_of_control(
     bench: Bench,
+    base_plan: GradientPlan,
     groups: Sequence[Group],
     factors: Sequence[float],
     counts: Sequence[int],
 ) -> Iterator[Measured]:
     """Measure the cosines of one control with each factor on the steps of differences.
 
-    The arguments are those of `_measure_cosines`. The last factor is only tried if no
-    other has reached the goal.
+    The arguments are those of `_measure_cosines`, but `base_plan` has the planned
+    steps. The last factor is only tried if no other has reached the goal.
     """
     group_names = {group.name for group in groups}
     is_reached = False
@@ -382,8 +385,7 @@ def _measure_cosines_of_control(
         is_fallback = factor == FACTORS[-1]
         if is_fallback and is_reached:
             break
-        scaled_plan = bench.renderer.plan.scale_steps(factor)
-        plan = restrict_plan(scaled_plan, group_names)
+        plan = restrict_plan(base_plan.scale_steps(factor), group_names)
         # Steps have an upper limit, so that a larger factor can give the same plan.
         if plan in tried_plans:
             continue
