@@ -215,7 +215,7 @@ class CameraControl(Control):
         lens = "a lens with distortion, or raindrops"
         if is_from_file:
             lens = f"the lens of `camera={model.name}`"
-        self._check_not_set(unsupported_names, lens)
+        self._check_is_unset(unsupported_names, lens)
 
     def _check_coefficients(self, kind: str, names: Sequence[str]) -> None:
         """Raise InputError for a distortion coefficient that a kind of lens lacks."""
@@ -228,7 +228,7 @@ class CameraControl(Control):
                     f"coefficients {coefficients}, not {name}"
                 )
 
-    def _check_not_set(self, names: Sequence[str], lens: str) -> None:
+    def _check_is_unset(self, names: Sequence[str], lens: str) -> None:
         """Raise InputError if the user set one of some parameters, with this lens."""
         for name in names:
             if name in self.specs:
