@@ -25,6 +25,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from scipy import linalg, sparse
 from scipy.sparse import linalg as sparse_linalg
@@ -320,10 +321,11 @@ def _sample_surface(welded_mesh: WeldedMesh) -> Float64Array:
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
     face = face.clip(max=len(areas) - 1)  # if the sum is rounded to less than 1
     barycentric = generator.dirichlet((1.0, 1.0, 1.0), N_SURFACE_SAMPLES)
-    return np.einsum("nk,nkc->nc", barycentric, corners[face])
+    samples: Float64Array = np.einsum("nk,nkc->nc", barycentric, corners[face])
+    return samples
 
 
-def _find_cells(points: Float64Array, cell_size: float) -> IntArray:
+def _find_cells(points: Float64Array, cell_size: float) -> npt.NDArray[np.intp]:
     """Return the index (N,) of the cubic cell, among those with points, of each point."""
     cubes = np.floor((points - points.min(axis=0)) / cell_size).astype(np.int64)
     return np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
@@ -502,7 +504,7 @@ def _find_slivers(edge_1: Float64Array, edge_2: Float64Array) -> BoolArray:
     longest = np.linalg.norm(edges, axis=-1).max(axis=0)
     double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
     # The height over the longest edge is `double_area / longest`.
-    is_limited = double_area > MIN_FACE_HEIGHT * longest**2
+    is_limited: BoolArray = double_area > MIN_FACE_HEIGHT * longest**2
     return ~is_limited
 
 

@@ -829,7 +829,7 @@ class Problem:
         full_u: Tensor,
         query: Query,
         seed: int,
-    ) -> tuple[Any, Tensor | None]:
+    ) -> tuple[Tensor, Tensor | None]:
         """Return the objective at a full configuration (d,), and its gradient (d,).
 
         The gradient is None if the query requests none.
