@@ -146,10 +146,7 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     vignette = compute_vignette(height, width, values["vignetting"])
     light = color.srgb_to_linear(image) * vignette.to(image.device)
     light = apply_aberration(light, values["aberration"])
-    variance = values["shot"] ** 2 * light + values["read"] ** 2
-    # The square root of the variance, shifted by `_DARK` so that its derivative at 0 is
-    # finite. It is 0 there.
-    std = torch.sqrt(variance + _DARK**2) - _DARK
+    std = _compute_noise_deviation(light, values)
     light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
     # `mosaic` is the weight of the image with a mosaic of color filters.
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
@@ -163,6 +160,14 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
         return display
     jpeg_quality = 100 - compression  # 5 to 99, as the compression is 1 to 95 here
     return images.compress_jpeg(display, jpeg_quality).clamp(0.0, 1.0)
+
+
+def _compute_noise_deviation(light: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    """Return the standard deviation (H, W, 3) of the noise of linear light."""
+    variance = values["shot"] ** 2 * light + values["read"] ** 2
+    # The square root of the variance, shifted by `_DARK` so that its derivative at 0 is
+    # finite. It is 0 there.
+    return torch.sqrt(variance + _DARK**2) - _DARK
 
 
 def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
@@ -209,18 +214,21 @@ def apply_mosaic(light: Tensor) -> Tensor:
     neighbors.
     """
     height, width = light.shape[:2]
+    is_measured = _make_mosaic_mask(height, width).to(light)
+    # Bilinear weights. A sum of neighbors is divided by the weight of those that have
+    # the channel.
+    weights = [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
+    kernel = light.new_tensor(weights).expand(3, 1, 3, 3)
+    total = F.conv2d(images.to_planes(light * is_measured), kernel, padding=1, groups=3)
+    weight = F.conv2d(images.to_planes(is_measured), kernel, padding=1, groups=3)
+    interpolated = images.to_image(total / weight.clamp_min(1e-6))
+    return torch.where(is_measured > 0.0, light, interpolated)
+
+
+def _make_mosaic_mask(height: int, width: int) -> Tensor:
+    """Return 1 where a pixel measures a channel, else 0, (height, width, 3) integers."""
     rows = torch.arange(height)[:, None] % 2
     columns = torch.arange(width)[None, :] % 2
     red = (1 - rows) * (1 - columns)
     blue = rows * columns
-    is_measured = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
-    # Bilinear weights. A sum of neighbors is divided by the weight of those that have
-    # the channel.
-    kernel = light.new_tensor(
-        [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
-    ).expand(3, 1, 3, 3)
-    total = F.conv2d(images.to_planes(light * is_measured), kernel, padding=1, groups=3)
-    weight = F.conv2d(images.to_planes(is_measured), kernel, padding=1, groups=3)
-    return torch.where(
-        is_measured > 0.0, light, images.to_image(total / weight.clamp_min(1e-6))
-    )
+    return torch.stack([red, 1 - red - blue, blue], dim=-1)
