@@ -105,7 +105,13 @@ class ParallelEvaluator:
         # a single query is evaluated here: sending it away would save no time
         if self.workers is None or len(queries) < 2:
             yield from map(self.problem.evaluate, queries)
-            return
+        else:
+            yield from self._evaluate_on_workers(self.workers, queries)
+
+    def _evaluate_on_workers(
+        self, workers: Workers, queries: Sequence[Query]
+    ) -> Iterator[Evaluation]:
+        """Evaluate queries on workers, and yield the evaluations in their order."""
         items: list[WorkItem] = [
             (self.problem_key, self.problem.preparation, query) for query in queries
         ]
@@ -114,7 +120,7 @@ class ParallelEvaluator:
         # evaluations that came too early, by the index of their query
         waiting = dict[int, Evaluation]()
         next_index = 0
-        results: Any = self.workers.compute([item] for item in items)
+        results: Any = workers.compute([item] for item in items)
         with closing(results):
             for result in results:
                 index = index_of_item[id(result.items[0])]
@@ -182,20 +188,24 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     # An evaluation of a search, which has a phase, is paid from the budget of renders,
     # also if it is lost. A trial has no cost.
     cost = 0 if query.phase is None else query.samples
-    judgement = Judgement(
-        score=math.nan,
-        margin=math.nan,
-        right=False,
-        prediction=Prediction(LOST_LABEL),
-        payload={"lost": reason},
-    )
     return Evaluation(
         objective=math.nan,
         gradient=gradient,
         success=False,
         cost=cost,
-        judgement=judgement,
+        judgement=_make_lost_judgement(reason),
         is_lost=True,
+    )
+
+
+def _make_lost_judgement(reason: str) -> Judgement:
+    """Return the judgement of an image that was never rendered."""
+    return Judgement(
+        score=math.nan,
+        margin=math.nan,
+        right=False,
+        prediction=Prediction(LOST_LABEL),
+        payload={"lost": reason},
     )
 
 
@@ -587,25 +597,41 @@ class Journal:
         for query, evaluation in evaluated:
             self.n_lost += evaluation.is_lost
             self._note_machine(evaluation.machine)
+            if self._has_search_row(query):
+                continue
             is_trial = query.phase is None
             if is_trial:
                 row = self._row_of_trial(query, evaluation)
                 if not id_is_number:
                     self._cache_trial(query, evaluation)
-            elif query.row_index < self._counts.get(query.kind, 0):
-                # The store has this row, but not its gradient, which is deleted when a
-                # run is complete. So it was evaluated again, but is not stored again.
-                continue
             else:
                 row, cached = self._row_of_search(query, evaluation)
             if id_is_number:
                 row = replace(row, id=query.row_index + 1)  # ids begin at 1
             rows.append(row)
+        self._append_to_store(rows, cached)
+        return rows
+
+    def _has_search_row(self, query: Query) -> bool:
+        """Return whether the store has the row of a search's query already.
+
+        It may have the row, but not its gradient, which is deleted when a run is
+        complete. So the query was evaluated again, but is not stored again.
+        """
+        is_of_search = query.phase is not None
+        return is_of_search and query.row_index < self._counts.get(query.kind, 0)
+
+    def _append_to_store(
+        self, rows: Sequence[Row], cached: CachedEvaluation | None
+    ) -> None:
+        """Append rows to the store, or to `rows` without a run directory.
+
+        `cached` is what the store has besides the row of a search's evaluation.
+        """
         if self.run_directory is None:
             self._append_in_memory(rows)
         elif rows:
             self.run_directory.append_rows(*rows, cached=cached)
-        return rows
 
     def _cache_trial(self, query: Query, evaluation: Evaluation) -> None:
         """Cache a trial, so that later calls find it; its image is stored elsewhere."""
@@ -718,13 +744,9 @@ class Journal:
         """
         if seconds is None:
             return None
-        stored: Iterable[Row] = ()
-        # The store has cached evaluations if an earlier process has begun the run.
-        if self.run_directory is not None and self.run_directory.store.has_cached:
-            stored = self.run_directory.store.rows(kind)
         search_seconds = []
         has_ranking = False
-        for row in stored:
+        for row in self._read_earlier_rows(kind):
             if row.phase == "search":
                 search_seconds.append(row.seconds or 0.0)
             else:  # "ranking"
@@ -733,6 +755,13 @@ class Journal:
         n_stored = len(search_seconds)
         clock = _Clock(n_stored, has_ranking, seconds_left, started=time.perf_counter())
         return clock.is_out_of_time
+
+    def _read_earlier_rows(self, kind: str) -> Iterable[Row]:
+        """Return the rows of a search that an earlier process began; empty without one."""
+        # The store has cached evaluations if an earlier process has begun the run.
+        if self.run_directory is not None and self.run_directory.store.has_cached:
+            return self.run_directory.store.rows(kind)
+        return ()
 
     @property
     def remarks(self) -> list[str]:

@@ -131,24 +131,27 @@ class Bench:
         Returns:
             Gradients (repeats, d), zero where the plan has no derivative, and seconds.
         """
-        slices = [
-            group.coordinates for group in plan.groups if group.estimator != "none"
-        ]
+        slices = _list_slices(plan)
         gradients = torch.zeros(repeats, len(self.u))
         seconds = []
         for index in range(repeats):
-            measure = partial(self._measure_gradient, plan, stream, index)
-            if label is None:
-                measurement = measure()
-            else:
-                # measured, or read from the store
-                measurement = self.store(f"{label} gradient {index}", measure)
+            measurement = self._load_measurement(plan, stream, index, label)
             _copy_derivatives(measurement["numbers"], slices, gradients[index])
             seconds.append(measurement["seconds"])
             # For gradients that are not stored, the caller reports the progress.
             if label is not None:
                 self.tick(self.spp)
         return gradients, statistics.median(seconds)
+
+    def _load_measurement(
+        self, plan: GradientPlan, stream: str, index: int, label: str | None
+    ) -> dict[str, Any]:
+        """Return a gradient as `_measure_gradient` does, or from the store by a label."""
+        measure = partial(self._measure_gradient, plan, stream, index)
+        if label is None:
+            return measure()
+        measurement: dict[str, Any] = self.store(f"{label} gradient {index}", measure)
+        return measurement
 
     def _measure_gradient(
         self, plan: GradientPlan, stream: str, index: int
@@ -161,13 +164,16 @@ class Bench:
         started = time.perf_counter()
         noise_seed = seeds.derive_seed(self.seed, stream, index)
         gradient = self.compute_gradient(plan, noise_seed)
-        slices = [
-            group.coordinates for group in plan.groups if group.estimator != "none"
-        ]
+        slices = _list_slices(plan)
         derivatives = torch.cat([gradient[coordinates] for coordinates in slices])
         float32_bytes = derivatives.to(torch.float32).numpy().tobytes()
         numbers = base64.b64encode(float32_bytes).decode("ascii")
         return {"seconds": time.perf_counter() - started, "numbers": numbers}
+
+
+def _list_slices(plan: GradientPlan) -> list[slice]:
+    """Return the coordinates of each group with an estimator."""
+    return [group.coordinates for group in plan.groups if group.estimator != "none"]
 
 
 def _copy_derivatives(numbers: str, slices: Sequence[slice], gradient: Tensor) -> None:

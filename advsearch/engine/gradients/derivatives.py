@@ -378,14 +378,34 @@ def measure_reference(
         pairs_of_factor[factor] = pairs
         references[factor] = reference
     best = min(references, key=lambda factor: references[factor].noise)
-    reference = references[best]
-    pairs = pairs_of_factor[best]
+    return _add_seeds(
+        bench, probe, references[best], pairs_of_factor[best], max_repeats
+    )
+
+
+def _add_seeds(
+    bench: Bench,
+    probe: Probe,
+    reference: Reference,
+    pairs: list[DifferencePair],
+    max_repeats: int,
+) -> Reference:
+    """Return a reference with more seeds, until it is accurate or has the most.
+
+    Args:
+        bench: bench of the renderer.
+        probe: direction along which the derivative is taken.
+        reference: the reference so far.
+        pairs: its pairs of differences; new ones are added.
+        max_repeats: largest number of seeds.
+    """
+    factor = reference.factor
     while (
         _compute_standard_error(pairs) > _find_max_error(reference)
         and len(pairs) < max_repeats
     ):
-        pairs.append(_measure_pair(bench, probe, best, len(pairs)))
-        reference = _extrapolate(pairs, best)
+        pairs.append(_measure_pair(bench, probe, factor, len(pairs)))
+        reference = _extrapolate(pairs, factor)
     return reference
 
 
@@ -569,9 +589,8 @@ def measure_derivatives(
         measure_reference, repeats=reference_repeats, factors=reference_factors
     )
     # probes of one control follow one another
-    for control, control_probes in groupby(
-        find_probes(bench), lambda probe: probe.group.control
-    ):
+    probes_by_control = groupby(find_probes(bench), lambda probe: probe.group.control)
+    for control, control_probes in probes_by_control:
         probes = list(control_probes)
         stage(f"references for {control}", len(probes))
         references = {
@@ -643,30 +662,40 @@ def _try_estimators(
         repeats: number of gradients with the factor 1, and with any other factor.
     """
     ok_names: set[str] = set()
-    all_references = list(references.values())
     planned_repeats, other_repeats = repeats
     for estimator, factor in tries:
-        if factor == 1.0:
-            tried_probes = list(probes)
-            count = planned_repeats
-        else:
-            tried_probes = [probe for probe in probes if probe.name not in ok_names]
-            count = other_repeats
+        is_planned = factor == 1.0
+        tried_probes = [
+            probe for probe in probes if is_planned or probe.name not in ok_names
+        ]
         if not tried_probes:  # all are ok, and only other factors follow
             break
+        count = planned_repeats if is_planned else other_repeats
         estimates = _load_estimates(bench, estimator, tried_probes, count, factor)
-        for probe, estimate in zip(tried_probes, estimates, strict=True):
-            row = compare_with_reference(
-                estimate,
-                references[probe.name],
-                others=all_references,
-                probe=probe,
-                spp=bench.spp,
-            )
+        rows = _rate_estimates(bench, tried_probes, estimates, references)
+        for probe, row in zip(tried_probes, rows, strict=True):
             if row.status == "ok":
                 ok_names.add(probe.name)
             yield row
         bench.tick(bench.spp)  # for the progress
+
+
+def _rate_estimates(
+    bench: Bench,
+    probes: Sequence[Probe],
+    estimates: Sequence[GradientEstimate],
+    references: Mapping[str, Reference],
+) -> Iterator[Measured]:
+    """Yield the errors of one estimate along each probe; see `_try_estimators`."""
+    all_references = list(references.values())
+    for probe, estimate in zip(probes, estimates, strict=True):
+        yield compare_with_reference(
+            estimate,
+            references[probe.name],
+            others=all_references,
+            probe=probe,
+            spp=bench.spp,
+        )
 
 
 def _load_estimates(

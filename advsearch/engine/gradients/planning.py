@@ -264,12 +264,13 @@ def _compute_squared_errors(
     reference_variance = variance_of[reference] / repeats  # that of the mean
     errors = dict[str, float]()
     for estimator, gradients in gradients_of.items():
+        variance = variance_of[estimator]
         if estimator == reference:
-            errors[estimator] = variance_of[reference]
+            errors[estimator] = variance
             continue
         squared_distance = (gradients - reference_gradient).square().sum(dim=1).mean()
         error = float(squared_distance) - reference_variance
-        errors[estimator] = max(error, variance_of[estimator])
+        errors[estimator] = max(error, variance)
     return errors
 
 
@@ -615,16 +616,9 @@ def measure_path_length(
     full_depth = renderer.scene.max_depth
     noise_seeds = [seeds.derive_seed(seed, "half", half) for half in range(2)]
     trial = _DepthTrial(renderer, noise_seeds, spp, tick)
-    full_renderings = [trial.render_twice(u, full_depth) for u in configurations]
-    cuts = []
-    chosen_depth = full_depth
-    for depth in range(full_depth - 1, MIN_DEPTH - 1, -1):
-        cut = trial.measure_cut(configurations, full_renderings, depth)
-        cuts.append(cut)
-        # NaN counts as too much
-        if not cut.levels <= bound:
-            break
-        chosen_depth = depth
+    cuts = trial.measure_cuts(configurations, bound)
+    accepted_depths = [cut.depth for cut in cuts if cut.levels <= bound]
+    chosen_depth = min(accepted_depths, default=full_depth)
     return PathLength(
         depth=chosen_depth,
         full=full_depth,
@@ -649,6 +643,21 @@ class _DepthTrial:
     noise_seeds: Sequence[int]
     spp: int
     tick: Callable[[], None]
+
+    def measure_cuts(
+        self, configurations: Sequence[Tensor], bound: float
+    ) -> list[PathCut]:
+        """Measure the changes by shorter and shorter paths, up to one over the bound."""
+        full_depth = self.renderer.scene.max_depth
+        full_renderings = [self.render_twice(u, full_depth) for u in configurations]
+        cuts = []
+        for depth in range(full_depth - 1, MIN_DEPTH - 1, -1):
+            cut = self.measure_cut(configurations, full_renderings, depth)
+            cuts.append(cut)
+            # NaN counts as too much
+            if not cut.levels <= bound:
+                break
+        return cuts
 
     def render_twice(self, u: Tensor, depth: int) -> list[_Rendering]:
         """Render u (d,) with both seeds and paths of at most `depth` segments."""
