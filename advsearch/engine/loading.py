@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence, ValuesView
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard, final
 
@@ -661,16 +662,15 @@ def fit_camera(
             description, description.backdrop_photograph, (height, width)
         )
     camera_model = description.camera_model
-    remarks = description.remarks
     if description.get_number("camera.drops") > 0.0:
         camera_model = _find_camera_behind_drops(description, aspect)
-    if camera_model is not None:
-        # A bundled lens depends on the aspect, and is found again by its name. Any
-        # other camera model stays.
-        bundled_models = make_bundled_models(aspect)
-        camera_model = bundled_models.get(camera_model.name, camera_model)
-        scaling_remarks = camera_model.describe_scaling((height, width))
-        remarks = tuple(dict.fromkeys((*remarks, *scaling_remarks)))
+    if camera_model is None:
+        return replace(description, aspect=aspect, camera_model=None)
+    # A bundled lens depends on the aspect, and is found again by its name. Any other
+    # camera model stays.
+    camera_model = make_bundled_models(aspect).get(camera_model.name, camera_model)
+    scaling_remarks = camera_model.describe_scaling((height, width))
+    remarks = tuple(dict.fromkeys((*description.remarks, *scaling_remarks)))
     return replace(
         description, aspect=aspect, camera_model=camera_model, remarks=remarks
     )
@@ -753,13 +753,7 @@ def make_renderer(
     # a control may have changed the scene, as one that chooses the photograph does
     description = space.scene or description
     _check_is_lit(description)
-    formation = ImageFormation(
-        denoiser=denoise,
-        sampler=sampler,
-        exposure=description.get_number("camera.exposure"),
-        resolution=size,
-        gain=description.gain,
-    )
+    formation = _make_formation(description, size, denoise, sampler)
     scene = MitsubaScene(
         description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler
     )
@@ -776,6 +770,19 @@ def make_renderer(
         motion=motion,
         estimators=estimators,
         moments=moments,
+    )
+
+
+def _make_formation(
+    description: SceneDescription, size: tuple[int, int], denoise: str, sampler: str
+) -> ImageFormation:
+    """Return how images of a scene are formed; `size` is (height, width) in pixels."""
+    return ImageFormation(
+        denoiser=denoise,
+        sampler=sampler,
+        exposure=description.get_number("camera.exposure"),
+        resolution=size,
+        gain=description.gain,
     )
 
 
@@ -907,19 +914,30 @@ def _measure_max_motion(
     moving_space = replace(space, controls=moving_controls)
     space_at_begin = moving_space.advance_time(-duration / 2.0)
     space_at_end = moving_space.advance_time(duration / 2.0)
+    project = partial(_project_configuration, motion, assembly)
     max_moved = 0.0
     for u in _sample_moving_configurations(len(moving_space.start)):
-        before, is_visible_before = motion.project_points(
-            assembly(space_at_begin.inputs(u))
-        )
-        after, is_visible_after = motion.project_points(
-            assembly(space_at_end.inputs(u))
-        )
+        before, is_visible_before = project(space_at_begin, u)
+        after, is_visible_after = project(space_at_end, u)
         is_visible = is_visible_before & is_visible_after
         moved = (after - before)[is_visible].norm(dim=1)
         if len(moved):
             max_moved = max(max_moved, float(moved.max()))
     return max_moved
+
+
+def _project_configuration(
+    motion: Motion, assembly: InputAssembler, space: Space, u: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return where points lie in the image of u (d,), in pixels, and which are visible.
+
+    Args:
+        motion: projects points of the scene into the image.
+        assembly: turns the inputs of the space into those of the scene.
+        space: space of the configuration.
+        u: (d,) the configuration.
+    """
+    return motion.project_points(assembly(space.inputs(u)))
 
 
 def _sample_moving_configurations(n_coordinates: int) -> Tensor:

@@ -129,25 +129,42 @@ def load_models(
     """
     threads.configure(config.n_used_threads)
     if isinstance(task, EnsembleTask):
-        tasks = task.parts
         models = to_model_list(models)
-    else:
-        tasks = (task,) * len(models)
-    if len(models) != len(tasks):
-        raise InputError(
-            f"model: expected {len(tasks)}, one for each task, got {len(models)}"
-        )
-    with warnings.catch_warnings(record=True) as caught:
-        # Python shows an equal warning only once, and "always" records every one
-        warnings.simplefilter("always", ModelWarning)
-        loaded = _load_each(models, tasks, task, config)
-    sentences = _take_model_warnings(caught)
+    loaded, sentences = _load_with_warnings(models, task, config)
     loaded = _add_rig_cameras(loaded, task, config.camera)
     for model in loaded:
         _check_n_images(model)
     if isinstance(task, EnsembleTask):
         return (join_models(loaded, config.resolution),), sentences
     return loaded, sentences
+
+
+def _load_with_warnings(
+    models: Sequence[Any], task: Task, config: SceneConfig
+) -> tuple[tuple[Model, ...], list[str]]:
+    """Load models of a task, and return them and their warnings as sentences."""
+    tasks = _list_tasks(task, len(models))
+    with warnings.catch_warnings(record=True) as caught:
+        # Python shows an equal warning only once, and "always" records every one
+        warnings.simplefilter("always", ModelWarning)
+        loaded = _load_each(models, tasks, task, config)
+    return loaded, _take_model_warnings(caught)
+
+
+def _list_tasks(task: Task, n_models: int) -> tuple[Task, ...]:
+    """Return the task of each model, for an `EnsembleTask` its parts.
+
+    Raises:
+        InputError: there is another number of models than tasks.
+    """
+    if not isinstance(task, EnsembleTask):
+        return (task,) * n_models
+    tasks = task.parts
+    if n_models != len(tasks):
+        raise InputError(
+            f"model: expected {len(tasks)}, one for each task, got {n_models}"
+        )
+    return tasks
 
 
 def _load_each(

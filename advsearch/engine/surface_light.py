@@ -471,21 +471,15 @@ class SurfaceLight(PredictedSearch):
         An image that the query requests shows the scene without random conditions.
         """
         problem = self.problem
-        set_index = query.row_index
-        reuses_conditions = self._reuses_conditions(query.kind)
-        if reuses_conditions:
-            set_index = query.row_index % N_CONDITION_SETS
         conditions = self._choose_conditions(
-            query.kind, set_index, problem.conditions_per_evaluation
+            query.kind,
+            self._find_set_index(query),
+            problem.conditions_per_evaluation,
         )
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
         ]
-        predict = partial(
-            self._predict_slice,
-            full_configurations,
-            set_index if reuses_conditions else None,
-        )
+        predict = partial(self._predict_slice, query, full_configurations)
         evaluation = problem.evaluate_conditions(
             predict, full_configurations, query.u, query.gradient, BATCH_SIZE
         )
@@ -494,24 +488,31 @@ class SurfaceLight(PredictedSearch):
             return evaluation
         return replace(evaluation, picture=self._predict_clean_image(query.u))
 
+    def _find_set_index(self, query: Query) -> int:
+        """Return the index of the set of conditions under which a query is evaluated."""
+        if self._reuses_conditions(query.kind):
+            return query.row_index % N_CONDITION_SETS
+        return query.row_index
+
     def _predict_slice(
         self,
+        query: Query,
         full_configurations: Sequence[Tensor],
-        set_index: int | None,
         batch: slice,
         u: Tensor,
     ) -> Tensor:
         """Return predicted images (n, H, W, 3) of a slice of full configurations.
 
         Args:
+            query: the query, on which it depends if views of the cameras are stored.
             full_configurations: all full configurations.
-            set_index: index of the set of their conditions, whose views of the cameras
-                are stored; None to store none.
             batch: the slice.
             u: (d,) the searched coordinates, perhaps with a gradient.
         """
-        # the key under which the views of this batch of conditions are stored
-        key = None if set_index is None else (set_index, batch.start)
+        key: tuple[int, int] | None = None
+        if self._reuses_conditions(query.kind):
+            # the key under which the views of this batch of conditions are stored
+            key = (self._find_set_index(query), batch.start)
         return self._predict_images(full_configurations[batch], u, key)
 
     def _predict_clean_image(self, u: Tensor) -> Tensor:

@@ -169,36 +169,38 @@ class Verifier:
                 conditions vary, the verification may not take more. None for no limit.
         """
         has_conditions = self.problem.conditions is not None
-        # `max_samples` is for the progress bar: samples per pixel of all renders, if
-        # every sample count of the ladder is tried.
-        if has_conditions:
-            choose: Callable[..., SampleCount] = choose_rate_spp
-            ladder = self._find_rate_ladder(len(candidates), search_samples)
-            max_samples = N_CONDITIONS * len(candidates) * sum(ladder)
-        else:
-            n_trials_of_first_look = self.look_sizes[0]
-            choose = partial(choose_spp, trials=n_trials_of_first_look)
-            ladder = self.spp_ladder
-            max_samples = count_max_samples(
-                len(candidates), ladder, n_trials_of_first_look
-            )
+        choose: Callable[..., SampleCount] = choose_rate_spp
+        if not has_conditions:
+            choose = partial(choose_spp, trials=self.look_sizes[0])
+        ladder = self._find_ladder(len(candidates), search_samples)
         # with a single sample count nothing is rendered
         if len(ladder) > 1:
-            self._begin_sample_count_stage(max_samples)
+            self._begin_sample_count_stage(
+                self._count_max_samples(len(candidates), ladder)
+            )
         margins = self._make_margin_functions(candidates, has_conditions)
         self.run_state.sample_count = choose(
             margins, seed=self.problem.seed, ladder=ladder
         )
 
-    def _find_rate_ladder(
+    def _count_max_samples(self, n_candidates: int, ladder: Sequence[int]) -> int:
+        """Return the samples per pixel of all renders that choose a sample count.
+
+        It is for the progress bar, as if every sample count of the ladder was tried.
+        """
+        if self.problem.conditions is not None:
+            return N_CONDITIONS * n_candidates * sum(ladder)
+        return count_max_samples(n_candidates, ladder, self.look_sizes[0])
+
+    def _find_ladder(
         self, n_candidates: int, search_samples: int | None
     ) -> Sequence[int]:
-        """Return the sample counts, ascending, to choose from if conditions vary.
+        """Return the sample counts to choose from, ascending.
 
-        A single count, set by the user, stays.
+        If conditions vary, they are limited, but a single count, set by the user, stays.
         """
         is_set_by_user = len(self.spp_ladder) == 1
-        if is_set_by_user:
+        if self.problem.conditions is None or is_set_by_user:
             return self.spp_ladder
         return self._list_affordable_counts(n_candidates, search_samples)
 
@@ -603,11 +605,9 @@ class Retrials:
             machine = None  # name of the worker's machine, if one rendered the image
             if key not in self._images:
                 rendered = next(from_workers, None)
-                if rendered is None or rendered.picture is None:  # not by a worker
-                    self._images[key] = self._render(condition, query.u, query.seed)
-                else:
-                    self._images[key] = rendered.picture
-                    machine = rendered.machine
+                self._images[key], machine = self._find_image(
+                    condition, query, rendered
+                )
             # with the change of the image that belongs to the condition
             judgement = self._judge_changed(condition, self._images[key], query)
             yield Evaluation.from_judgement(judgement, machine=machine)
@@ -618,6 +618,17 @@ class Retrials:
             self._images.clear()
             self._radiances.clear()
             self._cached_kind = kind
+
+    def _find_image(
+        self, condition: RetrialCondition, query: Query, rendered: Evaluation | None
+    ) -> tuple[Tensor, str | None]:
+        """Return the image (H, W, 3) of a trial, and the worker's machine.
+
+        It is rendered here, without a machine, if no worker has `rendered` it.
+        """
+        if rendered is None or rendered.picture is None:
+            return self._render(condition, query.u, query.seed), None
+        return rendered.picture, rendered.machine
 
     @staticmethod
     def _judge_changed(

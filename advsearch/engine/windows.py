@@ -106,6 +106,18 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return Refusal("nothing of what is searched is in the picture")
     if box.grow(MARGINS[0], resolution).area > max_area:
         return Refusal("what is searched fills much of the picture")
+    return _grow_window(problem, box, max_area)
+
+
+def _grow_window(problem: Problem, box: Window, max_area: float) -> Windowing | Refusal:
+    """Return the smallest accepted window around a box, or why there is none.
+
+    Args:
+        problem: problem of the search.
+        box: the box around what is searched.
+        max_area: area of the largest window that pays, in pixels.
+    """
+    resolution = problem.renderer.formation.resolution
     start, *extremes = _render_extremes(problem)
     # The first window is small enough, as was checked above, so that there is a
     # deviation after the loop: that of the largest window.
