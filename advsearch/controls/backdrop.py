@@ -194,16 +194,22 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
         PHOTOGRAPH_INPUT: torch.tensor(float(index)),
         "camera.to_world": torch.from_numpy(pose).float(),
         "camera.exposure": torch.tensor(exposure_stops),
+        **_compute_lens_input(scene, view),
     }
-    if scene.camera_model is not None:
-        inputs["camera.lens"] = torch.tensor(_get_lens(view).intrinsics)
-    else:
-        inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
     if has_plane(scene):
         inputs["ground.to_world"] = _compute_plane_pose(view, view_to_scene)
     if scene.environment is not None:
         inputs["environment.data"] = _turn_environment(scene.environment, view_to_scene)
     return inputs
+
+
+def _compute_lens_input(
+    scene: SceneDescription, view: SceneDescription
+) -> dict[str, Tensor]:
+    """Return the lens of a photograph as a scene input: a camera model, or an angle."""
+    if scene.camera_model is not None:
+        return {"camera.lens": torch.tensor(_get_lens(view).intrinsics)}
+    return {"camera.fov": torch.tensor([view.get_number("camera.fov")])}
 
 
 def _move_into_photograph(

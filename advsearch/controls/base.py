@@ -682,12 +682,7 @@ class Control:
         Raises:
             InputError: a setting of the control is impossible in this scene.
         """
-        slots = list[Slot]()
-        begin = 0
-        for parameter, spec in self.list_parameter_specs():
-            slot = Slot(parameter, spec, begin)
-            slots.append(slot)
-            begin += slot.n_coordinates
+        slots = self._make_slots()
         self.parameter_slots = tuple(slots)
         self.adjusted_defaults = tuple(self._list_adjusted_defaults())
         start_coordinates = [
@@ -700,6 +695,16 @@ class Control:
         low_and_span = _compute_low_and_span(slots)
         self._low = low_and_span[:, 0].contiguous()
         self._span = low_and_span[:, 1].contiguous()
+
+    def _make_slots(self) -> list[Slot]:
+        """Return each parameter with the offset of its coordinates."""
+        slots = list[Slot]()
+        begin = 0
+        for parameter, spec in self.list_parameter_specs():
+            slot = Slot(parameter, spec, begin)
+            slots.append(slot)
+            begin += slot.n_coordinates
+        return slots
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its value in the unchanged scene as the default.

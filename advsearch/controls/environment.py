@@ -138,12 +138,9 @@ class EnvironmentControl(Control):
         allowed = self.list_allowed_values("which", SCENE_ENVIRONMENT)
         files = [str(name) for name in allowed if _is_file(name)]
         notes = _list_environment_notes(files)
-        is_scene_environment_allowed = (
-            SCENE_ENVIRONMENT in allowed
-            or self._find_scene_environment_name(scene) is not None
-        )
+        keeps_environment = self._keeps_environment(scene, allowed)
         is_fixed = isinstance(self.specs.get("which"), Fixed)
-        if not is_scene_environment_allowed and (is_fixed or files):
+        if not keeps_environment and (is_fixed or files):
             name = str(allowed[0])
             scene = replace(
                 scene, environment=_load_environment(name), environment_spec=name
@@ -156,6 +153,15 @@ class EnvironmentControl(Control):
             if files and not shows_photograph:
                 notes += _describe_table(scene, list(dict.fromkeys(files)))
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
+
+    def _keeps_environment(
+        self, scene: SceneDescription, allowed: Sequence[ParameterValue]
+    ) -> bool:
+        """Return whether a scene's own environment is among the allowed names."""
+        return (
+            SCENE_ENVIRONMENT in allowed
+            or self._find_scene_environment_name(scene) is not None
+        )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; the default of `which` is the scene's own environment.

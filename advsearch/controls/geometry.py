@@ -521,6 +521,13 @@ def _compute_gradient_factors(
     return np.stack([1.0 / length_1, multiple, inverse_height], axis=1)
 
 
+def _measure_wall_widths(welded_mesh: WeldedMesh) -> Float64Array:
+    """Return the distance (W,) between both sides of each wall of a mesh."""
+    first_side = welded_mesh.positions[welded_mesh.walls[:, 0]]
+    second_side = welded_mesh.positions[welded_mesh.walls[:, 1]]
+    return np.asarray(np.linalg.norm(first_side - second_side, axis=1))
+
+
 class DisplacementLimits:
     """Scales displacements by a common factor, so that the mesh stays intact.
 
@@ -561,11 +568,7 @@ class DisplacementLimits:
         self._faces = torch.from_numpy(welded_mesh.faces[is_limited])
         self._gradient_factors = torch.from_numpy(gradient_factors)
         self._walls = torch.from_numpy(welded_mesh.walls)
-        wall_vectors = (
-            welded_mesh.positions[welded_mesh.walls[:, 0]]
-            - welded_mesh.positions[welded_mesh.walls[:, 1]]
-        )
-        self._wall_widths = torch.from_numpy(np.linalg.norm(wall_vectors, axis=1))
+        self._wall_widths = torch.from_numpy(_measure_wall_widths(welded_mesh))
         self._positions = torch.from_numpy(welded_mesh.positions)
 
     def compute_squared_usage(self, field: Tensor) -> Tensor:

@@ -246,17 +246,21 @@ class PatchControl(PictureControl):
         self._picture = (
             None if picture is None else images.resize_to_square(picture, side)
         )
-        # The painter needs the values at the start, which `compute_values` returns, and the
-        # start of the pixels needs the painter. So the pixels are set last, and are left
-        # out here.
-        start_values = {
+        self._painter = PatchPainter(self.scene, self._compute_start_numbers(), side)
+        if isinstance(pixels.parameter_spec, Range):
+            self._start_as_underneath(pixels.parameter, pixels.parameter_spec)
+
+    def _compute_start_numbers(self) -> dict[str, float]:
+        """Return the values at the start, without the pixels.
+
+        The painter needs these values, which `compute_values` returns, and the start of
+        the pixels needs the painter. So the pixels are set last.
+        """
+        return {
             name: float(value)
             for name, value in self.compute_values(self.start).items()
             if name != "pixels"
         }
-        self._painter = PatchPainter(self.scene, start_values, side)
-        if isinstance(pixels.parameter_spec, Range):
-            self._start_as_underneath(pixels.parameter, pixels.parameter_spec)
 
     def _check_has_groups(self) -> None:
         """Raise InputError if nothing is searched."""
@@ -529,10 +533,7 @@ class PatchPainter:
             numbers: azimuth, height, size and rotation of the patch, () each.
         """
         device = pixels.device
-        if base is None:
-            base = self._object_color.to(device)
-        else:
-            base = _resize_to_square(base, len(self._object_color))
+        base = self._prepare_base(base, device)
         size = numbers["size"]
         texels = self._find_texels(
             float(numbers["azimuth"].detach()),
@@ -546,6 +547,12 @@ class PatchPainter:
         opacity = (texels.opacity.to(device) * edge_opacity)[:, None]
         patch_colors = _sample_pixels(pixels, on_patch)
         return _blend_texels(base, texels.indices.to(device), patch_colors, opacity)
+
+    def _prepare_base(self, base: Tensor | None, device: torch.device) -> Tensor:
+        """Return a base color (h, w, 3), or the object's own, with the map's size."""
+        if base is None:
+            return self._object_color.to(device)
+        return _resize_to_square(base, len(self._object_color))
 
     def sample_underneath(self) -> Tensor:
         """Return the pixels of a patch that shows the object's own texture beneath it.

@@ -602,7 +602,8 @@ class Retrials:
         # The loop below takes the next one for each missing image, in the same order.
         from_workers = self._render_on_workers(condition, missing)
         for query, key in zip(queries, keys, strict=True):
-            machine = None  # name of the worker's machine, if one rendered the image
+            # name of the worker's machine, if one rendered the image
+            machine: str | None = None
             if key not in self._images:
                 rendered = next(from_workers, None)
                 self._images[key], machine = self._find_image(

@@ -305,13 +305,11 @@ class PathControl(Control):
         self._files = [
             movement for movement in all_movements if isinstance(movement, Waypoints)
         ]
-        self._check_choices_fit_paths(
-            names, are_all_files=len(self._files) == len(all_movements)
-        )
+        are_all_files = len(self._files) == len(all_movements)
+        self._check_choices_fit_paths(names, are_all_files=are_all_files)
         if self._files:
-            self.choice_values["seconds"] = max(
-                float(movement.times[-1]) for movement in self._files
-            )
+            durations = [float(movement.times[-1]) for movement in self._files]
+            self.choice_values["seconds"] = max(durations)
         self.seconds = float(self.choice_values["seconds"])
 
     def _check_path_names(self, names: Sequence[str]) -> None:
