@@ -370,11 +370,7 @@ class Space:
             group.setting == "environment.rotation" for group in self.groups
         )
         has_solids = any(part.solids for part in scene.surrounding_meshes.values())
-        has_limited_surroundings = find_surroundings(scene) is not None
-        # Views take time to compute, so only if a note may depend on them.
-        views = list[CameraView]()
-        if has_solids or has_limited_surroundings:
-            views = self._sample_camera_views(scene)
+        views = self._find_noted_views(scene, has_solids)
         camera_positions = []
         if has_solids:
             camera_positions = [get_camera_position(view) for view in views]
@@ -383,6 +379,18 @@ class Space:
             *list_view_remarks(scene, views, rotates_map=rotates_map),
             *list_camera_remarks(scene, camera_positions),
         )
+
+    def _find_noted_views(
+        self, scene: SceneDescription, has_solids: bool
+    ) -> list[CameraView]:
+        """Return views of the camera if a note may depend on them, as they take time.
+
+        `has_solids` states whether the surroundings have solids, such as walls.
+        """
+        has_limited_surroundings = find_surroundings(scene) is not None
+        if has_solids or has_limited_surroundings:
+            return self._sample_camera_views(scene)
+        return []
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
         """Return views of the camera, spread over the range in which it may move.

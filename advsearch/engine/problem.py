@@ -1002,19 +1002,13 @@ class Problem:
         mean_gradient = _average_gradients(evaluations, u.numel())
         if mean_gradient is not None:
             gradient = mean_gradient
-        judged = [
-            evaluation.judgement
-            for evaluation in evaluations
-            if evaluation.judgement is not None
-        ]
+        judged = _list_judgements(evaluations)
         judgement = self._average_judgements(judged, outputs)
-        n_successes = sum(evaluation.success for evaluation in evaluations)
-        n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
         total_objective = sum(evaluation.objective for evaluation in evaluations)
         return Evaluation(
             objective=total_objective / len(evaluations),
             gradient=gradient,
-            success=n_successes >= n_needed,
+            success=_is_success_over_conditions(evaluations),
             n_non_finite=sum(evaluation.n_non_finite for evaluation in evaluations),
             cost=max(evaluation.cost for evaluation in evaluations),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
@@ -1139,6 +1133,22 @@ def _divide_sum(derivatives: Sequence[Tensor | None], count: int) -> Tensor | No
         elif derivative is not None:
             total_derivative = total_derivative + derivative
     return None if total_derivative is None else total_derivative / count
+
+
+def _list_judgements(evaluations: Sequence[Evaluation]) -> list[Judgement]:
+    """List the judgements of those evaluations that have one."""
+    return [
+        evaluation.judgement
+        for evaluation in evaluations
+        if evaluation.judgement is not None
+    ]
+
+
+def _is_success_over_conditions(evaluations: Sequence[Evaluation]) -> bool:
+    """Return whether enough evaluations are successes, by the rule over conditions."""
+    n_successes = sum(evaluation.success for evaluation in evaluations)
+    n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
+    return n_successes >= n_needed
 
 
 def _average_gradients(evaluations: Sequence[Evaluation], dim: int) -> Tensor | None:
