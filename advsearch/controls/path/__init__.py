@@ -469,11 +469,7 @@ class PathControl(Control):
         times = self._find_times(trajectory, assumed)
         check_times(path, times)
         positions, rotations = self._orient(path, trajectory, assumed)
-        notes = list(trajectory.notes)
-        if assumed:
-            notes.append(_describe_assumptions(path, trajectory.format, assumed))
-        if rotations is not None:
-            notes += _warn_of_tilt(path, rotations)
+        notes = _list_trajectory_notes(path, trajectory, assumed, rotations)
         return Waypoints(
             torch.from_numpy(times.astype(np.float32)),
             torch.from_numpy(positions.astype(np.float32)),
@@ -1071,6 +1067,28 @@ def _roll_camera(
     rolled_up = cos * up - sin * left
     axes = torch.stack([rolled_left, rolled_up, ahead], dim=1)
     return geometry.make_affine(axes, position)
+
+
+def _list_trajectory_notes(
+    path: Path,
+    trajectory: Trajectory,
+    assumed: Mapping[str, str],
+    rotations: Rotation | None,
+) -> list[str]:
+    """List the notes on a trajectory: how it was read, what was assumed, and its tilt.
+
+    Args:
+        path: the file.
+        trajectory: what was read from it.
+        assumed: defaults of choices that the user left out, by name.
+        rotations: rotations of the camera; None if it looks at the object.
+    """
+    notes = list(trajectory.notes)
+    if assumed:
+        notes.append(_describe_assumptions(path, trajectory.format, assumed))
+    if rotations is not None:
+        notes += _warn_of_tilt(path, rotations)
+    return notes
 
 
 def _warn_of_tilt(path: Path, rotations: Rotation) -> list[str]:
