@@ -801,26 +801,32 @@ class Control:
                 allow that value.
         """
         for slot in self.parameter_slots:
-            parameter = slot.parameter
-            if not self.must_start_at_clean_value(parameter, slot.parameter_spec):
-                continue
-            scene_value = self.get_value_without_control(parameter)
-            used = slot.get_start_value()
-            if self._depends_on_strength(parameter):
-                continue
-            if is_same_value(used, scene_value, is_angle=slot.is_angle):
-                continue
-            self._check_allows_scene_value(slot, scene_value)
-            is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
-            if is_fixed_by_user:
-                continue
-            yield AdjustedDefault(
-                control_name=self.name,
-                parameter_name=self._get_reported_name(parameter),
-                unit="name" if parameter.options else parameter.unit,
-                scene_value=scene_value,
-                used_value=used,
-            )
+            adjusted = self._find_adjusted_default(slot)
+            if adjusted is not None:
+                yield adjusted
+
+    def _find_adjusted_default(self, slot: Slot) -> AdjustedDefault | None:
+        """Return the adjusted default of a parameter; None if it is not adjusted."""
+        parameter = slot.parameter
+        if not self.must_start_at_clean_value(parameter, slot.parameter_spec):
+            return None
+        scene_value = self.get_value_without_control(parameter)
+        used = slot.get_start_value()
+        if self._depends_on_strength(parameter):
+            return None
+        if is_same_value(used, scene_value, is_angle=slot.is_angle):
+            return None
+        self._check_allows_scene_value(slot, scene_value)
+        is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
+        if is_fixed_by_user:
+            return None
+        return AdjustedDefault(
+            control_name=self.name,
+            parameter_name=self._get_reported_name(parameter),
+            unit="name" if parameter.options else parameter.unit,
+            scene_value=scene_value,
+            used_value=used,
+        )
 
     def _depends_on_strength(self, parameter: Parameter) -> bool:
         """Return whether a parameter only has an effect if another one has strength."""

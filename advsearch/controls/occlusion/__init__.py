@@ -320,26 +320,47 @@ class OcclusionControl(Control):
         if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested_distance)
         mesh = _load_asset(self._select_option(values)).mesh
-        turn = geometry.make_rotation(requested["turn"], 0.0, 0.0)
-        # vertices of the turned occluder, centered on the origin, largest extent 1
-        points = mesh.vertices.astype(np.float64) @ turn.T
+        points = _turn_vertices(mesh, requested["turn"])
         size, distance = _fit_occluder(
             points, requested["size"], requested_distance, view.nearest_distance
         )
         placement = _make_hidden_placement(size, distance)
-        occluder_silhouette = silhouettes.rasterise_silhouette(
-            _to_facing_camera(points, size, distance), mesh.faces
-        )
-        if occluder_silhouette is None:
+        points_facing_camera = _to_facing_camera(points, size, distance)
+        silhouette = silhouettes.rasterise_silhouette(points_facing_camera, mesh.faces)
+        if silhouette is None:
             return placement
-        passage = silhouettes.Passage(
-            target_directions=view.directions,
-            occluder_silhouette=occluder_silhouette,
-            axes=silhouettes.compute_center_axes(view.directions),
-            direction=requested["direction"],
-        )
+        passage = _make_passage(view.directions, silhouette, requested["direction"])
         angle = _find_covering_angle(view, passage, requested["coverage"])
         return _move_into_view(placement, passage, angle)
+
+
+def _turn_vertices(mesh: assets.Mesh, degrees: float) -> assets.Float64Array:
+    """Return the vertices (V, 3) of an occluder after a turn about its vertical axis.
+
+    They are centered on the origin, and their largest extent is 1.
+    """
+    turn = geometry.make_rotation(degrees, 0.0, 0.0)
+    return mesh.vertices.astype(np.float64) @ turn.T
+
+
+def _make_passage(
+    directions: assets.Float64Array,
+    silhouette: silhouettes.Silhouette,
+    direction: float,
+) -> silhouettes.Passage:
+    """Return the passage of an occluder past the object.
+
+    Args:
+        directions: (N, 3) directions in which the object is visible.
+        silhouette: silhouette of the occluder, straight ahead of a camera.
+        direction: side that it comes from, degrees.
+    """
+    return silhouettes.Passage(
+        target_directions=directions,
+        occluder_silhouette=silhouette,
+        axes=silhouettes.compute_center_axes(directions),
+        direction=direction,
+    )
 
 
 def _move_into_view(

@@ -136,7 +136,7 @@ def _make_wave(rows: Tensor, columns: Tensor, generator: torch.Generator) -> Ten
     Args:
         rows: (h, 1, 1) vertical position, -1 to 1.
         columns: (1, w, 1) horizontal position, -1 to 1.
-        generator: of the random numbers.
+        generator: generator of random numbers; it advances.
     """
     # each has a number for every channel, uniform in [-1, 1]
     x_frequency, y_frequency, phase, amplitude = (
