@@ -80,10 +80,7 @@ class PoseControl(Control):
         base_pose = base_pose.to(device)
         vertices = vertices.to(device)
         center = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
-        rotation = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
-            values["yaw"], values["pitch"], values["roll"]
-        )
-        linear = values["scale"] * rotation
+        linear = _compute_linear_map(values)
         lowest = self._find_lowest(vertices - center, linear, floor - center[2])
         # The new center is `shift_and_height + level_center`: x and y are shifts of the
         # old center, and the height is absolute.
@@ -110,6 +107,14 @@ class PoseControl(Control):
             return (offsets @ linear[2]).amin()
         # of the mesh before, so that the center keeps its height
         return lowest_before
+
+
+def _compute_linear_map(values: Values) -> Tensor:
+    """Return the scale and the rotation of a pose as a matrix (3, 3)."""
+    rotation = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
+        values["yaw"], values["pitch"], values["roll"]
+    )
+    return values["scale"] * rotation
 
 
 @lru_cache(maxsize=16)

@@ -150,16 +150,22 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
     # `mosaic` is the weight of the image with a mosaic of color filters.
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
-    # white balance: red and blue in stops, relative to green
-    gains = torch.stack(
-        [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
-    )
-    display = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
+    balanced = _balance_white(light, values)
+    display = color.linear_to_srgb(balanced.clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
     if compression == 0:
         return display
     jpeg_quality = 100 - compression  # 5 to 99, as the compression is 1 to 95 here
     return images.compress_jpeg(display, jpeg_quality).clamp(0.0, 1.0)
+
+
+def _balance_white(light: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    """Return light (H, W, 3) after the gains of red and blue, relative to green."""
+    # both are in stops
+    gains = torch.stack(
+        [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
+    )
+    return light * gains.to(light.device)
 
 
 def _compute_noise_deviation(light: Tensor, values: Mapping[str, Tensor]) -> Tensor:

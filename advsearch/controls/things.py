@@ -432,7 +432,8 @@ class ThingsControl(Control):
 def _compute_outline_center(footprint: parts.Footprint) -> assets.Float64Array:
     """Return the center (2,) of the bounding box of a footprint's outline."""
     outline = footprint.outline
-    return (outline.min(axis=0) + outline.max(axis=0)) / 2.0
+    center: assets.Float64Array = (outline.min(axis=0) + outline.max(axis=0)) / 2.0
+    return center
 
 
 def _rotate_outline(

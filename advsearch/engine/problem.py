@@ -1075,7 +1075,7 @@ class _RecordingLoss:
     variable_u: Tensor
     inputs: ConfigurationInputs = field(init=False)
     calls: list[tuple[Tensor, Output]] = field(default_factory=list)
-    input_gradient: Tensor = field(default_factory=partial(torch.zeros, ()))
+    input_gradient: Tensor = field(default_factory=lambda: torch.zeros(()))
 
     def __post_init__(self) -> None:
         self.inputs = self.problem.make_objective_inputs(self.variable_u)
