@@ -162,7 +162,7 @@ def find_replaced_defaults(
 
 
 def _check_is_default(
-    control: str, name: str, before: SceneDescription, new_value: ParameterValue
+    control: str, name: str, before: SceneDescription, new_value: float
 ) -> None:
     """Raise InputError if the user set a value of a scene that a control replaces.
 
@@ -174,6 +174,7 @@ def _check_is_default(
     """
     if name in before.requested:
         value_before = before.values[name]
+        assert value_before is not None  # the caller skips those without a value
         raise InputError(
             f"`set` {name}={format_value(value_before)} and `controls` {control} "
             "contradict each "

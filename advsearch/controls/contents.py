@@ -377,9 +377,11 @@ def _find_apex(is_above: assets.BoolArray) -> assets.IntArray:
 
     `is_above` (S, 3) states which corners of a face are above the plane.
     """
-    return np.where(
-        is_above.sum(axis=1) == 1, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
+    is_alone_above = is_above.sum(axis=1) == 1
+    apex: assets.IntArray = np.where(
+        is_alone_above, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
     )
+    return apex
 
 
 def _cut_edges(

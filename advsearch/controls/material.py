@@ -286,7 +286,7 @@ def _make_band_filter(wavelength: tuple[float, float]) -> Float64Array:
     return np.asarray(np.exp(-(((radius - 1.0) / 0.22) ** 2)))
 
 
-def _step(value: Float64Array, edge: float, soft: float) -> Float64Array:
+def _step(value: Float64Array, edge: float | Float64Array, soft: float) -> Float64Array:
     """Return 0 below the edge and 1 above it, with a smooth ramp `soft` wide."""
     fraction = np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
     return np.asarray(fraction * fraction * (3.0 - 2.0 * fraction))

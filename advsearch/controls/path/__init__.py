@@ -307,6 +307,10 @@ class PathControl(Control):
         ]
         are_all_files = len(self._files) == len(all_movements)
         self._check_choices_fit_paths(names, are_all_files=are_all_files)
+        self._set_duration()
+
+    def _set_duration(self) -> None:
+        """Set `seconds`: the duration of the longest file, or the choice without files."""
         if self._files:
             durations = [float(movement.times[-1]) for movement in self._files]
             self.choice_values["seconds"] = max(durations)
@@ -330,13 +334,7 @@ class PathControl(Control):
             are_all_files: whether every movement is from a file, and none is a named
                 one such as "orbit".
         """
-        # "approach+orbit" moves both the camera and the object, "orbit" what `moves` states
-        has_single_mover = any(MOVER_SEPARATOR not in name for name in names)
-        if "moves" in self._settings and not has_single_mover:
-            raise InputError(
-                f"{self.name}: {names[0]} states the movements of both the camera and "
-                "the object; leave moves out"
-            )
+        self._check_moves_is_used(names)
         # Without `path` in the settings of this control, another setting of the run may
         # still add one. `prepare` checks that.
         if "path" in self._settings:
@@ -345,6 +343,20 @@ class PathControl(Control):
             self._check_not_set("seconds")
         if are_all_files:
             self._check_not_set("reach")
+
+    def _check_moves_is_used(self, names: Sequence[str]) -> None:
+        """Raise InputError if `moves` is set, but each path states what it moves.
+
+        Args:
+            names: names of the paths, e.g. "orbit" or "drive.csv".
+        """
+        # "approach+orbit" moves both the camera and the object, "orbit" what `moves` states
+        has_single_mover = any(MOVER_SEPARATOR not in name for name in names)
+        if "moves" in self._settings and not has_single_mover:
+            raise InputError(
+                f"{self.name}: {names[0]} states the movements of both the camera and "
+                "the object; leave moves out"
+            )
 
     def _check_not_set(self, setting: str) -> None:
         """Raise InputError if a choice is set that the files of the paths state."""
@@ -497,10 +509,10 @@ class PathControl(Control):
         if trajectory.times is not None:
             return trajectory.times
         count = len(trajectory.positions)
-        seconds = (count - 1) / KITTI_RATE
         if "seconds" in self._settings:
             seconds = float(self.choice_values["seconds"])
         else:
+            seconds = (count - 1) / KITTI_RATE
             assumed["seconds"] = (
                 f"{KITTI_RATE:g} poses a second, {_format_rounded(seconds)} in all"
             )
@@ -530,11 +542,11 @@ class PathControl(Control):
         axes = str(self.choice_values["axes"] or OPTICAL)
         up = str(self.choice_values["up"] or trajectory.default_up)
         origin = self.choice_values["object_at"] or (0.0, 0.0, 0.0)
-        if trajectory.rotations is None and axes == NO_AXES:
+        has_rotations = trajectory.rotations is not None
+        if not has_rotations and axes == NO_AXES:
             raise InputError(
                 f"{self.name}: axes: {path} has no rotations; leave it out"
             )
-        has_rotations = trajectory.rotations is not None
         assumed |= self._list_assumptions(axes, up, has_rotations=has_rotations)
         positions, rotations = trajectory.orient(axes, up, origin)
         _check_positions(path, positions)
@@ -624,6 +636,10 @@ class PathControl(Control):
                 f"camera {scene.camera!r}; set moves=object, or set the camera to "
                 "'orbit'"
             )
+        self._check_has_no_photograph(scene)
+
+    def _check_has_no_photograph(self, scene: SceneDescription) -> None:
+        """Raise InputError if the scene is rendered into a photograph."""
         photograph = scene.backdrop_photograph
         if photograph is not None:
             raise InputError(
@@ -687,7 +703,8 @@ class PathControl(Control):
             if isinstance(movement, Waypoints)
         ]
         even_times = torch.linspace(0.0, self.seconds, N_CHECKED_TIMES)
-        return torch.cat([even_times, *waypoint_times]).unique()
+        times: Tensor = torch.cat([even_times, *waypoint_times]).unique()
+        return times
 
     def _make_collision_error(self, name: str, collision_time: float) -> InputError:
         """Return the error of a camera that has no direction at a time in seconds."""
@@ -868,17 +885,21 @@ class PathControl(Control):
         from_center = scene_position - scene_start.center
         if movement == ORBIT:
             return scene_start.center + _turn_about_vertical(from_center, progress)
-        distance = from_center.norm()
+        distance: Tensor = from_center.norm()
         reach = float(self.choice_values["reach"])
         if movement == APPROACH:
-            ahead = _level_direction(forward)
             # It begins at `reach` times the distance at which it ends.
-            to_go = (1.0 - progress)[..., None]  # (..., 1), from 1 to 0
-            return scene_position - ahead * distance * (reach - 1.0) * to_go
+            to_go: Tensor = (1.0 - progress)[..., None]  # (..., 1), from 1 to 0
+            distance_to_go = (
+                _level_direction(forward) * distance * (reach - 1.0) * to_go
+            )
+            approach_position: Tensor = scene_position - distance_to_go
+            return approach_position
         # On "pass", (..., 1): 1 at the beginning, 0 at the position in the scene, -1 at
         # the end.
-        to_the_left = (1.0 - 2.0 * progress)[..., None]
-        return scene_position + left * distance * reach * to_the_left
+        to_the_left: Tensor = (1.0 - 2.0 * progress)[..., None]
+        position: Tensor = scene_position + left * distance * reach * to_the_left
+        return position
 
     def _camera_on_waypoints(
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
@@ -935,17 +956,32 @@ class PathControl(Control):
         if movement is None:
             return camera.new_zeros(3), no_turn
         if isinstance(movement, Waypoints):
-            # The positions of an object's waypoints are relative to its position in the
-            # scene.
-            shift = movement.interpolate(time, movement.positions)
-            shift = shift / self.scene.size_in_metres
-            if movement.headings is None:
-                return shift, no_turn
-            return shift, movement.interpolate(time, movement.headings)
+            return self._shift_on_waypoints(movement, time, no_turn)
         progress = (time / self.seconds).clamp(0.0, 1.0)
         if movement == ORBIT:
             return camera.new_zeros(3), 360.0 * progress
         return self._object_on_line(movement, scene_start, progress), no_turn
+
+    def _shift_on_waypoints(
+        self, waypoints: Waypoints, time: Tensor, no_turn: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return how far waypoints shift and turn the object.
+
+        Args:
+            waypoints: waypoints of the object, in metres.
+            time: (...,) seconds.
+            no_turn: () 0 degrees, for waypoints without headings.
+
+        Returns:
+            The shift (..., 3) in object sizes, and the turn (...,) in degrees.
+        """
+        # The positions of an object's waypoints are relative to its position in the
+        # scene.
+        shift = waypoints.interpolate(time, waypoints.positions)
+        shift = shift / self.scene.size_in_metres
+        if waypoints.headings is None:
+            return shift, no_turn
+        return shift, waypoints.interpolate(time, waypoints.headings)
 
     def _object_on_line(
         self, movement: str, scene_start: StartPoses, progress: Tensor
@@ -960,15 +996,17 @@ class PathControl(Control):
         # columns of the pose: the camera's x axis points to the left, y up, z ahead
         left, _, forward, position = scene_start.camera[:3].unbind(dim=1)
         reach = float(self.choice_values["reach"])
-        distance = (position - scene_start.center).norm()
+        distance: Tensor = (position - scene_start.center).norm()
         if movement == APPROACH:
             # It begins at `reach` times the distance from the camera at which it ends.
-            to_go = distance * (reach - 1.0) * (1.0 - progress)
-            return _level_direction(forward) * to_go[..., None]
+            to_go: Tensor = distance * (reach - 1.0) * (1.0 - progress)
+            approach_shift: Tensor = _level_direction(forward) * to_go[..., None]
+            return approach_shift
         # On "pass" it is to the right of its position in the scene at first (over 0),
         # then to the left (under 0).
-        to_right = distance * reach * (1.0 - 2.0 * progress)
-        return _level_direction(-left) * to_right[..., None]
+        to_right: Tensor = distance * reach * (1.0 - 2.0 * progress)
+        pass_shift: Tensor = _level_direction(-left) * to_right[..., None]
+        return pass_shift
 
 
 @geometry.cache_per_scene
