@@ -446,11 +446,7 @@ class Control:
         }
         self.instance_parameters = self.declare_parameters(settings)
         self._check_setting_names(settings)
-        self._settings: dict[str, Any] = {
-            setting: to_plain_value(value)
-            for setting, value in settings.items()
-            if value is not None
-        }
+        self._settings = _list_stated_settings(settings)
         self.choice_values: dict[str, Any] = self._collect_choice_values()
         self.check_choices()
         self.specs = self._parse_specs()
@@ -547,19 +543,14 @@ class Control:
             InputError: the mesh belongs to the surroundings of a Mitsuba scene, which
                 this control can't change.
         """
-        mesh = self.mesh_name
-        if mesh in scene.meshes:
-            return scene.meshes[mesh]
-        if any(
-            part.name == mesh for part in scene.parts if isinstance(part, PluginPart)
-        ):
-            raise self._make_surroundings_error(mesh)
-        raise UnknownNameError(
-            "mesh of the scene",
-            mesh,
-            scene.meshes,
-            f"It stands in `controls` {self.name}.",
-        )
+        name = self.mesh_name
+        if name in scene.meshes:
+            return scene.meshes[name]
+        plugin_parts = [part for part in scene.parts if isinstance(part, PluginPart)]
+        if any(part.name == name for part in plugin_parts):
+            raise self._make_surroundings_error(name)
+        hint = f"It stands in `controls` {self.name}."
+        raise UnknownNameError("mesh of the scene", name, scene.meshes, hint)
 
     def _make_surroundings_error(self, mesh: str) -> InputError:
         """Return the error for a mesh around the object in a Mitsuba scene."""
@@ -601,15 +592,19 @@ class Control:
                 self._check_is_full_range(parameter)
                 requested.append(form)
         if "form" in self._settings:
-            form = str(self._settings["form"])
-            requested.append(form)
-            if form not in forms:
-                raise UnknownNameError(f"{self.name}.form", form, forms)
+            requested.append(self._read_form(forms))
         if len(set(requested)) > 1:
             raise InputError(
                 f"{self.name}.form: expected one form, got {', '.join(requested)}"
             )
         return requested[0] if requested else forms[0]
+
+    def _read_form(self, forms: Sequence[str]) -> str:
+        """Return the setting `form`; raise UnknownNameError if it is none of the forms."""
+        form = str(self._settings["form"])
+        if form not in forms:
+            raise UnknownNameError(f"{self.name}.form", form, forms)
+        return form
 
     def _check_is_full_range(self, parameter: Parameter) -> None:
         """Raise InputError if a parameter is set to less than its full range."""
@@ -821,6 +816,18 @@ class Control:
         is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
         if is_fixed_by_user:
             return None
+        return self._make_adjusted_default(parameter, scene_value, used)
+
+    def _make_adjusted_default(
+        self, parameter: Parameter, scene_value: ParameterValue, used: ParameterValue
+    ) -> AdjustedDefault:
+        """Return the record of a parameter that starts at another value than the scene's.
+
+        Args:
+            parameter: the parameter.
+            scene_value: its value in the scene, without the control.
+            used: the value that it starts at.
+        """
         return AdjustedDefault(
             control_name=self.name,
             parameter_name=self._get_reported_name(parameter),
@@ -885,8 +892,13 @@ class Control:
         spec = slot.parameter_spec
         setting = self.get_setting_name(parameter)
         if isinstance(spec, OneOf):
-            options = len(spec.values)
-            return Group(name, slot.n_coordinates, (), options=options, setting=setting)
+            return Group(
+                name,
+                slot.n_coordinates,
+                valid=(),
+                options=len(spec.values),
+                setting=setting,
+            )
         budget = self.get_budget(parameter)
         self._check_has_no_distribution(name, spec, budget)
         return Group(
@@ -961,15 +973,8 @@ class Control:
         # logarithmic scale or a distribution are interpolated again.
         linear = self._low.to(u) + self._span.to(u) * u
         for slot in self.parameter_slots:
-            spec = slot.parameter_spec
-            if isinstance(spec, Range):
-                value = _interpolate_slot(slot, spec, u, linear)
-            elif isinstance(spec, Fixed):
-                value = _to_tensor(spec.value, slot, u.device)
-            else:  # a list of values, `OneOf`, which has one coordinate
-                selected = spec.select_value(u[slot.coordinate_offset])
-                value = _to_tensor(selected, slot, u.device)
-            values[slot.parameter.name] = value
+            name = slot.parameter.name
+            values[name] = _compute_slot_value(slot, u, linear)
         return values
 
     def scene_inputs(
@@ -1060,8 +1065,7 @@ class Control:
         described: dict[str, Value] = {}
         for slot in self.parameter_slots:
             parameter = slot.parameter
-            is_image = len(parameter.shape) > 1  # numbers have (), vectors (k,)
-            if isinstance(slot.parameter_spec, Fixed) or is_image:
+            if not _is_described(slot):
                 continue
             name = f"{self.name}.{parameter.name}"
             described |= _describe_value(name, parameter, values[parameter.name])
@@ -1182,6 +1186,33 @@ def _compute_low_and_span(slots: Sequence[Slot]) -> Tensor:
     return low_and_span_of_slot.repeat_interleave(counts, dim=0)
 
 
+def _list_stated_settings(settings: Mapping[str, object]) -> dict[str, Any]:
+    """Return the settings that are not None, as plain values of Python."""
+    return {
+        setting: to_plain_value(value)
+        for setting, value in settings.items()
+        if value is not None
+    }
+
+
+def _compute_slot_value(slot: Slot, u: Tensor, linear: Tensor) -> Tensor:
+    """Return the value of a parameter, of the parameter's shape.
+
+    Args:
+        slot: the parameter with its spec and its coordinates.
+        u: (d,) the control's slice of a configuration.
+        linear: (d,) the same, interpolated linearly between the bounds.
+    """
+    spec = slot.parameter_spec
+    if isinstance(spec, Range):
+        return _interpolate_slot(slot, spec, u, linear)
+    if isinstance(spec, Fixed):
+        return _to_tensor(spec.value, slot, u.device)
+    # a list of values, `OneOf`, which has one coordinate
+    selected = spec.select_value(u[slot.coordinate_offset])
+    return _to_tensor(selected, slot, u.device)
+
+
 def _interpolate_slot(slot: Slot, spec: Range, u: Tensor, linear: Tensor) -> Tensor:
     """Return the value of a parameter that has a range, of the parameter's shape.
 
@@ -1201,6 +1232,12 @@ def _interpolate_slot(slot: Slot, spec: Range, u: Tensor, linear: Tensor) -> Ten
     else:
         value = linear[coordinates]
     return value if parameter.shape else value.reshape(())
+
+
+def _is_described(slot: Slot) -> bool:
+    """Return whether a parameter is listed in results: not fixed, and no image."""
+    is_image = len(slot.parameter.shape) > 1  # numbers have (), vectors (k,)
+    return not isinstance(slot.parameter_spec, Fixed) and not is_image
 
 
 def _describe_value(name: str, parameter: Parameter, value: Tensor) -> dict[str, Value]:
