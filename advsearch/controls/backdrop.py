@@ -97,11 +97,8 @@ class BackdropControl(Control):
         # is replaced by the first allowed one.
         if first.backdrop_photograph is not scene.backdrop_photograph:
             scene = _move_into_photograph(scene, first)
-        # If one photograph needs a camera model, all of them are rendered with one:
-        # `_compute_view_inputs` sets the lens of the photograph that is shown.
-        has_model = any(view.camera_model is not None for view in views.values())
-        camera_model = _get_lens(first) if has_model else None
         photographs = replace(folder, scenes=views)
+        camera_model = _find_shared_model(views)
         return replace(scene, camera_model=camera_model, photographs=photographs)
 
     def _select_views(
@@ -171,6 +168,19 @@ class BackdropControl(Control):
         return {
             name: value.to(which.device, copy=True) for name, value in inputs.items()
         }
+
+
+def _find_shared_model(views: Mapping[str, SceneDescription]) -> CameraModel | None:
+    """Return the camera model of a scene in photographs; None if none needs a model.
+
+    Args:
+        views: scene in each photograph, by name.
+    """
+    # If one photograph needs a camera model, all of them are rendered with one:
+    # `_compute_view_inputs` sets the lens of the photograph that is shown.
+    has_model = any(view.camera_model is not None for view in views.values())
+    first = next(iter(views.values()))
+    return _get_lens(first) if has_model else None
 
 
 @cache_per_scene
@@ -320,14 +330,18 @@ def _describe_difference(view: SceneDescription, first: SceneDescription) -> str
     up_of_first = view_to_first[2, :3]
     up_error = np.abs(up_of_first - [0.0, 0.0, 1.0]).max()
     is_upright = up_error <= PLANE_TOLERANCE
-    same_surface = all(
-        view.get_number(setting) == first.get_number(setting)
-        for setting in PLANE_SURFACE
-    )
     if not is_upright:
         return "the object stands on another side"
     if has_plane(view) != has_plane(first):
         return "the camera is on another side of the plane, or its size differs,"
-    if not same_surface:
+    if not _has_same_surface(view, first):
         return f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"
     return None
+
+
+def _has_same_surface(view: SceneDescription, first: SceneDescription) -> bool:
+    """Return whether the planes of two photographs have the same size and gloss."""
+    return all(
+        view.get_number(setting) == first.get_number(setting)
+        for setting in PLANE_SURFACE
+    )

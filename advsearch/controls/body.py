@@ -81,15 +81,29 @@ class BodyControl(Control):
         if requested is None:
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
+        return self._find_clip(requested)
+
+    def _find_clip(self, requested: float | str) -> str:
+        """Return the name of the animation that the choice `clip` states.
+
+        Args:
+            requested: name of an animation, or its index.
+
+        Raises:
+            UnknownNameError: the mesh has no animation of that name or number.
+        """
+        clips = self.rig.clips
+        if requested in clips:
+            return str(requested)
         index = _parse_clip_index(requested)
-        if requested not in clips and not 0 <= index < len(clips):
+        if not 0 <= index < len(clips):
             raise errors.UnknownNameError(
                 f"{self.name}.clip",
                 str(requested),
                 clips,
                 f"Animations of {self.mesh_name}.",
             )
-        return str(requested) if requested in clips else clips[index]
+        return clips[index]
 
     def bind_parameters(self) -> None:
         """Check the parameters and the clip against the rig of the mesh.
