@@ -147,8 +147,7 @@ class CameraControl(Control):
                 determine the same number, or the lens does not support a setting.
         """
         self._check_can_orbit(scene)
-        needs_thin_lens = "aperture" in self.specs or "focus" in self.specs
-        if needs_thin_lens:
+        if self._sets_thin_lens:
             self._check_not_shifted()
         if "azimuth" in self.specs and self._drives_against_traffic(scene):
             scene = replace(scene, remarks=(*scene.remarks, make_traffic_remark(scene)))
@@ -159,9 +158,14 @@ class CameraControl(Control):
         if scene.camera_model is not None:
             # raises if the settings need a thin lens as well
             self._check_lens(scene.camera_model, distortion_names)
-        elif needs_thin_lens:
+        elif self._sets_thin_lens:
             scene = replace(scene, thin_lens=True)
         return scene
+
+    @property
+    def _sets_thin_lens(self) -> bool:
+        """Whether a setting needs a thin lens: an aperture, or a distance in focus."""
+        return "aperture" in self.specs or "focus" in self.specs
 
     def _check_not_shifted(self) -> None:
         """Raise InputError if the image is shifted, which a thin lens can't do."""
@@ -287,12 +291,19 @@ class CameraControl(Control):
         if name in ("distance", "focus"):
             return self._find_default_distance() * scene.size_in_metres
         if name == "height":
-            camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
-            return camera_height * scene.size_in_metres
+            return self._find_default_height()
         if name == "focal_length":
             half_fov = math.radians(scene.get_number("camera.fov")) / 2.0
             return SENSOR_WIDTH / 2.0 / math.tan(half_fov)
         return parameter.default
+
+    def _find_default_height(self) -> float:
+        """Return the height of the camera in the scene.
+
+        It is in metres if the object's size is known, else in object sizes.
+        """
+        camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
+        return camera_height * self.scene.size_in_metres
 
     def _find_default_distance(self) -> float:
         """Return the camera's distance from the object's center, in object sizes.
@@ -374,16 +385,14 @@ class CameraControl(Control):
         distance = self._compute_distance(values, fov)
         inputs = {"camera.to_world": self._compute_pose(values, distance)}
         inputs |= self._compute_lens_inputs(values, fov)
-        sets_thin_lens = "aperture" in self.specs or "focus" in self.specs
-        if scene.thin_lens and sets_thin_lens:
+        if scene.thin_lens and self._sets_thin_lens:
             inputs |= self._compute_thin_lens_inputs(values, distance)
         if scene.camera_model is None and self._sets_shift:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
             # The renderer applies the scene's own exposure already.
-            inputs["camera.exposure"] = values["exposure"] - scene.get_number(
-                "camera.exposure"
-            )
+            scene_exposure = scene.get_number("camera.exposure")
+            inputs["camera.exposure"] = values["exposure"] - scene_exposure
         return inputs
 
     def _compute_lens_inputs(self, values: Values, fov: Tensor) -> dict[str, Tensor]:
@@ -532,12 +541,7 @@ class CameraControl(Control):
         elevation = self._compute_elevation(values, distance)
         roll = torch.deg2rad(values["roll"])
         outwards = _compute_orbit_direction(azimuth, elevation)
-        # Axes without roll: left is level, and up is at right angles to left and to
-        # the direction of view. E.g. at azimuth 0 the camera is at +x and looks along
-        # -x, so that -y is on its left.
-        zero = torch.zeros_like(azimuth)
-        level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
-        level_up = torch.linalg.cross(-outwards, level_left)
+        level_left, level_up = _compute_level_axes(azimuth, outwards)
         # A positive roll turns the camera clockwise, as seen from behind it: its left
         # axis turns towards up, and its up axis towards the right.
         left = roll.cos() * level_left + roll.sin() * level_up
@@ -546,6 +550,22 @@ class CameraControl(Control):
         center = torch.from_numpy(compute_center(self.scene)).to(distance)
         position = center + distance * outwards
         return make_affine(torch.stack([left, up, forward], dim=1), position)
+
+
+def _compute_level_axes(azimuth: Tensor, outwards: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the axes left and up (3,) of a camera on the orbit that has no roll.
+
+    Left is level, and up is at right angles to left and to the direction of view. E.g.
+    at azimuth 0 the camera is at +x and looks along -x, so that -y is on its left.
+
+    Args:
+        azimuth: () angle of the camera around the object, radians.
+        outwards: (3,) unit direction from the object's center to the camera.
+    """
+    zero = torch.zeros_like(azimuth)
+    level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
+    level_up = torch.linalg.cross(-outwards, level_left)
+    return level_left, level_up
 
 
 def _compute_orbit_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:

@@ -110,11 +110,23 @@ def find_vessel(asset: assets.ObjectAsset) -> Vessel | None:
     radii = _fill_missed_radii(np.stack([distances for distances, _ in rows]))
     if radii is None:
         return None
-    # Through the liquid, mostly the lower half of the wall is visible.
-    lower_faces = np.concatenate([faces for _, faces in rows[: WALL_ROWS // 2]])
-    # the index is -1 for a ray that hit no face
-    wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
+    wall_color = _compute_wall_color(asset, [faces for _, faces in rows])
     return Vessel(axis, heights, radii, wall_color)
+
+
+def _compute_wall_color(
+    asset: assets.ObjectAsset, face_rows: list[assets.IntArray]
+) -> assets.Float64Array:
+    """Return the mean color (3,) of a vessel's wall, linear, as seen through a liquid.
+
+    Args:
+        asset: the vessel.
+        face_rows: index of the face that each ray hit, -1 for none; one array (rays,)
+            for each height, ascending.
+    """
+    # Through the liquid, mostly the lower half of the wall is visible.
+    lower_faces = np.concatenate(face_rows[: WALL_ROWS // 2])
+    return _mean_face_color(asset, lower_faces[lower_faces >= 0])
 
 
 def _fill_missed_radii(radii: assets.Float64Array) -> assets.Float64Array | None:
@@ -547,6 +559,16 @@ class ContentsControl(Control):
         Raises:
             InputError: the object is no vessel.
         """
+        vessel = self._require_vessel(scene)
+        mesh = _make_liquid_mesh(vessel)
+        black = np.zeros((4, 4, 3), dtype=np.float32)
+        pose = geometry.compute_object_to_world(scene)
+        return scene.with_part(
+            parts.MeshPart(self.name, mesh, black, LIQUID_MATERIAL, to_world=pose)
+        )
+
+    def _require_vessel(self, scene: SceneDescription) -> Vessel:
+        """Return the inside of a scene's object; raise InputError if it has none."""
         vessel = find_vessel(scene.object)
         if vessel is None:
             raise InputError(
@@ -555,12 +577,7 @@ class ContentsControl(Control):
                 f"bowl, a glass), got {scene.object.name!r}; choose another object or "
                 "leave the control out"
             )
-        mesh = _make_liquid_mesh(vessel)
-        black = np.zeros((4, 4, 3), dtype=np.float32)
-        pose = geometry.compute_object_to_world(scene)
-        return scene.with_part(
-            parts.MeshPart(self.name, mesh, black, LIQUID_MATERIAL, to_world=pose)
-        )
+        return vessel
 
     def bind_parameters(self) -> None:
         """Start from the default proportions, or the nearest that are possible."""
@@ -599,9 +616,7 @@ class ContentsControl(Control):
         inputs = {f"{self.name}.offsets": surface - base}
         if "object.to_world" in earlier_inputs:
             inputs[f"{self.name}.to_world"] = earlier_inputs["object.to_world"]
-        proportions = torch.stack([values[name] for name in INGREDIENTS])
-        vessel_color = torch.from_numpy(vessel.color).to(proportions)
-        liquid_color = mix_liquid_color(proportions, vessel_color)
+        liquid_color = _compute_liquid_color(values, vessel)
         # the size of the black texture of `prepare`
         inputs[f"{self.name}.base_color"] = liquid_color.expand(4, 4, 3)
         return inputs
@@ -744,6 +759,18 @@ def _make_liquid_mesh(vessel: Vessel) -> assets.Mesh:
     )
 
 
+def _compute_liquid_color(values: Values, vessel: Vessel) -> Tensor:
+    """Return the color (3,) of the liquid in a vessel, linear.
+
+    Args:
+        values: values of the control, the proportion of each ingredient among them.
+        vessel: inside of the vessel, whose color is seen through the liquid.
+    """
+    proportions = torch.stack([values[name] for name in INGREDIENTS])
+    vessel_color = torch.from_numpy(vessel.color).to(proportions)
+    return mix_liquid_color(proportions, vessel_color)
+
+
 def _make_liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     """Return the vertices (1 + K, 3) of the liquid's surface, the center first.
 
@@ -764,11 +791,7 @@ def _make_liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
     # The disk sinks as it shrinks. At level 0 it is `SINKING_LEVEL` of the depth below the
     # floor (a little less, as the factor is not 0).
     height = heights[0] + level * depth - (1.0 - shrinkage) * SINKING_LEVEL * depth
-    angle = torch.arange(WALL_DIRECTIONS, device=level.device) * (
-        2.0 * torch.pi / WALL_DIRECTIONS
-    )
-    circle = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
-    rim = circle * (radius * shrinkage)[:, None]
+    rim = _make_unit_circle(level.device) * (radius * shrinkage)[:, None]
     axis = torch.from_numpy(vessel.axis).to(level)
     positions = torch.cat([rim.new_zeros(1, 2), rim]) + axis  # (1 + K, 2)
     return torch.cat([positions, height.expand(len(positions), 1)], dim=1)
@@ -782,3 +805,10 @@ def _interpolate_radius(vessel: Vessel, level: Tensor) -> Tensor:
     row = int(position.detach().clamp(0, len(radii) - 2))
     wall_radius = torch.lerp(radii[row], radii[row + 1], position - row)
     return wall_radius * DISK_RADIUS_FRACTION
+
+
+def _make_unit_circle(device: torch.device) -> Tensor:
+    """Return x and y (K, 2) of the directions in which a vessel's wall is known."""
+    step = 2.0 * torch.pi / WALL_DIRECTIONS
+    angle = torch.arange(WALL_DIRECTIONS, device=device) * step
+    return torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
