@@ -146,13 +146,27 @@ class EnvironmentControl(Control):
                 scene, environment=_load_environment(name), environment_spec=name
             )
         else:
-            # raises if the scene has none
-            environment = scene.require_environment(f"`controls` {self.name}")
-            shows_photograph = scene.photograph is not None or environment.photographed
-            # A photograph shows its own floor instead of the table.
-            if files and not shows_photograph:
-                notes += _describe_table(scene, list(dict.fromkeys(files)))
+            notes += self._list_table_notes(scene, files)
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
+
+    def _list_table_notes(
+        self, scene: SceneDescription, files: Sequence[str]
+    ) -> list[str]:
+        """List the note that the object stands on the scene's table in all environments.
+
+        Args:
+            scene: scene that keeps its environment.
+            files: environment files to choose from; without any, there is no note.
+
+        Raises:
+            InputError: the scene has no environment.
+        """
+        environment = scene.require_environment(f"`controls` {self.name}")
+        shows_photograph = scene.photograph is not None or environment.photographed
+        # A photograph shows its own floor instead of the table.
+        if not files or shows_photograph:
+            return []
+        return _describe_table(scene, list(dict.fromkeys(files)))
 
     def _keeps_environment(
         self, scene: SceneDescription, allowed: Sequence[ParameterValue]

@@ -265,11 +265,9 @@ def _compute_smooth_functions(
     # A symmetric matrix with the same eigenvalues. Its eigenvectors are those functions
     # times the square root of the mass.
     symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
-    # A sparse matrix without negligible entries, for the Lanczos method. Dense solvers
-    # run in many threads, and take ten times as long on a busy machine.
-    matrix = sparse.csr_matrix(
-        np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
-    )
+    # The Lanczos method takes a sparse matrix. Dense solvers run in many threads, and
+    # take ten times as long on a busy machine.
+    matrix = sparse.csr_matrix(_drop_negligible_entries(symmetric))
     # a fixed start, so that the result is deterministic
     first_vector = np.cos(np.arange(len(mass)))
     n_lanczos_vectors = min(len(mass), 4 * (n_functions + 1))
@@ -280,6 +278,11 @@ def _compute_smooth_functions(
     selected = np.argsort(-eigenvalues)[1:]
     functions = _fix_signs(vectors[:, selected]) / np.sqrt(mass)[:, None]
     return functions, eigenvalues[selected]
+
+
+def _drop_negligible_entries(matrix: Float64Array) -> Float64Array:
+    """Return a matrix (N, N) whose entries below 1e-7 of the largest one are 0."""
+    return np.asarray(np.where(matrix > 1e-7 * matrix.max(), matrix, 0.0))
 
 
 def _fix_signs(vectors: Float64Array) -> Float64Array:
@@ -362,15 +365,25 @@ def _combine_without_rotation(
     rotations = _compute_rotation_coefficients(points, functions, mass)
     # (3 S, M) orthonormal basis of the fields without rotation
     basis = linalg.null_space(rotations)
-    # The energy of a field is the sum of energy times weight squared over all weights: a
-    # diagonal quadratic form of the coefficients. Here it is written in the basis.
-    energy_of_coefficient = np.repeat(energy, 3)[:, None]
-    basis_energy = basis.T @ (energy_of_coefficient * basis)
     # Eigenvectors by ascending energy. The first ones are the smoothest fields.
-    _, vectors = linalg.eigh(basis_energy)
+    _, vectors = linalg.eigh(_compute_basis_energy(basis, energy))
     n_fields = min(count, basis.shape[1])
     fields = _fix_signs(basis @ vectors[:, :n_fields])
     return np.asarray(fields.reshape(n_functions, 3, n_fields))
+
+
+def _compute_basis_energy(basis: Float64Array, energy: Float64Array) -> Float64Array:
+    """Return the energy of fields as a quadratic form (M, M) in a basis of fields.
+
+    The energy of a field is the sum of energy times weight squared over all weights: a
+    diagonal quadratic form of the coefficients.
+
+    Args:
+        basis: (3 S, M) coefficients of each field of the basis.
+        energy: (S,) how fast each function varies.
+    """
+    energy_of_coefficient = np.repeat(energy, 3)[:, None]
+    return np.asarray(basis.T @ (energy_of_coefficient * basis))
 
 
 def _compute_rotation_coefficients(
@@ -750,9 +763,8 @@ class GeometryControl(Control):
         self._mesh = self.get_mesh(self.scene).mesh
         welded_mesh = get_welded_mesh(self._mesh)
         self._position_of_vertex = torch.from_numpy(welded_mesh.position_of_vertex)
-        self._limits = DisplacementLimits(
-            welded_mesh, float(self.choice_values["epsilon"])
-        )
+        epsilon = float(self.choice_values["epsilon"])
+        self._limits = DisplacementLimits(welded_mesh, epsilon)
         if self.form == "modes":
             group = self._prepare_modes()
         else:

@@ -334,9 +334,8 @@ def wood(grid: Grid) -> Float64Array:
     rings = 9.0 * (x + bend) + 0.25 * _noise(grid, cells=(5, 2), seed=17)
     late_wood = _paint_late_wood(rings % 1.0)
     bent_grid = (x + 0.6 * bend, y)
-    fibre = _noise(bent_grid, cells=(120, 3), seed=13) + 0.6 * _noise(
-        bent_grid, cells=(240, 5), seed=18
-    )
+    coarse_fibre = _noise(bent_grid, cells=(120, 3), seed=13)
+    fibre = coarse_fibre + 0.6 * _noise(bent_grid, cells=(240, 5), seed=18)
     pores = _step(_noise(bent_grid, cells=(170, 12), seed=14), edge=0.5, soft=0.2)
     shade = _noise(grid, cells=(3, 1), seed=15)
     tone = 0.30 + 0.42 * late_wood + 0.13 * fibre + 0.16 * shade
@@ -502,11 +501,9 @@ def fabric(grid: Grid) -> Float64Array:
     # every second cell, like the fields of a chessboard.
     warp_is_over = (np.floor(thread_x) + np.floor(thread_y)) % 2.0 > 0.5
     height = _compute_thread_height(thread_x, thread_y, warp_is_over)
-    fibres = np.where(
-        warp_is_over,
-        _noise((x, y), cells=(count * 8, count), seed=42),
-        _noise((x, y), cells=(count, count * 8), seed=43),
-    )
+    warp_fibres = _noise((x, y), cells=(count * 8, count), seed=42)
+    weft_fibres = _noise((x, y), cells=(count, count * 8), seed=43)
+    fibres = np.where(warp_is_over, warp_fibres, weft_fibres)
     generator = np.random.Generator(np.random.PCG64(44))
     warp = _color("b9a77f") * _draw_thread_tones(generator, thread_x, count)
     weft = _color("3f5f86") * _draw_thread_tones(generator, thread_y, count)
@@ -608,6 +605,25 @@ def _draw_rosettes(
     turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
     radius = distance / size
     angle = _compute_angles(grid, points[index])
+    ring = _draw_broken_rings(radius, angle, turn)
+    # The core reaches below the ring, and is visible in its gaps.
+    core = 1.0 - _step(radius, edge=0.042, soft=0.02)
+    return ring, core
+
+
+def _draw_broken_rings(
+    radius: Float64Array, angle: Float64Array, turn: Float64Array
+) -> Float64Array:
+    """Return the opacity (SIDE, SIDE), from 0 to 1, of rings with gaps.
+
+    All arguments are (SIDE, SIDE), a value for each texel.
+
+    Args:
+        radius: distance from the center of its ring, in tiles, divided by the ring's
+            size.
+        angle: direction from that center, radians.
+        turn: angle by which its ring is turned, radians.
+    """
     # A ring is between two edges. The outer one is not quite a circle.
     beyond_inner_edge = _step(radius, edge=0.031, soft=0.008)
     outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
@@ -616,9 +632,7 @@ def _draw_rosettes(
     # It has gaps at the angles where the waves are low.
     waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
     opacity_at_angle = _step(waves, edge=-0.75, soft=0.5)
-    # The core reaches below the ring, and is visible in its gaps.
-    core = 1.0 - _step(radius, edge=0.042, soft=0.02)
-    return ring * opacity_at_angle, core
+    return ring * opacity_at_angle
 
 
 def _compute_angles(grid: Grid, points: Float64Array) -> Float64Array:
@@ -666,15 +680,28 @@ def rust(grid: Grid) -> Float64Array:
     paint = _color("5d6668") + 0.05 * paint_grain[..., None]
     finely_warped = _warp_grid(warped, cells=16, amount=0.015, seed=75)
     flakes = _clouds(finely_warped, cells=(4, 4), octaves=4, seed=76)
+    surface = _cover_with_flakes(oxide, paint, flakes)
+    pits = _step(_noise(grid, cells=(70, 70), seed=77), edge=0.5, soft=0.15)
+    return _mix(surface, _color("1b0d09"), 0.6 * pits)
+
+
+def _cover_with_flakes(
+    oxide: Float64Array, paint: Float64Array, flakes: Float64Array
+) -> Float64Array:
+    """Return oxide under flakes of paint that have dark rims, (SIDE, SIDE, 3) sRGB.
+
+    Args:
+        oxide: (SIDE, SIDE, 3) sRGB color of the oxide.
+        paint: (SIDE, SIDE, 3) sRGB color of the paint.
+        flakes: (SIDE, SIDE) noise; paint is left where it is high.
+    """
     # The remaining paint, and a dark rim around it: a slightly larger area without the
     # paint itself.
     paint_left = _step(flakes, edge=0.26, soft=0.05)
     paint_and_rim = _step(flakes, edge=0.20, soft=0.10)
     rim = paint_and_rim - paint_left
     rimmed_oxide = _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0))
-    surface = _mix(rimmed_oxide, paint, 0.85 * paint_left)
-    pits = _step(_noise(grid, cells=(70, 70), seed=77), edge=0.5, soft=0.15)
-    return _mix(surface, _color("1b0d09"), 0.6 * pits)
+    return _mix(rimmed_oxide, paint, 0.85 * paint_left)
 
 
 def _paint_oxide(grid: Grid, warped: Grid) -> Float64Array:
@@ -773,11 +800,9 @@ def elephant(grid: Grid) -> Float64Array:
     fold_grid = _warp_grid(grid, cells=5, amount=0.04, seed=95)
     waves = _clouds(fold_grid, cells=(3, 14), octaves=3, seed=96)
     folds += 0.55 * np.exp(-((np.abs(waves) / 0.035) ** 2))
-    tone = (
-        0.55
-        + 0.25 * _clouds(warped, cells=(3, 3), octaves=3, seed=97)
-        + 0.16 * _clouds(grid, cells=(60, 60), octaves=2, seed=98)
-    )
+    patches = _clouds(warped, cells=(3, 3), octaves=3, seed=97)
+    grains = _clouds(grid, cells=(60, 60), octaves=2, seed=98)
+    tone = 0.55 + 0.25 * patches + 0.16 * grains
     hide = _ramp(tone, "5f5850", "7d756c", "958d84", "a9a29a")
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
 

@@ -128,14 +128,14 @@ def blur_along_line(
     # (count,) distance of each weight from the pixel, in reference pixels
     distance = torch.arange(count, device=image.device) / step
     weights = _compute_line_weights(distance, radius, sigma)
-    height, width = image.shape[:2]
     # enough on all four sides for lines in any direction
     padded = F.pad(images.to_planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
+    height, width = image.shape[:2]
     for index, weight in enumerate(weights):
+        # the image as it is `index` pixels further along the line
         top = count + round(index * math.sin(angle))
         left = count + round(index * math.cos(angle))
-        # the image as it is `index` pixels further along the line
         shifted = padded[:, :, top : top + height, left : left + width]
         total = total + weight * images.to_image(shifted)
     return total
@@ -418,6 +418,22 @@ def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tens
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
     rows, columns = compute_reference_size(height, width)
+    origins = _shuffle_pixels(rows, columns, seed, severity)
+    shift = _compute_shifts(torch.tensor(origins), columns)
+    shift = shift.view(1, 2, rows, columns).float()
+    # Shifts are repeated, not interpolated, so that pixels stay scattered.
+    return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
+
+
+def _shuffle_pixels(rows: int, columns: int, seed: int, severity: int) -> list[int]:
+    """Return the index of the pixel that frosted glass shows at each pixel.
+
+    Args:
+        rows: height of the reference image.
+        columns: its width; pixels are numbered row by row.
+        seed: seed of the neighbors.
+        severity: 1 to 5.
+    """
     # The first number is the standard deviation of the blur, which `glass_blur` uses.
     reach = int(GLASS[severity - 1][1])
     n_passes = int(GLASS[severity - 1][2])
@@ -430,10 +446,7 @@ def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tens
         # as steps between indices of the flattened image
         to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
         _take_over_origins(origins, to_neighbor, rows, columns, reach)
-    shift = _compute_shifts(torch.tensor(origins), columns)
-    shift = shift.view(1, 2, rows, columns).float()
-    # Shifts are repeated, not interpolated, so that pixels stay scattered.
-    return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
+    return origins
 
 
 def _take_over_origins(
