@@ -278,22 +278,36 @@ def merge_control_settings(
     """
     by_control: dict[str, dict[str, object]] = {}
     for name, control_settings in check_control_settings(settings).items():
-        before_dot, dot, after_dot = name.partition(".")
-        kind = before_dot.partition(":")[0]
-        # In "package.module:Class" the dot is that of a module, whose package is no
-        # kind of control.
-        has_parameter = dot != "" and kind in CONTROLS
-        if not has_parameter:
-            by_control.setdefault(name, {}).update(control_settings)
-            continue
-        # Both "pose.yaw:chair" and "pose:chair.yaw" become "pose:chair" and "yaw".
-        parameter, colon, instance = after_dot.partition(":")
-        control_name = before_dot + colon + instance
-        default_range = _get_default_range(CONTROLS[kind], parameter)
-        # A range in the settings replaces the default range.
-        new_settings = {parameter: default_range, **control_settings}
+        control_name, new_settings = _move_parameter(name, control_settings)
         by_control.setdefault(control_name, {}).update(new_settings)
     return by_control
+
+
+def _move_parameter(
+    name: str, settings: Mapping[str, object]
+) -> tuple[str, Mapping[str, object]]:
+    """Move the parameter in the name of a control, if it has one, to its settings.
+
+    Args:
+        name: name such as "pose:chair.yaw", "pose.yaw:chair" or "pose:chair".
+        settings: settings of the control, which may state a range of that parameter.
+
+    Returns:
+        The name without the parameter, e.g. "pose:chair". And the settings, with the
+        default range of the parameter if they had no other.
+    """
+    before_dot, dot, after_dot = name.partition(".")
+    kind = before_dot.partition(":")[0]
+    # In "package.module:Class" the dot is that of a module, whose package is no
+    # kind of control.
+    has_parameter = dot != "" and kind in CONTROLS
+    if not has_parameter:
+        return name, settings
+    # Both "pose.yaw:chair" and "pose:chair.yaw" become "pose:chair" and "yaw".
+    parameter, colon, instance = after_dot.partition(":")
+    default_range = _get_default_range(CONTROLS[kind], parameter)
+    # A range in the settings replaces the default range.
+    return before_dot + colon + instance, {parameter: default_range, **settings}
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
@@ -372,21 +386,32 @@ def compose_space(controls: Sequence[Control], scene: SceneDescription) -> Space
             replaces a value that the user set.
     """
     _check_controls(controls, scene)
-    described_scene = scene
-    adjusted = list[AdjustedDefault]()
-    for control in controls:
-        prepared = control.prepare(scene)
-        adjusted += find_replaced_defaults(control.name, scene, prepared)
-        scene = prepared
-    _check_meshes_exist(controls, scene)
-    bound = tuple(control.bind(scene) for control in controls)
+    prepared, adjusted = _prepare_scene(controls, scene)
+    _check_meshes_exist(controls, prepared)
+    bound = tuple(control.bind(prepared) for control in controls)
     for control in bound:
         adjusted += control.adjusted_defaults
     # The adjustments by `prepare` come first, then those by `bind`: sort them by control.
     names = [control.name for control in controls]
     adjusted.sort(key=lambda default: names.index(default.control_name))
-    environment_name = _find_new_environment(described_scene, scene, adjusted)
-    return Space(bound, scene, tuple(adjusted), environment_name)
+    environment_name = _find_new_environment(scene, prepared, adjusted)
+    return Space(bound, prepared, tuple(adjusted), environment_name)
+
+
+def _prepare_scene(
+    controls: Sequence[Control], scene: SceneDescription
+) -> tuple[SceneDescription, list[AdjustedDefault]]:
+    """Let controls prepare a scene, one after the other.
+
+    Returns:
+        The prepared scene, and the default values of the scene that controls replace.
+    """
+    adjusted = list[AdjustedDefault]()
+    for control in controls:
+        prepared = control.prepare(scene)
+        adjusted += find_replaced_defaults(control.name, scene, prepared)
+        scene = prepared
+    return scene, adjusted
 
 
 def _check_meshes_exist(controls: Sequence[Control], scene: SceneDescription) -> None:

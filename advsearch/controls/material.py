@@ -632,7 +632,7 @@ def _draw_broken_rings(
     # It has gaps at the angles where the waves are low.
     waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
     opacity_at_angle = _step(waves, edge=-0.75, soft=0.5)
-    return ring * opacity_at_angle
+    return np.asarray(ring * opacity_at_angle)
 
 
 def _compute_angles(grid: Grid, points: Float64Array) -> Float64Array:

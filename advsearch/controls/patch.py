@@ -490,9 +490,8 @@ class PatchPainter:
         self._start_values = start_values
         self._side = side
         self._surface = images.MeshSurface(mesh)
-        object_color = color.srgb_to_linear(
-            torch.from_numpy(scene.object.base_color.copy())
-        )
+        srgb_color = torch.from_numpy(scene.object.base_color.copy())
+        object_color = color.srgb_to_linear(srgb_color)
         # (n, n) faces, positions, normals and areas of the map's texels
         charts = _rasterise_finely(
             mesh,

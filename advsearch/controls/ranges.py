@@ -498,6 +498,14 @@ def _check_value(label: str, parameter: Parameter, value: object) -> ParameterVa
     # a name without a list of options, such as a file
     if parameter.unit == "name" and isinstance(value, str) and value.strip():
         return value
+    return _check_bounded_number(label, parameter, value)
+
+
+def _check_bounded_number(label: str, parameter: Parameter, value: object) -> float:
+    """Return a value as a float; raise InputError if it is no number within the bounds.
+
+    The arguments are those of `_check_value`.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(
             f"{label}: expected a number in {parameter.unit}, got {value!r}"
@@ -769,15 +777,8 @@ def _freeze_distribution(
     """
     family = _find_distribution_family(where, name)
     text = f"{name}({_format_arguments(arguments)})"
-    frozen = None
-    is_valid = False
-    if all(map(Parameter.is_number, arguments.values())):
-        with suppress(TypeError):  # it has no such arguments, or lacks one
-            frozen = family(**arguments)
-            # scipy returns NaN for quantiles if an argument is out of its range
-            median = frozen.ppf(0.5)
-            is_valid = bool(np.isfinite(median))
-    if not is_valid:
+    frozen = _apply_arguments(family, arguments)
+    if frozen is None:
         # `family.shapes` are the names of its arguments besides loc and scale, e.g. "a, b"
         shapes = f"{family.shapes}, " if family.shapes else ""
         raise InputError(
@@ -785,6 +786,24 @@ def _freeze_distribution(
             f"{shapes}loc, scale, got {text}"
         )
     return frozen, text
+
+
+def _apply_arguments(family: Any, arguments: Mapping[str, Any]) -> Any:
+    """Return a distribution of scipy with its arguments; None if it can't have them.
+
+    Args:
+        family: the distribution without arguments, such as scipy.stats.norm.
+        arguments: its arguments by name, such as loc and scale.
+    """
+    if not all(map(Parameter.is_number, arguments.values())):
+        return None
+    with suppress(TypeError):  # it has no such arguments, or lacks one
+        frozen = family(**arguments)
+        # scipy returns NaN for quantiles if an argument is out of its range
+        median = frozen.ppf(0.5)
+        if bool(np.isfinite(median)):
+            return frozen
+    return None
 
 
 def _find_distribution_family(where: str, name: object) -> Any:
@@ -876,6 +895,14 @@ def _check_quantiles(
             f"({parameter.unit}) of {name}, got "
             f"{values[~is_inside][0]:g}"
         )
+    _check_rises(label, name, values)
+
+
+def _check_rises(label: str, name: str, values: NDArray[np.float64]) -> None:
+    """Raise InputError if a value of an inverse CDF is below the one before it.
+
+    The arguments are those of `_check_quantiles`.
+    """
     falls = np.diff(values) < 0.0
     if falls.any():
         index = int(falls.argmax())

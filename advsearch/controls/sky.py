@@ -216,13 +216,9 @@ class Sky:
         angle = compute_angles(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
         glow = _compute_glow(h, cosine)
-        around_sun = (
-            c
-            + d * torch.exp(e * angle)
-            + f * cosine**2
-            + g * glow
-            + i * self.cosines.sqrt()
-        )
+        peak = d * torch.exp(e * angle)
+        zenith = i * self.cosines.sqrt()
+        around_sun = c + peak + f * cosine**2 + g * glow + zenith
         return (horizon * around_sun * level).clamp_min(0.0)
 
     def _interpolate(
@@ -290,16 +286,24 @@ class Sky:
         upper = dome + disk
         # (H, W, 3) irradiance by each texel on a surface that faces the texel
         texel_irradiance = upper * self.solid_angles
-        ground_irradiance = (texel_irradiance * self.cosines).sum((0, 1))
-        # The ground is diffuse: its radiance is the same in all directions.
-        ground_radiance = self.ground * ground_irradiance / math.pi
-        n_lower_rows = MAP_ROWS - MAP_ROWS // 2
-        lower = ground_radiance.expand(n_lower_rows, MAP_COLUMNS, 3)
-        radiance = torch.cat([upper, lower])
+        radiance = torch.cat([upper, self._compute_lower_half(texel_irradiance)])
         # The same for a surface that faces the sun, instead of the ground.
         cosines_to_sun = (self.directions @ sun).clamp_min(0.0)[..., None]
         irradiance = (texel_irradiance * cosines_to_sun).sum() / 3.0  # mean of channels
         return radiance, irradiance
+
+    def _compute_lower_half(self, texel_irradiance: Tensor) -> Tensor:
+        """Return the radiance of the ground, the lower half of the map.
+
+        Args:
+            texel_irradiance: (H, W, 3) irradiance by each texel of the upper half on a
+                surface that faces the texel.
+        """
+        ground_irradiance = (texel_irradiance * self.cosines).sum((0, 1))
+        # The ground is diffuse: its radiance is the same in all directions.
+        ground_radiance = self.ground * ground_irradiance / math.pi
+        n_lower_rows = MAP_ROWS - MAP_ROWS // 2
+        return ground_radiance.expand(n_lower_rows, MAP_COLUMNS, 3)
 
 
 def _make_texel_angles(device: torch.device) -> tuple[Tensor, Tensor]:

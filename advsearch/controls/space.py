@@ -83,13 +83,13 @@ class Space:
         one is chosen later. The estimator "material" is removed if the scene does not
         support it.
         """
-        lacks_material_form = not self._has_material_form()
+        has_material_form = self._has_material_form()
         groups = []
         begin = 0
         for control in self.controls:
             for group in control.groups:
                 valid = group.valid
-                if lacks_material_form:
+                if not has_material_form:
                     valid = tuple(name for name in valid if name != "material")
                 # A control does not know where its coordinates begin in u.
                 positioned_group = replace(

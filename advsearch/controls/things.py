@@ -320,9 +320,7 @@ class ThingsControl(Control):
             # index of the option: 0 for "there", 1 for "away"
             is_present = float(values[f"{name}.presence"]) == 0.0
             if is_present:
-                obstacles.append(
-                    parts.Footprint(outline, footprint.lower, footprint.upper)
-                )
+                obstacles.append(footprint._replace(outline=outline))
         return stands
 
     def _list_obstacles(
@@ -417,9 +415,7 @@ class ThingsControl(Control):
         direction = _normalize(requested - object_center)
         push_distance = 0.0
         if not is_absent:
-            footprint = parts.Footprint(
-                outline + requested, initial_footprint.lower, initial_footprint.upper
-            )
+            footprint = initial_footprint._replace(outline=outline + requested)
             gap = MIN_GAP / scene.size_in_metres
             push_distance = _find_free_shift(
                 footprint, direction, obstacles, solids, gap

@@ -322,7 +322,10 @@ class OcclusionControl(Control):
         mesh = _load_asset(self._select_option(values)).mesh
         points = _turn_vertices(mesh, requested["turn"])
         size, distance = _fit_occluder(
-            points, requested["size"], requested_distance, view.nearest_distance
+            points,
+            size=requested["size"],
+            distance=requested_distance,
+            nearest_distance=view.nearest_distance,
         )
         placement = _make_hidden_placement(size, distance)
         points_facing_camera = _to_facing_camera(points, size, distance)
@@ -491,7 +494,7 @@ def _view_through_lens(
     if "camera.lens" in earlier_inputs:
         model = model.with_intrinsics(earlier_inputs["camera.lens"].detach().cpu())
     directions_of_image = _spread_directions(
-        model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
+        model, across=(0.0, 1.0), down=(0.0, 1.0), count=silhouettes.DIRECTION_GRID
     )
     return _make_object_view(
         points,
@@ -630,17 +633,26 @@ def _spread_directions(
         down: upper and lower bound of the part, as fractions of the height.
         count: number of rows, and of columns, of the grid.
     """
-    row, column = np.divmod(np.arange(count * count), count)
-    index = np.arange(count * count)
-    # 1 / g and 1 / g^2 of the plastic number g (Roberts 2018)
-    x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
-    y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
-    x = across[0] + x_in_cells / count * (across[1] - across[0])
-    y = down[0] + y_in_cells / count * (down[1] - down[0])
+    x_fraction, y_fraction = _spread_over_cells(count)
+    x = across[0] + x_fraction * (across[1] - across[0])
+    y = down[0] + y_fraction * (down[1] - down[0])
     directions, inside = model.compute_rays(torch.from_numpy(np.stack([x, y], axis=1)))
     # from y downwards to y upwards
     visible = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
     return np.asarray(visible / np.linalg.norm(visible, axis=1, keepdims=True))
+
+
+def _spread_over_cells(count: int) -> tuple[assets.Float64Array, assets.Float64Array]:
+    """Return x and y (count * count,), from 0 to 1, of a point in each cell of a grid.
+
+    Positions in the cells are from a low-discrepancy sequence (Roberts 2018): multiples
+    of 1 / g and 1 / g^2 modulo 1, where g is the plastic number.
+    """
+    index = np.arange(count * count)
+    row, column = np.divmod(index, count)
+    x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
+    y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
+    return x_in_cells / count, y_in_cells / count
 
 
 def _get_array(

@@ -76,12 +76,7 @@ class Silhouette:
                 all of the same shape. They need not have length 1.
         """
         height, width = self.mask.shape
-        window = self.window
-        # The limit only avoids a division by 0: `is_inside` excludes directions that do
-        # not point forwards.
-        depth = np.maximum(forwards, geometry.MIN_DEPTH)
-        x_fraction = (x / depth - window.left) / (window.right - window.left)
-        y_fraction = (y / depth - window.low) / (window.high - window.low)
+        x_fraction, y_fraction = self._find_position_in_window(x, y, forwards)
         column = np.floor(x_fraction * width)
         row = np.floor(y_fraction * height)
         is_in_row = (column >= 0) & (column < width)
@@ -90,6 +85,25 @@ class Silhouette:
         column = np.where(is_inside, column, 0).astype(np.int64)
         row = np.where(is_inside, row, 0).astype(np.int64)
         return np.asarray(is_inside & self.mask[row, column])
+
+    def _find_position_in_window(
+        self,
+        x: assets.Float64Array,
+        y: assets.Float64Array,
+        forwards: assets.Float64Array,
+    ) -> tuple[assets.Float64Array, assets.Float64Array]:
+        """Return x and y of directions in the window, from 0 (left, below) to 1.
+
+        The arguments are those of `contains`. Directions behind the camera get numbers
+        without a meaning.
+        """
+        window = self.window
+        # The limit only avoids a division by 0: `contains` excludes directions that do not
+        # point forwards.
+        depth = np.maximum(forwards, geometry.MIN_DEPTH)
+        x_fraction = (x / depth - window.left) / (window.right - window.left)
+        y_fraction = (y / depth - window.low) / (window.high - window.low)
+        return x_fraction, y_fraction
 
 
 def rasterise_silhouette(

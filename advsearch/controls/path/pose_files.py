@@ -145,8 +145,7 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
             quaternions do not have the length 1, matrices are no rotations, or the
             columns of the table are unknown.
     """
-    lines = [line.strip() for line in text.splitlines()]
-    lines = [line for line in lines if line]
+    lines = _list_filled_lines(text)
     first_row = next((index for index, line in enumerate(lines) if _is_row(line)), None)
     if first_row is None:
         return None
@@ -162,6 +161,12 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if headers:
         return _read_named_columns(path, headers[-1], rows, has_commas)
     return _read_unnamed_columns(path, rows, has_commas)
+
+
+def _list_filled_lines(text: str) -> list[str]:
+    """Return the lines of a text that are not blank, without space around them."""
+    lines = [line.strip() for line in text.splitlines()]
+    return [line for line in lines if line]
 
 
 def _is_other_table(candidates: Sequence[Sequence[str]], has_commas: bool) -> bool:
@@ -207,11 +212,16 @@ def _read_unnamed_columns(
         return _read_named_columns(path, names, rows, False)
     if count == 12:
         return _read_kitti(path, rows)
+    raise _make_column_count_error(path, count)
+
+
+def _make_column_count_error(path: Path, count: int) -> errors.FileFormatError:
+    """Return the error for a table of poses without a header, with `count` columns."""
     hint = ""
     # a matrix of 12 or 16 numbers after the index of an image
     if count in (13, 17):
         hint = " (KITTI-360's first column is the index of a picture; leave it out)"
-    raise errors.FileFormatError(
+    return errors.FileFormatError(
         f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, "
         "or 12 as KITTI's poses, got "
         f"{count}{hint}"

@@ -281,17 +281,21 @@ class ProjectorControl(PictureControl):
         if fov is None:
             fov = self._compute_covering_fov(scene, aspect=columns / rows)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
+        scene = replace(scene, remarks=(*scene.remarks, *self._list_unit_notes(scene)))
+        return scene.with_part(part)
+
+    def _list_unit_notes(self, scene: SceneDescription) -> list[str]:
+        """List the note that the brightness of a scene's environment has no unit."""
         # With candelas per unit of radiance, light in the scene can be converted to lux.
         has_unit = (
             scene.environment is not None and scene.environment.candelas is not None
         )
-        if not has_unit and "ambient" not in self.specs:
-            note = (
-                "The environment's brightness has no unit: its light is taken as "
-                f"{DEFAULT_AMBIENT_LUX:g} lux, unless {self.name}.ambient is set."
-            )
-            scene = replace(scene, remarks=(*scene.remarks, note))
-        return scene.with_part(part)
+        if has_unit or "ambient" in self.specs:
+            return []
+        return [
+            "The environment's brightness has no unit: its light is taken as "
+            f"{DEFAULT_AMBIENT_LUX:g} lux, unless {self.name}.ambient is set."
+        ]
 
     def _find_sides(self) -> tuple[int, int]:
         """Return the rows and columns of texels of the projected image."""
@@ -348,11 +352,13 @@ class ProjectorControl(PictureControl):
         camera_position = geometry.camera_to_world(scene)[:3, 3]
         camera_offset = camera_position - geometry.compute_center(scene)
         camera_distance = float(np.linalg.norm(camera_offset))
+        x, y, z = camera_offset
         if parameter.name == "azimuth":
-            azimuth = math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
+            azimuth = math.degrees(math.atan2(y, x))
             return replace(parameter, default=azimuth + DEFAULT_CAMERA_ANGLE)
         if parameter.name == "elevation":
-            elevation = math.degrees(math.asin(camera_offset[2] / camera_distance))
+            elevation = math.degrees(math.asin(z / camera_distance))
+            # Straight above or below the object, the azimuth would have no meaning.
             return replace(parameter, default=min(max(elevation, -89.0), 89.0))
         has_metres = scene.object.size_in_metres is not None
         return replace(
@@ -483,18 +489,22 @@ class ProjectorControl(PictureControl):
         The light is 0 while a flickering projector is off. It is in the scene's unit of
         radiance, at a distance of one scene unit from the projector.
         """
+        pose = self._compute_pose_from_values(values)
+        light = self.compute_projected_image(values)
+        if self._flashes_off(values):
+            light = 0.0 * light  # still depends on the pattern, for its derivative
+        white = self._compute_white_radiance(values)
+        return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
+
+    def _compute_pose_from_values(self, values: Values) -> Tensor:
+        """Return the pose (4, 4) of the projector, a copy without derivatives."""
         pose = make_projector_pose(
             self.scene,
             float(values["azimuth"].detach()),
             float(values["elevation"].detach()),
             float(values["distance"].detach()),
         )
-        pose = pose.to(values["distance"], copy=True)
-        light = self.compute_projected_image(values)
-        if self._flashes_off(values):
-            light = 0.0 * light  # still depends on the pattern, for its derivative
-        white = self._compute_white_radiance(values)
-        return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
+        return pose.to(values["distance"], copy=True)
 
     def _compute_white_radiance(self, values: Values) -> Tensor:
         """Return the radiance () of a white texel, in the scene's unit.
