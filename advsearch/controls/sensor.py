@@ -152,11 +152,21 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
     balanced = _balance_white(light, values)
     display = color.linear_to_srgb(balanced.clamp(0.0, 1.0))
-    compression = round(float(values["compression"].detach()))
-    if compression == 0:
-        return display
-    jpeg_quality = 100 - compression  # 5 to 99, as the compression is 1 to 95 here
-    return images.compress_jpeg(display, jpeg_quality).clamp(0.0, 1.0)
+    return _compress_as_jpeg(display, values["compression"])
+
+
+def _compress_as_jpeg(image: Tensor, compression: Tensor) -> Tensor:
+    """Return an image (H, W, 3) after JPEG compression, in [0, 1].
+
+    Args:
+        image: sRGB in [0, 1].
+        compression: () from 0, for no compression, to 95; it is rounded.
+    """
+    rounded = round(float(compression.detach()))
+    if rounded == 0:
+        return image
+    jpeg_quality = 100 - rounded  # 5 to 99, as the compression is 1 to 95 here
+    return images.compress_jpeg(image, jpeg_quality).clamp(0.0, 1.0)
 
 
 def _balance_white(light: Tensor, values: Mapping[str, Tensor]) -> Tensor:

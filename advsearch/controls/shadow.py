@@ -264,16 +264,23 @@ class ShadowControl(Control):
         camera_pose = geometry.get_camera_pose(self.scene, earlier_inputs)
         camera = camera_pose.detach().double().cpu().numpy()
         cone_angle = self._compute_image_cone_angle(earlier_inputs)
-        max_distance = self._compute_max_distance()
-        for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
-            # From some factor on, this is always the largest distance.
-            distance = min(requested * factor, max_distance)
+        for distance in self._list_distances(requested):
             card = geometry.compute_center(self.scene) + distance * outwards + offset
             # components along the camera's axes, the columns of its pose
             in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
             if _is_outside_cone(in_camera, radius=size, angle=cone_angle):
                 return float(distance)
         return None
+
+    def _list_distances(self, requested: float) -> list[float]:
+        """List the distances of the card to try, ascending, in object sizes.
+
+        They begin at the requested one. From some factor on, each is the largest
+        distance.
+        """
+        max_distance = self._compute_max_distance()
+        factors = np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES)
+        return [min(requested * factor, max_distance) for factor in factors]
 
     def _compute_max_distance(self) -> float:
         """Return the distance up to which the card stays nearer than the lamp."""

@@ -252,10 +252,9 @@ class TextureControl(Control):
         names = self.list_materials(self.scene)  # None for all of them
         self._original = self._resample_original(part, names)
         shape = (self._original.shape[0], self._original.shape[1])
-        if names is None:
-            self._painted_mask = None  # all texels
-            mask = torch.ones(shape, dtype=torch.bool)
-        else:
+        self._painted_mask = None
+        mask = torch.ones(shape, dtype=torch.bool)  # all texels
+        if names is not None:
             mask = torch.from_numpy(self._find_painted_texels(part, names, shape))
             self._painted_mask = mask
         self._mesh_name = part.name

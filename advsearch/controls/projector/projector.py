@@ -358,7 +358,7 @@ class ProjectorControl(PictureControl):
             return replace(parameter, default=azimuth + DEFAULT_CAMERA_ANGLE)
         if parameter.name == "elevation":
             elevation = math.degrees(math.asin(z / camera_distance))
-            # Straight above or below the object, the azimuth would have no meaning.
+            # within the bounds of the parameter
             return replace(parameter, default=min(max(elevation, -89.0), 89.0))
         has_metres = scene.object.size_in_metres is not None
         return replace(
