@@ -379,9 +379,7 @@ class CameraControl(Control):
             earlier_inputs: inputs of earlier controls, which are not used.
         """
         scene = self.scene
-        fov = values["fov"]
-        if "focal_length" in self.specs:
-            fov = _compute_fov(values["focal_length"])
+        fov = self._select_fov(values)
         distance = self._compute_distance(values, fov)
         inputs = {"camera.to_world": self._compute_pose(values, distance)}
         inputs |= self._compute_lens_inputs(values, fov)
@@ -394,6 +392,12 @@ class CameraControl(Control):
             scene_exposure = scene.get_number("camera.exposure")
             inputs["camera.exposure"] = values["exposure"] - scene_exposure
         return inputs
+
+    def _select_fov(self, values: Values) -> Tensor:
+        """Return the field of view () in degrees, that of the focal length if it is set."""
+        if "focal_length" in self.specs:
+            return _compute_fov(values["focal_length"])
+        return values["fov"]
 
     def _compute_lens_inputs(self, values: Values, fov: Tensor) -> dict[str, Tensor]:
         """Return the numbers of the camera model, or without one the field of view."""

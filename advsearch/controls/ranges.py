@@ -703,6 +703,27 @@ def parse_distribution(
         raise _make_lost_function_error(label, setting)
     arguments = {key: value for key, value in setting.items() if key != DISTRIBUTION}
     frozen, text = _freeze_distribution(label, name, arguments)
+    lower_probability, upper_probability = _find_range_probabilities(
+        label, parameter, frozen, text
+    )
+    return _make_range(label, frozen.ppf, lower_probability, upper_probability, text)
+
+
+def _find_range_probabilities(
+    label: str, parameter: Parameter, frozen: Any, text: str
+) -> tuple[float, float]:
+    """Return the cumulative probabilities between which a distribution is searched.
+
+    Args:
+        label: name of the parameter in messages.
+        parameter: states the bounds, at which the distribution is cut off.
+        frozen: the distribution of scipy with its arguments.
+        text: the distribution as messages write it, e.g. "norm(loc=20, scale=5)".
+
+    Raises:
+        InputError: a larger probability than `MAX_OUTSIDE_PROBABILITY` lies outside of
+            the bounds.
+    """
     with np.errstate(all="ignore"):  # far out in the tails, some formulas overflow
         # Probabilities below each bound. The bounds themselves have the probability 0, as
         # the distribution is continuous.
@@ -713,9 +734,10 @@ def parse_distribution(
         min_probability, max_probability = _find_cut_offs(frozen.ppf)
     if outside > MAX_OUTSIDE_PROBABILITY:
         raise _make_outside_error(label, parameter, text, outside)
-    lower_probability = max(lower_probability, min_probability)
-    upper_probability = min(upper_probability, max_probability)
-    return _make_range(label, frozen.ppf, lower_probability, upper_probability, text)
+    return (
+        max(lower_probability, min_probability),
+        min(upper_probability, max_probability),
+    )
 
 
 def _make_lost_function_error(label: str, setting: Mapping[str, object]) -> InputError:

@@ -316,25 +316,42 @@ class OcclusionControl(Control):
         requested = {name: float(value.detach()) for name, value in values.items()}
         view = _ObjectView.from_scene(self.scene, earlier_inputs)
         # "distance" is a fraction of the distance from the camera to the object
-        requested_distance = requested["distance"] * view.center_distance
+        requested["distance"] *= view.center_distance
         if view.directions is None or requested["coverage"] <= 0.0:
-            return _make_hidden_placement(requested["size"], requested_distance)
+            return _make_hidden_placement(requested["size"], requested["distance"])
         mesh = _load_asset(self._select_option(values)).mesh
-        points = _turn_vertices(mesh, requested["turn"])
-        size, distance = _fit_occluder(
-            points,
-            size=requested["size"],
-            distance=requested_distance,
-            nearest_distance=view.nearest_distance,
-        )
-        placement = _make_hidden_placement(size, distance)
-        points_facing_camera = _to_facing_camera(points, size, distance)
-        silhouette = silhouettes.rasterise_silhouette(points_facing_camera, mesh.faces)
-        if silhouette is None:
-            return placement
-        passage = _make_passage(view.directions, silhouette, requested["direction"])
-        angle = _find_covering_angle(view, passage, requested["coverage"])
-        return _move_into_view(placement, passage, angle)
+        return _place_occluder(mesh, requested, view, view.directions)
+
+
+def _place_occluder(
+    mesh: assets.Mesh,
+    requested: Mapping[str, float],
+    view: _ObjectView,
+    directions: assets.Float64Array,
+) -> Placement:
+    """Return the placement at which an occluder hides a fraction of the object.
+
+    It is out of sight if the occluder has no silhouette.
+
+    Args:
+        mesh: mesh of the occluder.
+        requested: values of the control, by parameter; the distance is that from the
+            camera, in object sizes.
+        view: the object as the camera sees it.
+        directions: (N, 3) directions in which the object is visible.
+    """
+    points = _turn_vertices(mesh, requested["turn"])
+    size, distance = _fit_occluder(
+        points, requested["size"], requested["distance"], view.nearest_distance
+    )
+    placement = _make_hidden_placement(size, distance)
+    points_facing_camera = _to_facing_camera(points, size, distance)
+    silhouette = silhouettes.rasterise_silhouette(points_facing_camera, mesh.faces)
+    if silhouette is None:
+        return placement
+    passage = _make_passage(directions, silhouette, requested["direction"])
+    angle = _find_covering_angle(view, passage, requested["coverage"])
+    return _move_into_view(placement, passage, angle)
 
 
 def _turn_vertices(mesh: assets.Mesh, degrees: float) -> assets.Float64Array:
