@@ -591,11 +591,9 @@ class PatchPainter:
             height: height from 0 (middle of the underside) to 1 (middle of the top).
             size: side of the patch, object sizes.
         """
-        center, radius, half_height = self._center_and_sizes
+        _, radius, half_height = self._center_and_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
-        # far enough away to be outside of the object
-        ray_origin = center + 4.0 * (radius + half_height) * outwards
-        face, point = self._surface.find_hit(ray_origin, -outwards)
+        face, point = self._find_patch_center(outwards)
         sign = self._find_side(face, outwards)
         mean_normal = self._compute_mean_normal(face, point)
         # rows right, up and outwards of the patch
@@ -605,11 +603,24 @@ class PatchPainter:
             self._positions[rows] - point, sign * self._normals[rows], frame
         )
         return NearbyTexels(
-            torch.from_numpy(self._texels[rows]),
-            torch.from_numpy(coordinates.astype(np.float32)),
-            _fade_in(cosine),
-            self._measure_texel_spacing(rows),
+            indices=torch.from_numpy(self._texels[rows]),
+            coordinates=torch.from_numpy(coordinates.astype(np.float32)),
+            opacity=_fade_in(cosine),
+            spacing=self._measure_texel_spacing(rows),
         )
+
+    def _find_patch_center(
+        self, outwards: assets.Float64Array
+    ) -> tuple[int, assets.Float64Array]:
+        """Return the face that a ray towards the object's center meets, and the point (3,).
+
+        Args:
+            outwards: (3,) unit direction from the center, from which the ray comes.
+        """
+        center, radius, half_height = self._center_and_sizes
+        # far enough away to be outside of the object
+        ray_origin = center + 4.0 * (radius + half_height) * outwards
+        return self._surface.find_hit(ray_origin, -outwards)
 
     def _find_side(self, face: int, outwards: assets.Float64Array) -> float:
         """Return 1 for a patch on the front of a face, and -1 for one on its back.

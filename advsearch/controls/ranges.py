@@ -347,14 +347,7 @@ def _explain_reversed_angles(parameter: Parameter, low: float, high: float) -> s
         low: first bound as the user wrote it, which is the larger one.
         high: second bound.
     """
-    # The interval through 0 in ascending order: [350, 10] becomes [-10, 10]; or [350, 370]
-    # if the parameter has no values below 0.
-    if low - FULL_TURN >= parameter.low:
-        begin = low - FULL_TURN
-        end = high
-    else:
-        begin = low
-        end = high + FULL_TURN
+    begin, end = _find_interval_through_zero(parameter, low, high)
     # the angle that lies between both, which is 0 or 360
     inner_turn = 0 if begin <= 0 else FULL_TURN
     inner_width = FULL_TURN - low + high
@@ -364,6 +357,19 @@ def _explain_reversed_angles(parameter: Parameter, low: float, high: float) -> s
         f"{inner_turn:g} to {high:g}, or [{high:g}, {low:g}] "
         f"for the other {low - high:g}"
     )
+
+
+def _find_interval_through_zero(
+    parameter: Parameter, low: float, high: float
+) -> tuple[float, float]:
+    """Return an interval of angles that passes 0 or 360 degrees in ascending order.
+
+    [350, 10] becomes [-10, 10]; or [350, 370] if the parameter has no values below 0.
+    The arguments are those of `_explain_reversed_angles`.
+    """
+    if low - FULL_TURN >= parameter.low:
+        return low - FULL_TURN, high
+    return low, high + FULL_TURN
 
 
 def _make_choice(where: str, values: Sequence[ParameterValue]) -> OneOf:

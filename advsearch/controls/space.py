@@ -313,9 +313,7 @@ class Space:
             _FixedControl(control, u_slice)
             for control, u_slice in zip(first_controls, slices, strict=True)
         ]
-        # only to find out which environment the first controls choose
-        fixed_space = Space(first_controls, self.scene)
-        chosen_environment = fixed_space.find_environment_name(fixed_space.describe(u))
+        chosen_environment = _find_chosen_environment(first_controls, self.scene, u)
         return replace(
             self,
             controls=(*fixed, *self.controls[count:]),
@@ -610,6 +608,20 @@ def _has_shape(value: Tensor, shape: tuple[int | None, ...]) -> bool:
         expected in (None, size)
         for expected, size in zip(shape, value.shape, strict=True)
     )
+
+
+def _find_chosen_environment(
+    controls: tuple[Control, ...], scene: SceneDescription | None, u: Tensor
+) -> str | None:
+    """Return the name of the environment that controls choose; None if they choose none.
+
+    Args:
+        controls: controls that are bound to the scene.
+        scene: the scene.
+        u: (d,) their configuration.
+    """
+    space = Space(controls, scene)
+    return space.find_environment_name(space.describe(u))
 
 
 def _check_range(label: str, value: Tensor, low: float, high: float) -> None:

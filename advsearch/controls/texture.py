@@ -299,21 +299,31 @@ class TextureControl(Control):
             mask: (h, w) bool, texels that are painted.
         """
         texels = self._original[mask]
-        norm = self.choice_values["norm"]
         if self.form == "palette":
             return self._make_palette(part, mask)
         if self.form == "waves":
-            max_change = self._compute_radius(norm, texels.numel())
-            if norm == "l2":
-                # Waves limit each change. If n changes are at most radius / sqrt(n),
-                # their norm is at most the radius.
-                max_change = max_change / math.sqrt(texels.numel())
-            n_waves = int(self.choice_values["waves"])
-            return make_wave_painter(texels, mask, n_waves, max_change)
+            return self._make_waves(texels, mask)
+        norm = self.choice_values["norm"]
         budget = Budget(norm, self._compute_radius(norm, texels.numel()))
         group = Group("texels", texels.numel(), ("adjoint",), budget)
         # The coordinates are the texel values themselves.
         return Painter(texels.reshape(-1), group, to_texels)
+
+    def _make_waves(self, texels: Tensor, mask: Tensor) -> Painter:
+        """Return what adds waves to the texels.
+
+        Args:
+            texels: (n, 3) sRGB, the texels that are painted.
+            mask: (h, w) bool, texels that are painted.
+        """
+        norm = self.choice_values["norm"]
+        max_change = self._compute_radius(norm, texels.numel())
+        if norm == "l2":
+            # Waves limit each change. If n changes are at most radius / sqrt(n),
+            # their norm is at most the radius.
+            max_change = max_change / math.sqrt(texels.numel())
+        n_waves = int(self.choice_values["waves"])
+        return make_wave_painter(texels, mask, n_waves, max_change)
 
     def _make_palette(self, part: MeshPart, mask: Tensor) -> Painter:
         """Return the painter that changes a few colors; see `_make_painter`."""

@@ -478,17 +478,28 @@ def _find_free_shift(
     solid_footprints = [solid.footprint for solid in solids]
     solid_intervals = _find_overlaps(footprint, solid_footprints, direction)
     obstacle_intervals = _find_overlaps(footprint, obstacles, direction)
-    shift = 0.0
-    # begins of the solids that it overlaps with at the shift 0
-    solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
-    if solid_begins:
-        shift = min(solid_begins) - gap
+    shift = _find_shift_before_solids(solid_intervals, gap)
     # In ascending order of their begins: after a shift past an obstacle, the thing can
     # only overlap with those that begin later.
     for begin, end in sorted(obstacle_intervals + solid_intervals):
         if begin < shift < end:
             shift = end + gap
     return shift
+
+
+def _find_shift_before_solids(
+    solid_intervals: Iterable[tuple[float, float]], gap: float
+) -> float:
+    """Return the shift that moves a thing backwards to just before the first solid.
+
+    Args:
+        solid_intervals: (begin, end) of the interval of shifts at which the thing
+            overlaps with each solid; the shift is 0 if no interval has 0 inside.
+        gap: distance from the solid that is left free.
+    """
+    # begins of the solids that it overlaps with at the shift 0
+    solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
+    return min(solid_begins) - gap if solid_begins else 0.0
 
 
 def _find_overlaps(
