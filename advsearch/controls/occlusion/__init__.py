@@ -320,10 +320,10 @@ class OcclusionControl(Control):
         if view.directions is None or requested["coverage"] <= 0.0:
             return _make_hidden_placement(requested["size"], requested["distance"])
         mesh = _load_asset(self._select_option(values)).mesh
-        return _place_occluder(mesh, requested, view, view.directions)
+        return _find_occluder_placement(mesh, requested, view, view.directions)
 
 
-def _place_occluder(
+def _find_occluder_placement(
     mesh: assets.Mesh,
     requested: Mapping[str, float],
     view: _ObjectView,

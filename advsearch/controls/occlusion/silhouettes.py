@@ -144,21 +144,30 @@ def _rasterise_tangents(
     """
     window_width = window.right - window.left
     window_height = window.high - window.low
-    pixel = max(window_width, window_height) / RASTER
-    width = max(1, math.ceil(window_width / pixel))
-    height = max(1, math.ceil(window_height / pixel))
+    height, width = _compute_raster_shape(window_height, window_width)
     # In the coordinates of `rasterize_triangles`, pixel centers are at whole numbers. So
     # the corner of the window, which is the corner of a pixel, is at -0.5.
-    in_pixels = (tangents - (window.left, window.low)) * (
-        width / window_width,
-        height / window_height,
-    ) - 0.5
+    pixels_per_tangent = (width / window_width, height / window_height)
+    in_pixels = (tangents - (window.left, window.low)) * pixels_per_tangent - 0.5
     _face, row, column, _weights = images.rasterize_triangles(
         in_pixels, (height, width)
     )
     mask = np.zeros((height, width), dtype=np.bool_)
     mask[row, column] = True
     return mask
+
+
+def _compute_raster_shape(height: float, width: float) -> tuple[int, int]:
+    """Return the rows and columns of a raster whose longer side has `RASTER` pixels.
+
+    Args:
+        height: height of the raster, in tangents.
+        width: width of the raster, in tangents.
+    """
+    pixel = max(width, height) / RASTER
+    rows = max(1, math.ceil(height / pixel))
+    columns = max(1, math.ceil(width / pixel))
+    return rows, columns
 
 
 def _find_window(
