@@ -563,7 +563,7 @@ def _compute_footprint(
     offsets = earlier_inputs.get(f"{name}.offsets")
     if pose is None and offsets is None:
         return _compute_initial_footprint(part)
-    vertices = part.mesh.vertices
+    vertices: assets.Float32Array | assets.Float64Array = part.mesh.vertices
     if offsets is not None:
         vertices = vertices + _to_float64_array(offsets)
     to_world = part.to_world if pose is None else _to_float64_array(pose)

@@ -360,7 +360,8 @@ def _turn_vertices(mesh: assets.Mesh, degrees: float) -> assets.Float64Array:
     They are centered on the origin, and their largest extent is 1.
     """
     turn = geometry.make_rotation(degrees, 0.0, 0.0)
-    return mesh.vertices.astype(np.float64) @ turn.T
+    turned: assets.Float64Array = mesh.vertices.astype(np.float64) @ turn.T
+    return turned
 
 
 def _make_passage(
