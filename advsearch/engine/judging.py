@@ -257,7 +257,6 @@ def _judge_each_by_truth(
     return [
         task.judge(output[index : index + 1], truth)[0]
         for index, truth in enumerate(truths)
-        for index, truth in enumerate(truths)
     ]
 
 
