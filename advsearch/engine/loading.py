@@ -929,7 +929,9 @@ def _measure_max_motion(
 def _project_configuration(
     motion: Motion, assembly: InputAssembler, space: Space, u: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return where points lie in the image of u (d,), in pixels, and which are visible.
+    """Return where points lie in the image of u (d,), and which are in or near it.
+
+    The positions (N, 2) are in pixels from the center.
 
     Args:
         motion: projects points of the scene into the image.

@@ -108,10 +108,10 @@ def _find_search_refusal(
 
 
 def _find_forced_refusal(problem: Problem) -> Refusal | None:
-    """Return a refusal if the user forces an estimator; None if none is forced."""
+    """Return a refusal if the user forces an estimator of rendered images, else None."""
     for group in problem.gradient_plan.groups:
-        # It is one of derivatives of rendered images. Derivatives of predicted images
-        # are computed in another way.
+        # The user may force an estimator of derivatives of rendered images. Derivatives
+        # of predicted images are computed in another way.
         needs_estimator = group.estimator not in ("none", "image")
         if group.is_forced and needs_estimator:
             return Refusal(f"the estimator of {group.name} is forced")
