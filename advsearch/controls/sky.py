@@ -329,8 +329,9 @@ def _compute_glow(h: Tensor, cosine: Tensor) -> Tensor:
 
     `cosine` (H, W, 1) is that of the angle between a direction and the sun.
     """
-    spread = (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(1.5)
-    return (1.0 + cosine**2) / spread
+    # The numerator comes first: the order fixes how derivatives are rounded.
+    numerator = 1.0 + cosine**2
+    return numerator / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(1.5)
 
 
 def compute_angles(directions: Tensor, reference: Tensor) -> Tensor:

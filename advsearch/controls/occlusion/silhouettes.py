@@ -79,9 +79,9 @@ class Silhouette:
         x_fraction, y_fraction = self._find_position_in_window(x, y, forwards)
         column = np.floor(x_fraction * width)
         row = np.floor(y_fraction * height)
-        is_in_row = (column >= 0) & (column < width)
-        is_in_column = (row >= 0) & (row < height)
-        is_inside = (forwards > geometry.MIN_DEPTH) & is_in_row & is_in_column
+        is_column_inside = (column >= 0) & (column < width)
+        is_row_inside = (row >= 0) & (row < height)
+        is_inside = (forwards > geometry.MIN_DEPTH) & is_column_inside & is_row_inside
         column = np.where(is_inside, column, 0).astype(np.int64)
         row = np.where(is_inside, row, 0).astype(np.int64)
         return np.asarray(is_inside & self.mask[row, column])
