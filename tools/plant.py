@@ -136,8 +136,7 @@ FAULTS = (
     Fault(
         "controls: the exposure counts twice",
         "advsearch/controls/camera.py",
-        'values["exposure"] - scene.get_number(\n                "camera.exposure"\n       '
-        "     )",
+        'values["exposure"] - scene_exposure',
         'values["exposure"]',
         ("tests/controls/test_clean.py",),
     ),

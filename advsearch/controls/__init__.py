@@ -78,17 +78,24 @@ def make_control(
     control = CONTROLS[kind]
     if parameter is not None:
         options.setdefault(parameter, _get_default_range(control, parameter))
+    _check_known_settings(kind, control, options)
+    # "name" is added after the check, because users can't set that
+    if name != kind:
+        options["name"] = name
+    return control(**options)
+
+
+def _check_known_settings(
+    kind: str, control: type[Control], options: Mapping[str, object]
+) -> None:
+    """Raise UnknownNameError for a setting that is no choice and no parameter."""
     known = [choice.name for choice in control.choices]
     known += [
         known_parameter.name for known_parameter in control.declare_parameters(options)
     ]
-    # Checked before "name" is added to the options, because users can't set that.
     for setting in options:
         if setting not in known:
             raise UnknownNameError(f"setting of control {kind}", setting, known)
-    if name != kind:
-        options["name"] = name
-    return control(**options)
 
 
 def make_unknown_control_error(
@@ -208,22 +215,27 @@ def _get_default_range(control: type[Control], parameter: str) -> object:
             f"`controls` {control.kind}.{parameter}: expected a range, as in "
             f"{control.kind}:{parameter}=[0.2, 0.8]"
         )
-    # Besides the parameters of the class, a control may have one by the name that a
-    # user states, such as a joint of a mesh.
-    stated_names = (parameter,)
-    parameter_by_name = {
-        declared_parameter.name: declared_parameter
-        for declared_parameter in control.declare_parameters(stated_names)
-    }
-    if parameter not in parameter_by_name:
-        raise UnknownNameError(
-            f"parameter of control {control.kind}", parameter, parameter_by_name
-        )
-    declared = parameter_by_name[parameter]
+    declared = _find_declared_parameter(control, parameter)
     if declared.options:
         return {"choices": list(declared.options)}
     # without a default search range, all allowed values
     return list(declared.search or (declared.low, declared.high))
+
+
+def _find_declared_parameter(control: type[Control], name: str) -> Parameter:
+    """Return a parameter of a class of controls; raise UnknownNameError without it."""
+    # Besides the parameters of the class, a control may have one by the name that a
+    # user states, such as a joint of a mesh.
+    stated_names = (name,)
+    parameter_by_name = {
+        parameter.name: parameter
+        for parameter in control.declare_parameters(stated_names)
+    }
+    if name not in parameter_by_name:
+        raise UnknownNameError(
+            f"parameter of control {control.kind}", name, parameter_by_name
+        )
+    return parameter_by_name[name]
 
 
 def check_control_settings(
@@ -266,22 +278,36 @@ def merge_control_settings(
     """
     by_control: dict[str, dict[str, object]] = {}
     for name, control_settings in check_control_settings(settings).items():
-        before_dot, dot, after_dot = name.partition(".")
-        kind = before_dot.partition(":")[0]
-        # In "package.module:Class" the dot is that of a module, whose package is no
-        # kind of control.
-        has_parameter = dot != "" and kind in CONTROLS
-        if not has_parameter:
-            by_control.setdefault(name, {}).update(control_settings)
-            continue
-        # Both "pose.yaw:chair" and "pose:chair.yaw" become "pose:chair" and "yaw".
-        parameter, colon, instance = after_dot.partition(":")
-        control_name = before_dot + colon + instance
-        default_range = _get_default_range(CONTROLS[kind], parameter)
-        # A range in the settings replaces the default range.
-        new_settings = {parameter: default_range, **control_settings}
+        control_name, new_settings = _move_parameter(name, control_settings)
         by_control.setdefault(control_name, {}).update(new_settings)
     return by_control
+
+
+def _move_parameter(
+    name: str, settings: Mapping[str, object]
+) -> tuple[str, Mapping[str, object]]:
+    """Move the parameter in the name of a control, if it has one, to its settings.
+
+    Args:
+        name: name such as "pose:chair.yaw", "pose.yaw:chair" or "pose:chair".
+        settings: settings of the control, which may state a range of that parameter.
+
+    Returns:
+        The name without the parameter, e.g. "pose:chair". And the settings, with the
+        default range of the parameter if they had no other.
+    """
+    before_dot, dot, after_dot = name.partition(".")
+    kind = before_dot.partition(":")[0]
+    # In "package.module:Class" the dot is that of a module, whose package is no
+    # kind of control.
+    has_parameter = dot != "" and kind in CONTROLS
+    if not has_parameter:
+        return name, settings
+    # Both "pose.yaw:chair" and "pose:chair.yaw" become "pose:chair" and "yaw".
+    parameter, colon, instance = after_dot.partition(":")
+    default_range = _get_default_range(CONTROLS[kind], parameter)
+    # A range in the settings replaces the default range.
+    return before_dot + colon + instance, {parameter: default_range, **settings}
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
@@ -360,34 +386,62 @@ def compose_space(controls: Sequence[Control], scene: SceneDescription) -> Space
             replaces a value that the user set.
     """
     _check_controls(controls, scene)
-    described_scene = scene
-    adjusted = list[AdjustedDefault]()
-    for control in controls:
-        prepared = control.prepare(scene)
-        adjusted += find_replaced_defaults(control.name, scene, prepared)
-        scene = prepared
-    for control in controls:
-        if control.mesh_name != OBJECT:
-            control.get_mesh(scene)  # raises if the scene has no such mesh
-    bound = tuple(control.bind(scene) for control in controls)
+    prepared, adjusted = _prepare_scene(controls, scene)
+    _check_meshes_exist(controls, prepared)
+    bound = tuple(control.bind(prepared) for control in controls)
     for control in bound:
         adjusted += control.adjusted_defaults
     # The adjustments by `prepare` come first, then those by `bind`: sort them by control.
     names = [control.name for control in controls]
     adjusted.sort(key=lambda default: names.index(default.control_name))
-    # A control that replaces the environment has either recorded its name in the scene,
-    # or listed it as an adjusted default. If several have listed one, the first counts.
-    environment_name = None
-    if scene.environment_spec != described_scene.environment_spec:
-        environment_name = scene.environment_spec
-    listed_environments = [
-        str(default.used_value)
-        for default in adjusted
-        if default.parameter_name == ENVIRONMENT
-    ]
-    if listed_environments:
-        environment_name = listed_environments[0]
-    return Space(bound, scene, tuple(adjusted), environment_name)
+    environment_name = _find_new_environment(scene, prepared, adjusted)
+    return Space(bound, prepared, tuple(adjusted), environment_name)
+
+
+def _prepare_scene(
+    controls: Sequence[Control], scene: SceneDescription
+) -> tuple[SceneDescription, list[AdjustedDefault]]:
+    """Let controls prepare a scene, one after the other.
+
+    Returns:
+        The prepared scene, and the default values of the scene that controls replace.
+    """
+    adjusted = list[AdjustedDefault]()
+    for control in controls:
+        prepared = control.prepare(scene)
+        adjusted += find_replaced_defaults(control.name, scene, prepared)
+        scene = prepared
+    return scene, adjusted
+
+
+def _check_meshes_exist(controls: Sequence[Control], scene: SceneDescription) -> None:
+    """Check that a prepared scene has the meshes that controls act on."""
+    for control in controls:
+        if control.mesh_name != OBJECT:
+            control.get_mesh(scene)  # raises if the scene has no such mesh
+
+
+def _find_new_environment(
+    before: SceneDescription,
+    after: SceneDescription,
+    adjusted: Sequence[AdjustedDefault],
+) -> str | None:
+    """Return the name of the environment that a control has put in; None without one.
+
+    The control has either recorded its name in the scene, or listed it as an adjusted
+    default. If several have listed one, the first counts.
+
+    Args:
+        before: scene before controls have prepared it.
+        after: the prepared scene.
+        adjusted: default values that controls have adjusted.
+    """
+    for default in adjusted:
+        if default.parameter_name == ENVIRONMENT:
+            return str(default.used_value)
+    if after.environment_spec != before.environment_spec:
+        return after.environment_spec
+    return None
 
 
 def _check_controls(controls: Sequence[Control], scene: SceneDescription) -> None:

@@ -26,10 +26,14 @@ from advsearch.controls.ranges import ParameterValue, list_allowed_names
 from advsearch.controls.support.images import rotate_map
 from advsearch.errors import InputError
 from advsearch.scene.assembly import PHOTOGRAPH_INPUT
-from advsearch.scene.assets import Float64Array
+from advsearch.scene.assets import EnvironmentAsset, Float64Array
 from advsearch.scene.backdrop import has_plane
 from advsearch.scene.camera_model import CameraModel, make_pinhole
-from advsearch.scene.description import SCENE_ENVIRONMENT, SceneDescription
+from advsearch.scene.description import (
+    SCENE_ENVIRONMENT,
+    PhotographFolder,
+    SceneDescription,
+)
 from advsearch.scene.geometry import camera_to_world, compute_object_to_world
 from advsearch.scene.scene_data import cache_per_scene
 from advsearch.scene.settings import Parameter
@@ -86,6 +90,25 @@ class BackdropControl(Control):
                 f"`controls` {self.name}: chooses among the photographs of a folder, "
                 "and the scene has none; set `backdrop=FOLDER`"
             )
+        views = self._select_views(scene, folder)
+        self._check_views(views)
+        first = next(iter(views.values()))
+        # The scene shows the first photograph of the folder. If that is not allowed, it
+        # is replaced by the first allowed one.
+        if first.backdrop_photograph is not scene.backdrop_photograph:
+            scene = _move_into_photograph(scene, first)
+        photographs = replace(folder, scenes=views)
+        camera_model = _find_shared_model(views)
+        return replace(scene, camera_model=camera_model, photographs=photographs)
+
+    def _select_views(
+        self, scene: SceneDescription, folder: PhotographFolder
+    ) -> dict[str, SceneDescription]:
+        """Return the scene in each allowed photograph, by the photograph's name.
+
+        Raises:
+            InputError: a name is none of the photographs.
+        """
         allowed = [str(name) for name in self._list_names(scene)]
         for name in allowed:
             if name not in folder.scenes:
@@ -93,26 +116,7 @@ class BackdropControl(Control):
                     f"{self.name}.which: {folder.path} has no photograph "
                     f"{name}; it has {', '.join(folder.scenes)[:200]}"
                 )
-        views = {name: folder.scenes[name] for name in allowed}
-        self._check_views(views)
-        first = views[allowed[0]]
-        # The scene shows the first photograph of the folder. If that is not allowed, it
-        # is replaced by the first allowed one.
-        if first.backdrop_photograph is not scene.backdrop_photograph:
-            scene = replace(
-                scene,
-                backdrop_photograph=first.backdrop_photograph,
-                camera=first.camera,
-                values=first.values,
-            )
-        # If one photograph needs a camera model, all of them are rendered with one:
-        # `_compute_view_inputs` sets the lens of the photograph that is shown.
-        has_model = any(view.camera_model is not None for view in views.values())
-        return replace(
-            scene,
-            camera_model=_get_lens(first) if has_model else None,
-            photographs=replace(folder, scenes=views),
-        )
+        return {name: folder.scenes[name] for name in allowed}
 
     def _check_views(self, views: Mapping[str, SceneDescription]) -> None:
         """Raise InputError if the photographs can't all be shown in one scene.
@@ -166,6 +170,19 @@ class BackdropControl(Control):
         }
 
 
+def _find_shared_model(views: Mapping[str, SceneDescription]) -> CameraModel | None:
+    """Return the camera model of a scene in photographs; None if none needs a model.
+
+    Args:
+        views: scene in each photograph, by name.
+    """
+    # If one photograph needs a camera model, all of them are rendered with one:
+    # `_compute_view_inputs` sets the lens of the photograph that is shown.
+    has_model = any(view.camera_model is not None for view in views.values())
+    first = next(iter(views.values()))
+    return _get_lens(first) if has_model else None
+
+
 @cache_per_scene
 def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tensor]:
     """Return the scene inputs that replace the first photograph by another one.
@@ -187,22 +204,53 @@ def _compute_view_inputs(scene: SceneDescription, index: int) -> dict[str, Tenso
         PHOTOGRAPH_INPUT: torch.tensor(float(index)),
         "camera.to_world": torch.from_numpy(pose).float(),
         "camera.exposure": torch.tensor(exposure_stops),
+        **_compute_lens_input(scene, view),
     }
-    if scene.camera_model is not None:
-        inputs["camera.lens"] = torch.tensor(_get_lens(view).intrinsics)
-    else:
-        inputs["camera.fov"] = torch.tensor([view.get_number("camera.fov")])
     if has_plane(scene):
         inputs["ground.to_world"] = _compute_plane_pose(view, view_to_scene)
     if scene.environment is not None:
-        # All photographs have the same environment, whose directions refer to the camera.
-        radiance = torch.from_numpy(scene.environment.radiance.copy())
-        # `view_to_scene` can only turn about the vertical (see `_check_compatible`): by
-        # this angle, counter-clockwise seen from above.
-        angle = math.atan2(view_to_scene[1, 0], view_to_scene[0, 0])
-        degrees = torch.tensor(math.degrees(angle))
-        inputs["environment.data"] = rotate_map(radiance, degrees)
+        inputs["environment.data"] = _turn_environment(scene.environment, view_to_scene)
     return inputs
+
+
+def _compute_lens_input(
+    scene: SceneDescription, view: SceneDescription
+) -> dict[str, Tensor]:
+    """Return the lens of a photograph as a scene input: a camera model, or an angle."""
+    if scene.camera_model is not None:
+        return {"camera.lens": torch.tensor(_get_lens(view).intrinsics)}
+    return {"camera.fov": torch.tensor([view.get_number("camera.fov")])}
+
+
+def _move_into_photograph(
+    scene: SceneDescription, view: SceneDescription
+) -> SceneDescription:
+    """Return a scene with the photograph, the camera and the values of another view."""
+    return replace(
+        scene,
+        backdrop_photograph=view.backdrop_photograph,
+        camera=view.camera,
+        values=view.values,
+    )
+
+
+def _turn_environment(
+    environment: EnvironmentAsset, view_to_scene: Float64Array
+) -> Tensor:
+    """Return the map (h, w, 3) of an environment, turned with a photograph's world.
+
+    All photographs have the same environment, whose directions refer to the camera.
+
+    Args:
+        environment: the environment.
+        view_to_scene: (4, 4) map from the photograph's world to that of the scene.
+    """
+    radiance = torch.from_numpy(environment.radiance.copy())
+    # `view_to_scene` can only turn about the vertical (see `_check_compatible`): by this
+    # angle, counter-clockwise seen from above.
+    angle = math.atan2(view_to_scene[1, 0], view_to_scene[0, 0])
+    degrees = torch.tensor(math.degrees(angle))
+    return rotate_map(radiance, degrees)
 
 
 def _compute_view_to_first(
@@ -266,24 +314,34 @@ def _check_compatible(
             f"`controls` backdrop: {name} has a file with its own light next to it; "
             "state one `environment` for all photographs, or sweep over them"
         )
+    difference = _describe_difference(view, first)
+    if difference is not None:
+        raise InputError(
+            f"`controls` backdrop: in {name} {difference} than in the first "
+            "photograph; "
+            "leave it out of backdrop.which, or sweep over the photographs"
+        )
+
+
+def _describe_difference(view: SceneDescription, first: SceneDescription) -> str | None:
+    """Return how the plane of a photograph differs from the first; None if it fits."""
     view_to_first = _compute_view_to_first(view, first)
     # The z axis of the first photograph's world, in the world of this photograph.
     up_of_first = view_to_first[2, :3]
     up_error = np.abs(up_of_first - [0.0, 0.0, 1.0]).max()
     is_upright = up_error <= PLANE_TOLERANCE
-    same_surface = all(
+    if not is_upright:
+        return "the object stands on another side"
+    if has_plane(view) != has_plane(first):
+        return "the camera is on another side of the plane, or its size differs,"
+    if not _has_same_surface(view, first):
+        return f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"
+    return None
+
+
+def _has_same_surface(view: SceneDescription, first: SceneDescription) -> bool:
+    """Return whether the planes of two photographs have the same size and gloss."""
+    return all(
         view.get_number(setting) == first.get_number(setting)
         for setting in PLANE_SURFACE
-    )
-    if not is_upright:
-        difference = "the object stands on another side"
-    elif has_plane(view) != has_plane(first):
-        difference = "the camera is on another side of the plane, or its size differs,"
-    elif not same_surface:
-        difference = f"the plane has another size or gloss ({', '.join(PLANE_SURFACE)})"
-    else:
-        return
-    raise InputError(
-        f"`controls` backdrop: in {name} {difference} than in the first photograph; "
-        "leave it out of backdrop.which, or sweep over the photographs"
     )

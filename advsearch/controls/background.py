@@ -96,13 +96,10 @@ class BackgroundControl(Control):
         # `Control` searches the default ranges unless the user has requested a range.
         # Here only a range of the color counts: with a list of values of `what` alone,
         # the color is still searched over its default range.
-        color_specs = [
-            self.specs[parameter_name]
+        self.has_requested_range = any(
+            not isinstance(self.specs[parameter_name], Fixed)
             for parameter_name in COLOR_PARAMETERS
             if parameter_name in self.specs
-        ]
-        self.has_requested_range = any(
-            not isinstance(spec, Fixed) for spec in color_specs
         )
         if self.specs.get("what") == Fixed("environment"):
             raise InputError(

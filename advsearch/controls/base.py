@@ -120,20 +120,17 @@ def _describe_adjustment(value: AdjustedDefault) -> str:
     unit = f" {value.unit}"
     if value.unit in ("1", "name") or isinstance(value.used_value, str):
         unit = ""
-    used = (
-        value.used_value
-        if isinstance(value.used_value, str)
-        else format_rounded(value.used_value)
-    )
-    scene = (
-        value.scene_value
-        if isinstance(value.scene_value, str)
-        else format_rounded(value.scene_value)
-    )
+    used = _format_briefly(value.used_value)
+    scene = _format_briefly(value.scene_value)
     if used == scene:  # the values differ by less than the rounding: show more digits
         used = format_value(value.used_value)
         scene = format_value(value.scene_value)
     return f"{value.parameter_name} {used}{unit} instead of {scene}"
+
+
+def _format_briefly(value: ParameterValue) -> str:
+    """Return a value as text, a number with few digits."""
+    return value if isinstance(value, str) else format_rounded(value)
 
 
 def find_replaced_defaults(
@@ -160,14 +157,30 @@ def find_replaced_defaults(
         # None is a default that the scene computes: it has no value to compare.
         if value is None or value_before is None or is_same_value(value, value_before):
             continue
-        if name in before.requested:
-            raise InputError(
-                f"`set` {name}={format_value(value_before)} and `controls` {control} "
-                "contradict each "
-                "other: the control makes it "
-                f"{format_rounded(value)}; change one of the two, or leave one out"
-            )
+        _check_is_default(control, name, before, value)
         yield AdjustedDefault(control, name, SETTINGS[name].unit, value_before, value)
+
+
+def _check_is_default(
+    control: str, name: str, before: SceneDescription, new_value: float
+) -> None:
+    """Raise InputError if the user set a value of a scene that a control replaces.
+
+    Args:
+        control: name of the control.
+        name: name of the setting, such as "ground.size".
+        before: scene before the control has prepared it.
+        new_value: value by the control.
+    """
+    if name in before.requested:
+        value_before = before.values[name]
+        assert value_before is not None  # the caller skips those without a value
+        raise InputError(
+            f"`set` {name}={format_value(value_before)} and `controls` {control} "
+            "contradict each "
+            "other: the control makes it "
+            f"{format_rounded(new_value)}; change one of the two, or leave one out"
+        )
 
 
 def _find_replaced_environment(
@@ -187,13 +200,7 @@ def _find_replaced_environment(
     if after.environment is None or after.environment is before.environment:
         return None
     check_single_environment(after.parts, f"`controls` {control}")
-    # An environment that the user set must not be replaced.
-    if ENVIRONMENT in before.requested:
-        raise InputError(
-            f"`environment={before.environment_spec}` and `controls` {control} "
-            "contradict each other: the control "
-            f"puts {after.environment.name} in its place; leave one of the two out"
-        )
+    _check_environment_is_default(control, before, after.environment.name)
     # If the control has recorded the new name in the scene, `compose_space` reads it
     # there, and no adjusted default is needed.
     if after.environment_spec != before.environment_spec:
@@ -201,6 +208,24 @@ def _find_replaced_environment(
     return AdjustedDefault(
         control, ENVIRONMENT, "name", before.environment_spec, after.environment.name
     )
+
+
+def _check_environment_is_default(
+    control: str, before: SceneDescription, new_name: str
+) -> None:
+    """Raise InputError if the user set the environment that a control replaces.
+
+    Args:
+        control: name of the control.
+        before: scene before the control has prepared it.
+        new_name: name of the new environment.
+    """
+    if ENVIRONMENT in before.requested:
+        raise InputError(
+            f"`environment={before.environment_spec}` and `controls` {control} "
+            "contradict each other: the control "
+            f"puts {new_name} in its place; leave one of the two out"
+        )
 
 
 NO_INPUTS: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
@@ -421,22 +446,27 @@ class Control:
         }
         self.instance_parameters = self.declare_parameters(settings)
         self._check_setting_names(settings)
-        self._settings: dict[str, Any] = {
-            setting: to_plain_value(value)
-            for setting, value in settings.items()
-            if value is not None
-        }
-        self.choice_values: dict[str, Any] = {
-            choice.name: self._settings.get(choice.name, choice.default)
-            for choice in self.choices
-        }
-        for choice in self.choices:
-            choice.check(self.name, self.choice_values[choice.name])
+        self._settings = _list_stated_settings(settings)
+        self.choice_values: dict[str, Any] = self._collect_choice_values()
         self.check_choices()
         self.specs = self._parse_specs()
         self.has_requested_range = any(
             not isinstance(spec, Fixed) for spec in self.specs.values()
         )
+
+    def _collect_choice_values(self) -> dict[str, Any]:
+        """Return the value of each choice by name, set by the user or the default.
+
+        Raises:
+            InputError: a value is not allowed.
+        """
+        values = {
+            choice.name: self._settings.get(choice.name, choice.default)
+            for choice in self.choices
+        }
+        for choice in self.choices:
+            choice.check(self.name, values[choice.name])
+        return values
 
     def _check_setting_names(self, settings: Iterable[str]) -> None:
         """Raise UnknownNameError for a setting that is no parameter and no choice."""
@@ -513,23 +543,22 @@ class Control:
             InputError: the mesh belongs to the surroundings of a Mitsuba scene, which
                 this control can't change.
         """
-        mesh = self.mesh_name
-        if mesh in scene.meshes:
-            return scene.meshes[mesh]
-        if any(
-            part.name == mesh for part in scene.parts if isinstance(part, PluginPart)
-        ):
-            raise InputError(
-                f"`controls` {self.name}: {mesh} is around the object in a Mitsuba "
-                "scene, and stays as it is; "
-                "make it the object, or vary its numbers by Mitsuba's names, "
-                f"mitsuba:{mesh}.KEY=[low, high]"
-            )
-        raise UnknownNameError(
-            "mesh of the scene",
-            mesh,
-            scene.meshes,
-            f"It stands in `controls` {self.name}.",
+        name = self.mesh_name
+        if name in scene.meshes:
+            return scene.meshes[name]
+        plugin_parts = [part for part in scene.parts if isinstance(part, PluginPart)]
+        if any(part.name == name for part in plugin_parts):
+            raise self._make_surroundings_error(name)
+        hint = f"It stands in `controls` {self.name}."
+        raise UnknownNameError("mesh of the scene", name, scene.meshes, hint)
+
+    def _make_surroundings_error(self, mesh: str) -> InputError:
+        """Return the error for a mesh around the object in a Mitsuba scene."""
+        return InputError(
+            f"`controls` {self.name}: {mesh} is around the object in a Mitsuba "
+            "scene, and stays as it is; "
+            "make it the object, or vary its numbers by Mitsuba's names, "
+            f"mitsuba:{mesh}.KEY=[low, high]"
         )
 
     def get_setting_name(self, parameter: Parameter) -> str:
@@ -559,27 +588,34 @@ class Control:
         """
         requested = []
         for parameter, form in zip(self.parameters, forms, strict=True):
-            value = self._settings.get(parameter.name)
-            if value is None:
-                continue
-            full_range = [parameter.low, parameter.high]
-            if value not in (full_range, tuple(full_range)):
-                raise InputError(
-                    f"{self.name}.{parameter.name}: expected no value but "
-                    f"[{parameter.low:g}, {parameter.high:g}], got "
-                    f"{value!r}; set how far it may go with {self.name}.epsilon"
-                )
-            requested.append(form)
+            if self._settings.get(parameter.name) is not None:
+                self._check_is_full_range(parameter)
+                requested.append(form)
         if "form" in self._settings:
-            form = str(self._settings["form"])
-            requested.append(form)
-            if form not in forms:
-                raise UnknownNameError(f"{self.name}.form", form, forms)
+            requested.append(self._read_form(forms))
         if len(set(requested)) > 1:
             raise InputError(
                 f"{self.name}.form: expected one form, got {', '.join(requested)}"
             )
         return requested[0] if requested else forms[0]
+
+    def _read_form(self, forms: Sequence[str]) -> str:
+        """Return the setting `form`; raise UnknownNameError if it is none of the forms."""
+        form = str(self._settings["form"])
+        if form not in forms:
+            raise UnknownNameError(f"{self.name}.form", form, forms)
+        return form
+
+    def _check_is_full_range(self, parameter: Parameter) -> None:
+        """Raise InputError if a parameter is set to less than its full range."""
+        value = self._settings[parameter.name]
+        full_range = [parameter.low, parameter.high]
+        if value not in (full_range, tuple(full_range)):
+            raise InputError(
+                f"{self.name}.{parameter.name}: expected no value but "
+                f"[{parameter.low:g}, {parameter.high:g}], got "
+                f"{value!r}; set how far it may go with {self.name}.epsilon"
+            )
 
     def list_allowed_values(
         self, parameter: str, *defaults: ParameterValue
@@ -642,44 +678,29 @@ class Control:
         Raises:
             InputError: a setting of the control is impossible in this scene.
         """
+        slots = self._make_slots()
+        self.parameter_slots = tuple(slots)
+        self.adjusted_defaults = tuple(self._list_adjusted_defaults())
+        start_coordinates = [
+            coordinate for slot in slots for coordinate in slot.get_start_coordinates()
+        ]
+        self.start = torch.tensor(start_coordinates, dtype=torch.float32)
+        self.groups = tuple(
+            self._make_group(slot) for slot in slots if slot.n_coordinates
+        )
+        low_and_span = _compute_low_and_span(slots)
+        self._low = low_and_span[:, 0].contiguous()
+        self._span = low_and_span[:, 1].contiguous()
+
+    def _make_slots(self) -> list[Slot]:
+        """Return each parameter with the offset of its coordinates."""
         slots = list[Slot]()
         begin = 0
         for parameter, spec in self.list_parameter_specs():
             slot = Slot(parameter, spec, begin)
             slots.append(slot)
             begin += slot.n_coordinates
-        self.parameter_slots = tuple(slots)
-        self.adjusted_defaults = tuple(self._list_adjusted_defaults())
-        self.start = torch.tensor(
-            [
-                coordinate
-                for slot in slots
-                for coordinate in slot.get_start_coordinates()
-            ],
-            dtype=torch.float32,
-        )
-        self.groups = tuple(
-            self._make_group(slot) for slot in slots if slot.n_coordinates
-        )
-        # `compute_values` needs the lower bound and the width of the range of each
-        # coordinate, (d,) each. All coordinates of a slot have the same range. A slot
-        # that is fixed, or has a list of values, has no range. `compute_values` never
-        # reads the numbers of its placeholder.
-        placeholder = Range(0.0, 1.0)
-        ranges = [
-            slot.parameter_spec
-            if isinstance(slot.parameter_spec, Range)
-            else placeholder
-            for slot in slots
-        ]
-        low_and_span_of_slot = torch.tensor(
-            [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
-        ).reshape(-1, 2)
-        counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
-        # (d, 2): the row of a slot for each of its coordinates
-        low_and_span = low_and_span_of_slot.repeat_interleave(counts, dim=0)
-        self._low = low_and_span[:, 0].contiguous()
-        self._span = low_and_span[:, 1].contiguous()
+        return slots
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its value in the unchanged scene as the default.
@@ -758,16 +779,11 @@ class Control:
             scene_value: its value in the clean scene.
             used_value: its value at the start of the search.
         """
-        self.adjusted_defaults = (
-            *self.adjusted_defaults,
-            AdjustedDefault(
-                self.name,
-                f"{self.name}.{parameter.name}",
-                parameter.unit,
-                scene_value,
-                used_value,
-            ),
+        label = f"{self.name}.{parameter.name}"
+        adjusted = AdjustedDefault(
+            self.name, label, parameter.unit, scene_value, used_value
         )
+        self.adjusted_defaults = (*self.adjusted_defaults, adjusted)
 
     def _list_adjusted_defaults(self) -> Iterator[AdjustedDefault]:
         """Yield the parameters whose start differs from the value in the clean scene.
@@ -781,45 +797,77 @@ class Control:
                 allow that value.
         """
         for slot in self.parameter_slots:
-            parameter = slot.parameter
-            if not self.must_start_at_clean_value(parameter, slot.parameter_spec):
-                continue
-            scene_value = self.get_value_without_control(parameter)
-            used = slot.get_start_value()
-            # Without its strength, the control has no effect, whatever this parameter is.
-            depends_on_strength = (
-                self.strength_parameter is not None
-                and parameter.name != self.strength_parameter
+            adjusted = self._find_adjusted_default(slot)
+            if adjusted is not None:
+                yield adjusted
+
+    def _find_adjusted_default(self, slot: Slot) -> AdjustedDefault | None:
+        """Return the adjusted default of a parameter; None if it is not adjusted."""
+        parameter = slot.parameter
+        if not self.must_start_at_clean_value(parameter, slot.parameter_spec):
+            return None
+        scene_value = self.get_value_without_control(parameter)
+        used = slot.get_start_value()
+        if self._depends_on_strength(parameter):
+            return None
+        if is_same_value(used, scene_value, is_angle=slot.is_angle):
+            return None
+        self._check_allows_scene_value(slot, scene_value)
+        is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
+        if is_fixed_by_user:
+            return None
+        return self._make_adjusted_default(parameter, scene_value, used)
+
+    def _make_adjusted_default(
+        self, parameter: Parameter, scene_value: ParameterValue, used: ParameterValue
+    ) -> AdjustedDefault:
+        """Return the record of a parameter that starts at another value than the scene's.
+
+        Args:
+            parameter: the parameter.
+            scene_value: its value in the scene, without the control.
+            used: the value that it starts at.
+        """
+        return AdjustedDefault(
+            control_name=self.name,
+            parameter_name=self._get_reported_name(parameter),
+            unit="name" if parameter.options else parameter.unit,
+            scene_value=scene_value,
+            used_value=used,
+        )
+
+    def _depends_on_strength(self, parameter: Parameter) -> bool:
+        """Return whether a parameter only has an effect if another one has strength."""
+        # Without its strength, the control has no effect, whatever this parameter is.
+        return (
+            self.strength_parameter is not None
+            and parameter.name != self.strength_parameter
+        )
+
+    def _check_allows_scene_value(
+        self, slot: Slot, scene_value: ParameterValue
+    ) -> None:
+        """Raise InputError if the user set a scene's value that a control excludes."""
+        setting = self.get_setting_name(slot.parameter)
+        if setting in self.scene.requested:
+            label = f"{self.name}.{slot.parameter.name}"
+            raise InputError(
+                f"{self._quote_setting(setting)} and `controls` {self.name} "
+                "contradict "
+                f"each other: {label} is {slot.parameter_spec}, "
+                f"which leaves {format_value(scene_value)} out; change one of the "
+                "two, or "
+                "leave one out"
             )
-            if depends_on_strength:
-                continue
-            if is_same_value(used, scene_value, is_angle=slot.is_angle):
-                continue
-            # the scene's setting for the same value, such as "pose.yaw"
-            setting = self.get_setting_name(parameter)
-            label = f"{self.name}.{parameter.name}"
-            if setting in self.scene.requested:
-                raise InputError(
-                    f"{self._quote_setting(setting)} and `controls` {self.name} "
-                    "contradict "
-                    f"each other: {label} is {slot.parameter_spec}, "
-                    f"which leaves {format_value(scene_value)} out; change one of the "
-                    "two, or "
-                    "leave one out"
-                )
-            is_fixed_by_user = isinstance(self.specs.get(parameter.name), Fixed)
-            if is_fixed_by_user:
-                continue
-            # The environment is one value, which several controls may replace: it has
-            # the same label in all of them.
-            parameter_name = setting if setting == ENVIRONMENT else label
-            yield AdjustedDefault(
-                control_name=self.name,
-                parameter_name=parameter_name,
-                unit="name" if parameter.options else parameter.unit,
-                scene_value=scene_value,
-                used_value=used,
-            )
+
+    def _get_reported_name(self, parameter: Parameter) -> str:
+        """Return the name of a parameter in an `AdjustedDefault`, such as "pose.yaw".
+
+        The environment is one value, which several controls may replace: it has the
+        same name in all of them.
+        """
+        setting = self.get_setting_name(parameter)
+        return setting if setting == ENVIRONMENT else f"{self.name}.{parameter.name}"
 
     def _quote_setting(self, setting: str) -> str:
         """Return how the user writes a setting of the scene, with its value."""
@@ -844,23 +892,15 @@ class Control:
         spec = slot.parameter_spec
         setting = self.get_setting_name(parameter)
         if isinstance(spec, OneOf):
-            no_estimators = ()
             return Group(
                 name,
                 slot.n_coordinates,
-                no_estimators,
+                valid=(),
                 options=len(spec.values),
                 setting=setting,
             )
         budget = self.get_budget(parameter)
-        # A distribution is a subclass of `Range`.
-        is_distribution = type(spec) is not Range
-        is_limited_by_norm = budget != FULL_RANGE
-        if is_distribution and is_limited_by_norm:
-            raise InputError(
-                f"{self.name}.{name}: expected a range, got a distribution; its values "
-                "are limited by a norm (epsilon)"
-            )
+        self._check_has_no_distribution(name, spec, budget)
         return Group(
             name,
             slot.n_coordinates,
@@ -869,6 +909,19 @@ class Control:
             periodic=slot.is_full_turn,
             setting=setting,
         )
+
+    def _check_has_no_distribution(
+        self, parameter: str, spec: Spec, budget: Budget
+    ) -> None:
+        """Raise InputError for a distribution in the ball of a norm."""
+        # A distribution is a subclass of `Range`.
+        is_distribution = type(spec) is not Range
+        is_limited_by_norm = budget != FULL_RANGE
+        if is_distribution and is_limited_by_norm:
+            raise InputError(
+                f"{self.name}.{parameter}: expected a range, got a distribution; its "
+                "values are limited by a norm (epsilon)"
+            )
 
     @property
     def ambient_lux(self) -> float | None:
@@ -917,28 +970,11 @@ class Control:
         if not self.parameter_slots:
             return values
         # All coordinates are interpolated linearly at once, which is fast. Those with a
-        # logarithmic scale or a distribution are interpolated again below.
+        # logarithmic scale or a distribution are interpolated again.
         linear = self._low.to(u) + self._span.to(u) * u
         for slot in self.parameter_slots:
-            parameter = slot.parameter
-            spec = slot.parameter_spec
-            if isinstance(spec, Range):
-                coordinates = slice(
-                    slot.coordinate_offset, slot.coordinate_offset + slot.n_values
-                )
-                # A distribution is a subclass of `Range`.
-                is_distribution = type(spec) is not Range
-                if parameter.log or is_distribution:
-                    value = spec.interpolate(u[coordinates], log=parameter.log)
-                else:
-                    value = linear[coordinates]
-                values[parameter.name] = value if parameter.shape else value.reshape(())
-                continue
-            if isinstance(spec, Fixed):
-                constant = spec.value
-            else:  # a list of values, `OneOf`, which has one coordinate
-                constant = spec.select_value(u[slot.coordinate_offset])
-            values[parameter.name] = _to_tensor(constant, slot, u.device)
+            name = slot.parameter.name
+            values[name] = _compute_slot_value(slot, u, linear)
         return values
 
     def scene_inputs(
@@ -1029,25 +1065,12 @@ class Control:
         described: dict[str, Value] = {}
         for slot in self.parameter_slots:
             parameter = slot.parameter
-            is_image = len(parameter.shape) > 1  # numbers have (), vectors (k,)
-            if isinstance(slot.parameter_spec, Fixed) or is_image:
+            if not _is_described(slot):
                 continue
-            value = values[parameter.name]
             name = f"{self.name}.{parameter.name}"
-            if parameter.options:
-                # The value is the index of an option.
-                option = parameter.options[int(value)]
-                described[name] = {"value": option, "unit": "name"}
-            elif value.ndim == 0:
-                described[name] = make_value_with_unit(value, parameter.unit)
-            else:
-                for index, number in enumerate(value):
-                    described[f"{name}.{index}"] = make_value_with_unit(
-                        number, parameter.unit
-                    )
-        for name, measurement in self.compute_measurements(
-            values, earlier_inputs
-        ).items():
+            described |= _describe_value(name, parameter, values[parameter.name])
+        measurements = self.compute_measurements(values, earlier_inputs)
+        for name, measurement in measurements.items():
             described[f"{self.name}.{name}"] = measurement
         return described
 
@@ -1141,6 +1164,94 @@ class Control:
 
 
 NumberControl = Control  # alias for packages that add controls
+
+
+def _compute_low_and_span(slots: Sequence[Slot]) -> Tensor:
+    """Return lower bound and width of the range of each coordinate, (d, 2) float64.
+
+    All coordinates of a slot have the same range. A slot that is fixed, or has a list of
+    values, has no range. `Control.compute_values` never reads the numbers of its
+    placeholder.
+    """
+    placeholder = Range(0.0, 1.0)
+    ranges = [
+        slot.parameter_spec if isinstance(slot.parameter_spec, Range) else placeholder
+        for slot in slots
+    ]
+    low_and_span_of_slot = torch.tensor(
+        [(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64
+    ).reshape(-1, 2)
+    counts = torch.tensor([slot.n_coordinates for slot in slots], dtype=torch.long)
+    # the row of a slot for each of its coordinates
+    return low_and_span_of_slot.repeat_interleave(counts, dim=0)
+
+
+def _list_stated_settings(settings: Mapping[str, object]) -> dict[str, Any]:
+    """Return the settings that are not None, as plain values of Python."""
+    return {
+        setting: to_plain_value(value)
+        for setting, value in settings.items()
+        if value is not None
+    }
+
+
+def _compute_slot_value(slot: Slot, u: Tensor, linear: Tensor) -> Tensor:
+    """Return the value of a parameter, of the parameter's shape.
+
+    Args:
+        slot: the parameter with its spec and its coordinates.
+        u: (d,) the control's slice of a configuration.
+        linear: (d,) the same, interpolated linearly between the bounds.
+    """
+    spec = slot.parameter_spec
+    if isinstance(spec, Range):
+        return _interpolate_slot(slot, spec, u, linear)
+    if isinstance(spec, Fixed):
+        return _to_tensor(spec.value, slot, u.device)
+    # a list of values, `OneOf`, which has one coordinate
+    selected = spec.select_value(u[slot.coordinate_offset])
+    return _to_tensor(selected, slot, u.device)
+
+
+def _interpolate_slot(slot: Slot, spec: Range, u: Tensor, linear: Tensor) -> Tensor:
+    """Return the value of a parameter that has a range, of the parameter's shape.
+
+    Args:
+        slot: the parameter with its coordinates.
+        spec: its range.
+        u: (d,) the control's slice of a configuration.
+        linear: (d,) the same, interpolated linearly between the bounds.
+    """
+    parameter = slot.parameter
+    end = slot.coordinate_offset + slot.n_values
+    coordinates = slice(slot.coordinate_offset, end)
+    # A distribution is a subclass of `Range`.
+    is_distribution = type(spec) is not Range
+    if parameter.log or is_distribution:
+        value = spec.interpolate(u[coordinates], log=parameter.log)
+    else:
+        value = linear[coordinates]
+    return value if parameter.shape else value.reshape(())
+
+
+def _is_described(slot: Slot) -> bool:
+    """Return whether a parameter is listed in results: not fixed, and no image."""
+    is_image = len(slot.parameter.shape) > 1  # numbers have (), vectors (k,)
+    return not isinstance(slot.parameter_spec, Fixed) and not is_image
+
+
+def _describe_value(name: str, parameter: Parameter, value: Tensor) -> dict[str, Value]:
+    """Describe the value of a parameter; the elements of a vector have an index."""
+    if parameter.options:
+        # The value is the index of an option.
+        option = parameter.options[int(value)]
+        return {name: {"value": option, "unit": "name"}}
+    if value.ndim == 0:
+        return {name: make_value_with_unit(value, parameter.unit)}
+    return {
+        f"{name}.{index}": make_value_with_unit(number, parameter.unit)
+        for index, number in enumerate(value)
+    }
 
 
 def _to_tensor(constant: ParameterValue, slot: Slot, device: torch.device) -> Tensor:

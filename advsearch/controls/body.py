@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from torch import Tensor
@@ -81,18 +81,29 @@ class BodyControl(Control):
         if requested is None:
             plays_time = geometry.TIME.name in self.specs or not self._settings
             return clips[0] if clips and plays_time else None
-        index = -1  # no index of an animation
-        # The index may be a string, such as "1".
-        if Parameter.is_number(requested) or str(requested).isdecimal():
-            index = int(requested)
-        if requested not in clips and not 0 <= index < len(clips):
+        return self._find_clip(requested)
+
+    def _find_clip(self, requested: float | str) -> str:
+        """Return the name of the animation that the choice `clip` states.
+
+        Args:
+            requested: name of an animation, or its index.
+
+        Raises:
+            UnknownNameError: the mesh has no animation of that name or number.
+        """
+        clips = self.rig.clips
+        if requested in clips:
+            return str(requested)
+        index = _parse_clip_index(requested)
+        if not 0 <= index < len(clips):
             raise errors.UnknownNameError(
                 f"{self.name}.clip",
                 str(requested),
                 clips,
                 f"Animations of {self.mesh_name}.",
             )
-        return str(requested) if requested in clips else clips[index]
+        return clips[index]
 
     def bind_parameters(self) -> None:
         """Check the parameters and the clip against the rig of the mesh.
@@ -102,14 +113,31 @@ class BodyControl(Control):
             UnknownNameError: the rig has no such parameter, or no such clip.
         """
         known = [parameter.name for parameter in self.rig.parameters]
+        self._check_parameters_exist(known)
+        self._check_has_search(known)
+        # The class has parameters of persons, which other rigs do not have.
+        self.instance_parameters = tuple(
+            parameter
+            for parameter in self.instance_parameters
+            if parameter.name in known
+        )
+        self.clip  # noqa: B018 - raises if there is no such animation
+        super().bind_parameters()
+
+    def _check_parameters_exist(self, known: Sequence[str]) -> None:
+        """Raise UnknownNameError for a setting that is no parameter of the rig."""
         for name in self.specs:
             if name not in known:
                 hint = f"It stands in `controls` {self.name}."
                 raise errors.UnknownNameError(
                     f"parameter of {self.mesh_name}", name, known, hint
                 )
-        # Without settings, default ranges are searched: there has to be one. With
-        # settings, `make_space` reports if nothing is searched.
+
+    def _check_has_search(self, known: Sequence[str]) -> None:
+        """Raise InputError if there are no settings, and no default range either.
+
+        With settings, `make_space` reports if nothing is searched.
+        """
         has_default_search = any(
             self.resolve_parameter(parameter).search for parameter in self.parameters
         )
@@ -121,14 +149,6 @@ class BodyControl(Control):
                 "ranges, as in "
                 f"{self.name}={{{example}: [-20, 20]}}"
             )
-        # The class has parameters of persons, which other rigs do not have.
-        self.instance_parameters = tuple(
-            parameter
-            for parameter in self.instance_parameters
-            if parameter.name in known
-        )
-        self.clip  # noqa: B018 - raises if there is no such animation
-        super().bind_parameters()
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter with its default in the rig.
@@ -149,3 +169,13 @@ class BodyControl(Control):
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         return dict(self.rig.get_measurements(values, self.clip))
+
+
+def _parse_clip_index(requested: float | str) -> int:
+    """Return the index of an animation that is a number, or -1 for a name.
+
+    The index may be a string, such as "1".
+    """
+    if Parameter.is_number(requested) or str(requested).isdecimal():
+        return int(requested)
+    return -1

@@ -23,7 +23,7 @@ from advsearch.controls.base import Control, Values
 from advsearch.controls.ranges import Fixed, ParameterValue
 from advsearch.errors import InputError
 from advsearch.scene.assets import is_road_vehicle
-from advsearch.scene.camera_entries import PRESETS
+from advsearch.scene.camera_entries import PRESETS, CameraPreset
 from advsearch.scene.camera_model import (
     COEFFICIENTS,
     COEFFICIENTS_OF_KIND,
@@ -147,15 +147,10 @@ class CameraControl(Control):
                 determine the same number, or the lens does not support a setting.
         """
         self._check_can_orbit(scene)
-        needs_thin_lens = "aperture" in self.specs or "focus" in self.specs
-        if needs_thin_lens and self._sets_shift:
-            raise InputError(
-                f"`controls` {self.name}: a shifted picture together with an aperture "
-                "is not supported; leave one of them out"
-            )
+        if self._sets_thin_lens:
+            self._check_not_shifted()
         if "azimuth" in self.specs and self._drives_against_traffic(scene):
             scene = replace(scene, remarks=(*scene.remarks, make_traffic_remark(scene)))
-
         distortion_names = [name for name in COEFFICIENTS if name in self.specs]
         if distortion_names and scene.camera_model is None:
             pinhole = make_pinhole(scene.get_number("camera.fov"), scene.aspect)
@@ -163,9 +158,22 @@ class CameraControl(Control):
         if scene.camera_model is not None:
             # raises if the settings need a thin lens as well
             self._check_lens(scene.camera_model, distortion_names)
-        elif needs_thin_lens:
+        elif self._sets_thin_lens:
             scene = replace(scene, thin_lens=True)
         return scene
+
+    @property
+    def _sets_thin_lens(self) -> bool:
+        """Whether a setting needs a thin lens: an aperture, or a distance in focus."""
+        return "aperture" in self.specs or "focus" in self.specs
+
+    def _check_not_shifted(self) -> None:
+        """Raise InputError if the image is shifted, which a thin lens can't do."""
+        if self._sets_shift:
+            raise InputError(
+                f"`controls` {self.name}: a shifted picture together with an aperture "
+                "is not supported; leave one of them out"
+            )
 
     def _check_can_orbit(self, scene: SceneDescription) -> None:
         """Check that the scene's camera orbits, and that no number is set twice.
@@ -199,13 +207,7 @@ class CameraControl(Control):
             InputError: this kind of lens does not have a number that was set.
         """
         supported_names = COEFFICIENTS_OF_KIND[model.kind]
-        for name in distortion_names:
-            if name not in supported_names:
-                coefficients = ", ".join(supported_names) or "none"
-                raise InputError(
-                    f"`controls` {self.name}: a {model.kind} lens has the "
-                    f"coefficients {coefficients}, not {name}"
-                )
+        self._check_coefficients(model.kind, distortion_names)
         unsupported_names = ["aperture", "focus"]
         is_from_file = model.name != ""
         if is_from_file:  # it has its own focal length
@@ -217,7 +219,22 @@ class CameraControl(Control):
         lens = "a lens with distortion, or raindrops"
         if is_from_file:
             lens = f"the lens of `camera={model.name}`"
-        for name in unsupported_names:
+        self._check_is_unset(unsupported_names, lens)
+
+    def _check_coefficients(self, kind: str, names: Sequence[str]) -> None:
+        """Raise InputError for a distortion coefficient that a kind of lens lacks."""
+        supported_names = COEFFICIENTS_OF_KIND[kind]
+        for name in names:
+            if name not in supported_names:
+                coefficients = ", ".join(supported_names) or "none"
+                raise InputError(
+                    f"`controls` {self.name}: a {kind} lens has the "
+                    f"coefficients {coefficients}, not {name}"
+                )
+
+    def _check_is_unset(self, names: Sequence[str], lens: str) -> None:
+        """Raise InputError if the user set one of some parameters, with this lens."""
+        for name in names:
             if name in self.specs:
                 raise InputError(
                     f"`controls` {self.name}: {name} is not supported "
@@ -269,22 +286,34 @@ class CameraControl(Control):
         # The camera is focused on the object. So all three are the distance of the object:
         # "sizes" in object sizes, the others in metres if the object's size is known.
         # (`size_in_metres` of the scene is 1 if it is not.)
-        if name in ("distance", "focus", "sizes"):
-            # The default distance depends on the field of view.
-            fixed_lens_scene = self._with_fixed_lens()
-            camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
-            offset = camera_position - compute_center(fixed_lens_scene)
-            distance_in_sizes = float(np.linalg.norm(offset))
-            if name == "sizes":
-                return distance_in_sizes
-            return distance_in_sizes * scene.size_in_metres
+        if name == "sizes":
+            return self._find_default_distance()
+        if name in ("distance", "focus"):
+            return self._find_default_distance() * scene.size_in_metres
         if name == "height":
-            camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
-            return camera_height * scene.size_in_metres
+            return self._find_default_height()
         if name == "focal_length":
             half_fov = math.radians(scene.get_number("camera.fov")) / 2.0
             return SENSOR_WIDTH / 2.0 / math.tan(half_fov)
         return parameter.default
+
+    def _find_default_height(self) -> float:
+        """Return the height of the camera in the scene.
+
+        It is in metres if the object's size is known, else in object sizes.
+        """
+        camera_height = float(camera_to_world(self._with_fixed_lens())[2, 3])
+        return camera_height * self.scene.size_in_metres
+
+    def _find_default_distance(self) -> float:
+        """Return the camera's distance from the object's center, in object sizes.
+
+        It depends on the field of view.
+        """
+        fixed_lens_scene = self._with_fixed_lens()
+        camera_position = camera_to_world(fixed_lens_scene)[:3, 3]
+        offset = camera_position - compute_center(fixed_lens_scene)
+        return float(np.linalg.norm(offset))
 
     def _find_search_range(
         self, parameter: Parameter, default: ParameterValue
@@ -304,27 +333,33 @@ class CameraControl(Control):
         Returns:
             Lower and upper bound; None if the parameter is not searched by default.
         """
-        scene = self.scene
         name = parameter.name
         search = parameter.search
-        preset = PRESETS.get(scene.preset)
-        if preset is not None and name == "azimuth":
-            max_turn = preset.search_azimuth
-            if max_turn >= 180.0:
-                return 0.0, 360.0
-            scene_azimuth = scene.get_number("camera.azimuth")
-            return scene_azimuth - max_turn, scene_azimuth + max_turn
+        preset = PRESETS.get(self.scene.preset)
         if preset is not None:
-            return preset.search_ranges.get(name)  # None if it has no such range
-        if is_road_vehicle(scene.object) and name == "elevation":
+            return self._find_preset_range(preset, name)
+        is_around_vehicle = is_road_vehicle(self.scene.object)
+        if is_around_vehicle and name == "elevation":
             return None
-        if is_road_vehicle(scene.object) and name == "height":
+        if is_around_vehicle and name == "height":
             # A road vehicle has a size in metres, so the height is in metres. The range
             # is extended if the camera's default height is above it.
             return ROAD_USER_HEIGHTS[0], max(ROAD_USER_HEIGHTS[1], float(default))
         if name == "distance" and search is not None:
             return search[0] * float(default), search[1] * float(default)
         return search
+
+    def _find_preset_range(
+        self, preset: CameraPreset, name: str
+    ) -> tuple[float, float] | None:
+        """Return the range of a parameter by a preset; None if it is not searched."""
+        if name != "azimuth":
+            return preset.search_ranges.get(name)
+        max_turn = preset.search_azimuth
+        if max_turn >= 180.0:
+            return 0.0, 360.0
+        scene_azimuth = self.scene.get_number("camera.azimuth")
+        return scene_azimuth - max_turn, scene_azimuth + max_turn
 
     def get_setting_name(self, parameter: Parameter) -> str:
         equivalent_settings = {"focal_length": "camera.fov", "sizes": "camera.distance"}
@@ -344,33 +379,46 @@ class CameraControl(Control):
             earlier_inputs: inputs of earlier controls, which are not used.
         """
         scene = self.scene
-        fov = values["fov"]
-        if "focal_length" in self.specs:
-            fov = _compute_fov(values["focal_length"])
+        fov = self._select_fov(values)
         distance = self._compute_distance(values, fov)
         inputs = {"camera.to_world": self._compute_pose(values, distance)}
-        if scene.camera_model is not None:
-            inputs["camera.lens"] = self._compute_model_numbers(
-                scene.camera_model, values, fov
-            )
-        else:
-            inputs["camera.fov"] = fov.reshape(1)
-        sets_thin_lens = "aperture" in self.specs or "focus" in self.specs
-        if scene.thin_lens and sets_thin_lens:
-            # A thin lens needs a positive aperture.
-            inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
-            focus = distance  # in object sizes, as scene inputs are
-            if "focus" in self.specs:  # in metres
-                focus = values["focus"] / scene.size_in_metres
-            inputs["camera.focus"] = focus.reshape(1)
+        inputs |= self._compute_lens_inputs(values, fov)
+        if scene.thin_lens and self._sets_thin_lens:
+            inputs |= self._compute_thin_lens_inputs(values, distance)
         if scene.camera_model is None and self._sets_shift:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
             # The renderer applies the scene's own exposure already.
-            inputs["camera.exposure"] = values["exposure"] - scene.get_number(
-                "camera.exposure"
-            )
+            scene_exposure = scene.get_number("camera.exposure")
+            inputs["camera.exposure"] = values["exposure"] - scene_exposure
         return inputs
+
+    def _select_fov(self, values: Values) -> Tensor:
+        """Return the field of view () in degrees, that of the focal length if it is set."""
+        if "focal_length" in self.specs:
+            return _compute_fov(values["focal_length"])
+        return values["fov"]
+
+    def _compute_lens_inputs(self, values: Values, fov: Tensor) -> dict[str, Tensor]:
+        """Return the numbers of the camera model, or without one the field of view."""
+        model = self.scene.camera_model
+        if model is None:
+            return {"camera.fov": fov.reshape(1)}
+        return {"camera.lens": self._compute_model_numbers(model, values, fov)}
+
+    def _compute_thin_lens_inputs(
+        self, values: Values, distance: Tensor
+    ) -> dict[str, Tensor]:
+        """Return aperture and focus (1,), both in object sizes.
+
+        Without a stated focus, it is the distance () of the object.
+        """
+        # A thin lens needs a positive aperture.
+        aperture = values["aperture"].clamp_min(1e-5).reshape(1)
+        focus = distance
+        if "focus" in self.specs:  # in metres
+            focus = values["focus"] / self.scene.size_in_metres
+        return {"camera.aperture": aperture, "camera.focus": focus.reshape(1)}
 
     def _compute_model_numbers(
         self, model: CameraModel, values: Values, fov: Tensor
@@ -390,16 +438,7 @@ class CameraControl(Control):
         }
         is_pinhole = model.name == ""
         if is_pinhole:
-            aspect = self.scene.aspect  # width over height
-            # Focal length in lengths of the longer side, which the field of view is
-            # along. The model has "fx" in widths and "fy" in heights of the image.
-            focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
-            longer_side_in_widths = max(1.0, 1.0 / aspect)
-            longer_side_in_heights = max(1.0, aspect)
-            model_values |= {
-                "fx": focal * longer_side_in_widths,
-                "fy": focal * longer_side_in_heights,
-            }
+            model_values |= self._compute_focal_lengths(fov)
         coefficients_set_by_user = [name for name in COEFFICIENTS if name in self.specs]
         model_values |= {name: values[name] for name in coefficients_set_by_user}
         model_values |= {
@@ -407,6 +446,21 @@ class CameraControl(Control):
             "cy": model_values["cy"] + values["shift_y"],
         }
         return torch.stack([model_values[name].to(fov) for name in NUMBER_NAMES])
+
+    def _compute_focal_lengths(self, fov: Tensor) -> dict[str, Tensor]:
+        """Return the focal lengths () "fx" and "fy" of a pinhole by its field of view.
+
+        They are in widths and in heights of the image.
+        """
+        aspect = self.scene.aspect  # width over height
+        # in lengths of the longer side, which the field of view is along
+        focal = 0.5 / torch.tan(torch.deg2rad(fov) / 2.0)
+        longer_side_in_widths = max(1.0, 1.0 / aspect)
+        longer_side_in_heights = max(1.0, aspect)
+        return {
+            "fx": focal * longer_side_in_widths,
+            "fy": focal * longer_side_in_heights,
+        }
 
     def _with_fixed_lens(self) -> SceneDescription:
         """Return the scene with the field of view of this control, if it is fixed.
@@ -490,20 +544,8 @@ class CameraControl(Control):
         azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
         elevation = self._compute_elevation(values, distance)
         roll = torch.deg2rad(values["roll"])
-        zero = torch.zeros_like(azimuth)
-        # from the object's center to the camera
-        outwards = torch.stack(
-            [
-                elevation.cos() * azimuth.cos(),
-                elevation.cos() * azimuth.sin(),
-                elevation.sin(),
-            ]
-        )
-        # Axes without roll: left is level, and up is at right angles to left and to
-        # the direction of view. E.g. at azimuth 0 the camera is at +x and looks along
-        # -x, so that -y is on its left.
-        level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
-        level_up = torch.linalg.cross(-outwards, level_left)
+        outwards = _compute_orbit_direction(azimuth, elevation)
+        level_left, level_up = _compute_level_axes(azimuth, outwards)
         # A positive roll turns the camera clockwise, as seen from behind it: its left
         # axis turns towards up, and its up axis towards the right.
         left = roll.cos() * level_left + roll.sin() * level_up
@@ -512,6 +554,36 @@ class CameraControl(Control):
         center = torch.from_numpy(compute_center(self.scene)).to(distance)
         position = center + distance * outwards
         return make_affine(torch.stack([left, up, forward], dim=1), position)
+
+
+def _compute_level_axes(azimuth: Tensor, outwards: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the axes left and up (3,) of a camera on the orbit that has no roll.
+
+    Left is level, and up is at right angles to left and to the direction of view. E.g.
+    at azimuth 0 the camera is at +x and looks along -x, so that -y is on its left.
+
+    Args:
+        azimuth: () angle of the camera around the object, radians.
+        outwards: (3,) unit direction from the object's center to the camera.
+    """
+    zero = torch.zeros_like(azimuth)
+    level_left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
+    level_up = torch.linalg.cross(-outwards, level_left)
+    return level_left, level_up
+
+
+def _compute_orbit_direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
+    """Return the direction (3,) from the object's center to the camera.
+
+    Both angles () are in radians.
+    """
+    return torch.stack(
+        [
+            elevation.cos() * azimuth.cos(),
+            elevation.cos() * azimuth.sin(),
+            elevation.sin(),
+        ]
+    )
 
 
 def adapt_length_unit(parameter: Parameter, has_metres: bool) -> Parameter:

@@ -103,24 +103,30 @@ def find_vessel(asset: assets.ObjectAsset) -> Vessel | None:
     depth = rim - floor
     highest_level = floor + FILL_LIMIT * depth
     heights = np.linspace(floor, highest_level, WALL_ROWS)
+    # The lowest rays are cast a little above the floor, and stand for the wall at the
+    # floor.
     min_height = floor + MIN_RAY_HEIGHT * depth
-    distances = []
-    faces = []
-    for height in heights:
-        # The lowest rays are cast a little above the floor, and stand for the wall at
-        # the floor.
-        ray_height = max(float(height), min_height)
-        row_distances, row_faces = _find_wall(mesh, axis, ray_height)
-        distances.append(row_distances)
-        faces.append(row_faces)
-    radii = _fill_missed_radii(np.stack(distances))
+    rows = [_find_wall(mesh, axis, max(float(z), min_height)) for z in heights]
+    radii = _fill_missed_radii(np.stack([distances for distances, _ in rows]))
     if radii is None:
         return None
-    # Through the liquid, mostly the lower half of the wall is visible.
-    lower_faces = np.concatenate(faces[: WALL_ROWS // 2])
-    # the index is -1 for a ray that hit no face
-    wall_color = _mean_face_color(asset, lower_faces[lower_faces >= 0])
+    wall_color = _compute_wall_color(asset, [faces for _, faces in rows])
     return Vessel(axis, heights, radii, wall_color)
+
+
+def _compute_wall_color(
+    asset: assets.ObjectAsset, face_rows: list[assets.IntArray]
+) -> assets.Float64Array:
+    """Return the mean color (3,) of a vessel's wall, linear, as seen through a liquid.
+
+    Args:
+        asset: the vessel.
+        face_rows: index of the face that each ray hit, -1 for none; one array (rays,)
+            for each height, ascending.
+    """
+    # Through the liquid, mostly the lower half of the wall is visible.
+    lower_faces = np.concatenate(face_rows[: WALL_ROWS // 2])
+    return _mean_face_color(asset, lower_faces[lower_faces >= 0])
 
 
 def _fill_missed_radii(radii: assets.Float64Array) -> assets.Float64Array | None:
@@ -207,11 +213,27 @@ def _compute_height_map(
     heights = np.full((height, width), below_mesh)
     corners = vertices[mesh.faces.astype(np.int64)]
     in_cells = (corners[..., :2] - lower) / cell
-    face, row, column, weights = images.rasterize_triangles(in_cells, (height, width))
-    # several faces may lie over a cell: the highest one counts
-    np.maximum.at(heights, (row, column), (weights * corners[face, :, 2]).sum(axis=1))
+    _draw_faces(heights, in_cells, corners[..., 2])
     _draw_edges(heights, in_cells, corners[..., 2])
     return lower, cell, heights
+
+
+def _draw_faces(
+    ground: assets.Float64Array,
+    positions: assets.Float64Array,
+    heights: assets.Float64Array,
+) -> None:
+    """Raise a height map (h, w) to triangles, in place.
+
+    Args:
+        ground: (h, w) height map.
+        positions: (F, 3, 2) x and y of the corners, in cells.
+        heights: (F, 3) heights of the corners.
+    """
+    height, width = ground.shape
+    face, row, column, weights = images.rasterize_triangles(positions, (height, width))
+    # several faces may lie over a cell: the highest one counts
+    np.maximum.at(ground, (row, column), (weights * heights[face]).sum(axis=1))
 
 
 def _draw_edges(
@@ -250,18 +272,22 @@ def _fill_with_water(ground: assets.Float64Array) -> assets.Float64Array:
     water[[0, -1]] = ground[[0, -1]]
     water[:, [0, -1]] = ground[:, [0, -1]]
     while True:
-        neighbors = (
-            water[:-2, 1:-1],
-            water[2:, 1:-1],
-            water[1:-1, :-2],
-            water[1:-1, 2:],
-        )
-        lowest = np.minimum.reduce(neighbors)
+        lowest = _find_lowest_neighbor(water)
         level = np.maximum(ground[1:-1, 1:-1], np.minimum(lowest, water[1:-1, 1:-1]))
         has_settled = np.array_equal(level, water[1:-1, 1:-1])
         if has_settled:
             return water
         water[1:-1, 1:-1] = level
+
+
+def _find_lowest_neighbor(levels: assets.Float64Array) -> assets.Float64Array:
+    """Return the lowest of the four neighbors of each inner cell, (h - 2, w - 2)."""
+    above = levels[:-2, 1:-1]
+    below = levels[2:, 1:-1]
+    left = levels[1:-1, :-2]
+    right = levels[1:-1, 2:]
+    lowest: assets.Float64Array = np.minimum.reduce((above, below, left, right))
+    return lowest
 
 
 def _find_weighted_center(
@@ -298,10 +324,25 @@ def _find_wall(
     face, first_end, second_end = _cut_faces(mesh, height)
     if not len(face):
         return np.full(WALL_DIRECTIONS, np.inf), np.full(WALL_DIRECTIONS, -1)
-    first_end = first_end - axis
-    second_end = second_end - axis
-    angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
-    ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    along_ray = _cross_segments(first_end - axis, second_end - axis)
+    nearest = along_ray.argmin(axis=1)
+    distance = along_ray[np.arange(WALL_DIRECTIONS), nearest]
+    return distance, np.where(np.isfinite(distance), face[nearest], -1)
+
+
+def _cross_segments(
+    first_end: assets.Float64Array, second_end: assets.Float64Array
+) -> assets.Float64Array:
+    """Return how far along each ray from the origin S segments are crossed.
+
+    Args:
+        first_end: (S, 2) one end of each segment.
+        second_end: (S, 2) its other end.
+
+    Returns:
+        (K, S) distances, infinite if a ray does not hit a segment.
+    """
+    ray = _make_directions()
     # (K, S) cross products with the ends: positive on the left of a ray, negative on the
     # right, and proportional to the distance from the ray's line.
     first_side = ray[:, :1] * first_end[:, 1] - ray[:, 1:] * first_end[:, 0]
@@ -310,10 +351,13 @@ def _find_wall(
     # where the ray's line crosses the segment, from 0 at its first end to 1
     fraction = first_side / np.where(is_crossed, first_side - second_side, 1.0)
     along_ray = (ray @ first_end.T) * (1.0 - fraction) + (ray @ second_end.T) * fraction
-    along_ray = np.where(is_crossed & (along_ray > 0.0), along_ray, np.inf)
-    nearest = along_ray.argmin(axis=1)
-    distance = along_ray[np.arange(WALL_DIRECTIONS), nearest]
-    return distance, np.where(np.isfinite(distance), face[nearest], -1)
+    return np.where(is_crossed & (along_ray > 0.0), along_ray, np.inf)
+
+
+def _make_directions() -> assets.Float64Array:
+    """Return K = `WALL_DIRECTIONS` even directions (K, 2) from +x counter-clockwise."""
+    angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _cut_faces(
@@ -329,22 +373,37 @@ def _cut_faces(
     is_above = corners[..., 2] > height
     face = np.nonzero(is_above.any(axis=1) & ~is_above.all(axis=1))[0]
     corners = corners[face]
-    is_above = is_above[face]
+    apex_corner = _find_apex(is_above[face])
     index = np.arange(len(face))
-    # (S,) index, 0 to 2, of the corner that is alone on its side of the plane. Both edges
-    # that the plane cuts begin at this corner, the apex.
-    apex_corner = np.where(
-        is_above.sum(axis=1) == 1, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
-    )
     apex = corners[index, apex_corner]
-    ends = []
-    for step in (1, 2):
-        other = corners[index, (apex_corner + step) % 3]
-        # never 0, because the other corner is on the other side of the plane
-        rise = other[:, 2] - apex[:, 2]
-        fraction = (height - apex[:, 2]) / rise
-        ends.append(apex[:, :2] + fraction[:, None] * (other[:, :2] - apex[:, :2]))
-    return face, ends[0], ends[1]
+    # both edges that the plane cuts begin at the apex
+    first_other = corners[index, (apex_corner + 1) % 3]
+    second_other = corners[index, (apex_corner + 2) % 3]
+    first_end = _cut_edges(apex, first_other, height)
+    second_end = _cut_edges(apex, second_other, height)
+    return face, first_end, second_end
+
+
+def _find_apex(is_above: assets.BoolArray) -> assets.IntArray:
+    """Return the corner (S,), 0 to 2, that is alone on its side of a plane.
+
+    `is_above` (S, 3) states which corners of a face are above the plane.
+    """
+    is_alone_above = is_above.sum(axis=1) == 1
+    apex: assets.IntArray = np.where(
+        is_alone_above, is_above.argmax(axis=1), (~is_above).argmax(axis=1)
+    )
+    return apex
+
+
+def _cut_edges(
+    apex: assets.Float64Array, other: assets.Float64Array, height: float
+) -> assets.Float64Array:
+    """Return x and y (S, 2) at a height on the edges from corners (S, 3) to others."""
+    # never 0, because the other corner is on the other side of the plane
+    rise = other[:, 2] - apex[:, 2]
+    fraction = (height - apex[:, 2]) / rise
+    return apex[:, :2] + fraction[:, None] * (other[:, :2] - apex[:, :2])
 
 
 class ContentsControl(Control):
@@ -439,21 +498,23 @@ class ContentsControl(Control):
         bounds = dict[str, tuple[float, float]]()
         for name in INGREDIENTS:
             spec = self.specs.get(name)
-            if spec is None:
-                continue
-            if isinstance(spec, Fixed):
-                bounds[name] = (float(spec.value), float(spec.value))
-            elif type(spec) is Range:  # a distribution is a subclass
-                bounds[name] = (spec.low, spec.high)
-            else:
-                got = "a distribution"
-                if isinstance(spec, OneOf):
-                    got = "a list of values"
-                raise InputError(
-                    f"{self.name}.{name}: expected a number or a range [low, high], "
-                    f"got {got}, with which proportions would not add up to 1"
-                )
+            if spec is not None:
+                bounds[name] = self._get_proportion_bounds(name, spec)
         return bounds
+
+    def _get_proportion_bounds(
+        self, name: str, spec: Fixed | Range | OneOf
+    ) -> tuple[float, float]:
+        """Return the smallest and largest proportion of an ingredient by its spec."""
+        if isinstance(spec, Fixed):
+            return float(spec.value), float(spec.value)
+        if type(spec) is Range:  # a distribution is a subclass
+            return spec.low, spec.high
+        got = "a list of values" if isinstance(spec, OneOf) else "a distribution"
+        raise InputError(
+            f"{self.name}.{name}: expected a number or a range [low, high], "
+            f"got {got}, with which proportions would not add up to 1"
+        )
 
     def _check_total(self, min_total: float) -> None:
         """Check that the proportions can add up to 1.
@@ -472,21 +533,23 @@ class ContentsControl(Control):
         is_too_much = min_total > 1.0 + SUM_TOLERANCE
         if not is_too_little and not is_too_much:
             return
+        raise InputError(
+            f"`controls` {self.name}: expected proportions of water, milk and "
+            f"coffee that add up to 1, got {self._describe_bounds()}; "
+            "change one of them or leave one out"
+        )
+
+    def _describe_bounds(self) -> str:
+        """Return the proportions that are set, such as "water 0.2 to 0.5, milk 0.1"."""
         stated = []
         for name in INGREDIENTS:
             if name in self.proportion_bounds:
-                # "water 0.2 to 0.5", or "water 0.2" for equal bounds
                 lower, upper = self.proportion_bounds[name]
-                stated.append(
-                    f"{name} {lower:g}"
-                    if f"{lower:g}" == f"{upper:g}"
-                    else f"{name} {lower:g} to {upper:g}"
-                )
-        raise InputError(
-            f"`controls` {self.name}: expected proportions of water, milk and "
-            f"coffee that add up to 1, got {', '.join(stated)}; "
-            "change one of them or leave one out"
-        )
+                text = f"{lower:g} to {upper:g}"
+                if f"{lower:g}" == f"{upper:g}":
+                    text = f"{lower:g}"
+                stated.append(f"{name} {text}")
+        return ", ".join(stated)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with a mesh for the surface of the liquid.
@@ -496,6 +559,16 @@ class ContentsControl(Control):
         Raises:
             InputError: the object is no vessel.
         """
+        vessel = self._require_vessel(scene)
+        mesh = _make_liquid_mesh(vessel)
+        black = np.zeros((4, 4, 3), dtype=np.float32)
+        pose = geometry.compute_object_to_world(scene)
+        return scene.with_part(
+            parts.MeshPart(self.name, mesh, black, LIQUID_MATERIAL, to_world=pose)
+        )
+
+    def _require_vessel(self, scene: SceneDescription) -> Vessel:
+        """Return the inside of a scene's object; raise InputError if it has none."""
         vessel = find_vessel(scene.object)
         if vessel is None:
             raise InputError(
@@ -504,22 +577,7 @@ class ContentsControl(Control):
                 f"bowl, a glass), got {scene.object.name!r}; choose another object or "
                 "leave the control out"
             )
-        angle = np.arange(WALL_DIRECTIONS) * 2.0 * np.pi / WALL_DIRECTIONS
-        circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        # Texture coordinates in the order of the vertices: the center, then the circle.
-        # `scene_inputs` replaces the black texture.
-        uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * circle])
-        vertices = _make_liquid_surface(vessel, torch.tensor(0.5)).numpy()
-        mesh = replace(
-            parts.make_polygon(WALL_DIRECTIONS),
-            vertices=vertices,
-            uvs=uvs.astype(np.float32),
-        )
-        black = np.zeros((4, 4, 3), dtype=np.float32)
-        pose = geometry.compute_object_to_world(scene)
-        return scene.with_part(
-            parts.MeshPart(self.name, mesh, black, LIQUID_MATERIAL, to_world=pose)
-        )
+        return vessel
 
     def bind_parameters(self) -> None:
         """Start from the default proportions, or the nearest that are possible."""
@@ -558,9 +616,7 @@ class ContentsControl(Control):
         inputs = {f"{self.name}.offsets": surface - base}
         if "object.to_world" in earlier_inputs:
             inputs[f"{self.name}.to_world"] = earlier_inputs["object.to_world"]
-        proportions = torch.stack([values[name] for name in INGREDIENTS])
-        vessel_color = torch.from_numpy(vessel.color).to(proportions)
-        liquid_color = mix_liquid_color(proportions, vessel_color)
+        liquid_color = _compute_liquid_color(values, vessel)
         # the size of the black texture of `prepare`
         inputs[f"{self.name}.base_color"] = liquid_color.expand(4, 4, 3)
         return inputs
@@ -660,11 +716,25 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
         vessel_color: linear reflectance (3,) of the vessel's inside.
     """
     amounts = dict(zip(INGREDIENTS, proportions, strict=True))
-    absorption = proportions.new_zeros(3)
+    ratio = _compute_absorption_ratio(amounts)
+    # reflectance of an infinitely deep mixture; 1e-9 keeps the derivative finite at 0
+    mixed_color = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
+    opacity = 1.0 - torch.exp(-OPACITY_RATE * (amounts["milk"] + amounts["coffee"]))
+    floor_color = (1.0 - opacity) * vessel_color * proportions.new_tensor(WATER_TINT)
+    return opacity * mixed_color + floor_color
+
+
+def _compute_absorption_ratio(amounts: Mapping[str, Tensor]) -> Tensor:
+    """Return the absorption over the scattering (3,) of a mixture.
+
+    `amounts` are the proportions () by ingredient.
+    """
+    milk = amounts["milk"]
+    absorption = milk.new_zeros(3)
     # Pure water does not scatter. A tiny number avoids a division by 0.
-    scattering = proportions.new_tensor(1e-6)
+    scattering = milk.new_tensor(1e-6)
     for name, reflectance in REFLECTANCE.items():  # milk and coffee
-        deep_reflectance = proportions.new_tensor(reflectance)
+        deep_reflectance = milk.new_tensor(reflectance)
         added_scattering = amounts[name] * SCATTERING[name]
         # Kubelka and Munk: K / S = (1 - R)^2 / (2 R), by the reflectance R of an
         # infinitely deep layer of the ingredient.
@@ -672,12 +742,33 @@ def mix_liquid_color(proportions: Tensor, vessel_color: Tensor) -> Tensor:
             1.0 - deep_reflectance
         ).square() / (2.0 * deep_reflectance)
         scattering = scattering + added_scattering
-    ratio = absorption / scattering
-    # reflectance of an infinitely deep mixture; 1e-9 keeps the derivative finite at 0
-    mixed_color = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
-    opacity = 1.0 - torch.exp(-OPACITY_RATE * (amounts["milk"] + amounts["coffee"]))
-    floor_color = (1.0 - opacity) * vessel_color * proportions.new_tensor(WATER_TINT)
-    return opacity * mixed_color + floor_color
+    return absorption / scattering
+
+
+def _make_liquid_mesh(vessel: Vessel) -> assets.Mesh:
+    """Return the surface of the liquid at half the height, a disk with K corners."""
+    circle = _make_directions()
+    # Texture coordinates in the order of the vertices: the center, then the circle.
+    # `ContentsControl.scene_inputs` replaces the texture.
+    uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * circle])
+    vertices = _make_liquid_surface(vessel, torch.tensor(0.5)).numpy()
+    return replace(
+        parts.make_polygon(WALL_DIRECTIONS),
+        vertices=vertices,
+        uvs=uvs.astype(np.float32),
+    )
+
+
+def _compute_liquid_color(values: Values, vessel: Vessel) -> Tensor:
+    """Return the color (3,) of the liquid in a vessel, linear.
+
+    Args:
+        values: values of the control, the proportion of each ingredient among them.
+        vessel: inside of the vessel, whose color is seen through the liquid.
+    """
+    proportions = torch.stack([values[name] for name in INGREDIENTS])
+    vessel_color = torch.from_numpy(vessel.color).to(proportions)
+    return mix_liquid_color(proportions, vessel_color)
 
 
 def _make_liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
@@ -691,26 +782,33 @@ def _make_liquid_surface(vessel: Vessel, level: Tensor) -> Tensor:
         vessel: inside of the vessel; its wall is known in K directions at some heights.
         level: () from 0 at the floor to 1 at the highest level.
     """
-    heights = torch.from_numpy(vessel.heights).to(level)
-    radii = torch.from_numpy(vessel.radii).to(level)  # (len(heights), K)
-    # a fractional index into the heights, which are evenly spaced
-    position = level * (len(heights) - 1)
-    row = int(position.detach().clamp(0, len(heights) - 2))
-    radius = (
-        torch.lerp(radii[row], radii[row + 1], position - row) * DISK_RADIUS_FRACTION
-    )
+    radius = _interpolate_radius(vessel, level)
     # Factor on the disk's radius: 1 from `SINKING_LEVEL` upwards, and smaller below. It is
     # never 0, so that its faces keep an area.
     shrinkage = (level / SINKING_LEVEL).clamp(1e-3, 1.0)
+    heights = torch.from_numpy(vessel.heights).to(level)
     depth = heights[-1] - heights[0]
     # The disk sinks as it shrinks. At level 0 it is `SINKING_LEVEL` of the depth below the
     # floor (a little less, as the factor is not 0).
     height = heights[0] + level * depth - (1.0 - shrinkage) * SINKING_LEVEL * depth
-    angle = torch.arange(WALL_DIRECTIONS, device=level.device) * (
-        2.0 * torch.pi / WALL_DIRECTIONS
-    )
-    circle = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
-    rim = circle * (radius * shrinkage)[:, None]
+    rim = _make_unit_circle(level.device) * (radius * shrinkage)[:, None]
     axis = torch.from_numpy(vessel.axis).to(level)
     positions = torch.cat([rim.new_zeros(1, 2), rim]) + axis  # (1 + K, 2)
     return torch.cat([positions, height.expand(len(positions), 1)], dim=1)
+
+
+def _interpolate_radius(vessel: Vessel, level: Tensor) -> Tensor:
+    """Return the radius (K,) of the liquid's surface in each direction, at a level ()."""
+    radii = torch.from_numpy(vessel.radii).to(level)  # (n heights, K)
+    # a fractional index into the heights, which are evenly spaced
+    position = level * (len(radii) - 1)
+    row = int(position.detach().clamp(0, len(radii) - 2))
+    wall_radius = torch.lerp(radii[row], radii[row + 1], position - row)
+    return wall_radius * DISK_RADIUS_FRACTION
+
+
+def _make_unit_circle(device: torch.device) -> Tensor:
+    """Return x and y (K, 2) of the directions in which a vessel's wall is known."""
+    step = 2.0 * torch.pi / WALL_DIRECTIONS
+    angle = torch.arange(WALL_DIRECTIONS, device=device) * step
+    return torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)

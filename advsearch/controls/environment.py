@@ -136,30 +136,46 @@ class EnvironmentControl(Control):
             InputError: the scene has no environment and needs one.
         """
         allowed = self.list_allowed_values("which", SCENE_ENVIRONMENT)
-        assets_by_file = {
-            str(name): _load_environment(str(name))
-            for name in allowed
-            if _is_file(name)
-        }
-        notes = [note for asset in assets_by_file.values() for note in asset.warnings]
-        is_scene_environment_allowed = (
-            SCENE_ENVIRONMENT in allowed
-            or self._find_scene_environment_name(scene) is not None
-        )
+        files = [str(name) for name in allowed if _is_file(name)]
+        notes = _list_environment_notes(files)
+        keeps_environment = self._keeps_environment(scene, allowed)
         is_fixed = isinstance(self.specs.get("which"), Fixed)
-        if not is_scene_environment_allowed and (is_fixed or assets_by_file):
+        if not keeps_environment and (is_fixed or files):
             name = str(allowed[0])
             scene = replace(
                 scene, environment=_load_environment(name), environment_spec=name
             )
         else:
-            # raises if the scene has none
-            environment = scene.require_environment(f"`controls` {self.name}")
-            shows_photograph = scene.photograph is not None or environment.photographed
-            # A photograph shows its own floor instead of the table.
-            if assets_by_file and not shows_photograph:
-                notes += _describe_table(scene, list(assets_by_file))
+            notes += self._list_table_notes(scene, files)
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
+
+    def _list_table_notes(
+        self, scene: SceneDescription, files: Sequence[str]
+    ) -> list[str]:
+        """List the note that the object stands on the scene's table in all environments.
+
+        Args:
+            scene: scene that keeps its environment.
+            files: environment files to choose from; without any, there is no note.
+
+        Raises:
+            InputError: the scene has no environment.
+        """
+        environment = scene.require_environment(f"`controls` {self.name}")
+        shows_photograph = scene.photograph is not None or environment.photographed
+        # A photograph shows its own floor instead of the table.
+        if not files or shows_photograph:
+            return []
+        return _describe_table(scene, list(dict.fromkeys(files)))
+
+    def _keeps_environment(
+        self, scene: SceneDescription, allowed: Sequence[ParameterValue]
+    ) -> bool:
+        """Return whether a scene's own environment is among the allowed names."""
+        return (
+            SCENE_ENVIRONMENT in allowed
+            or self._find_scene_environment_name(scene) is not None
+        )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return a parameter; the default of `which` is the scene's own environment.
@@ -229,17 +245,9 @@ class EnvironmentControl(Control):
         The scene's own rotation and exposure are applied when it is rendered, so that
         only the differences from these are applied here.
         """
-        which, *_ = self.instance_parameters
-        name = which.options[int(values["which"])]
-        device = values["rotation"].device
-        is_scene_map = name == SCENE_ENVIRONMENT or _is_scene_environment(
-            name, self.scene
-        )
-        other_asset = None if is_scene_map else _load_environment(name)
-        base = _load_map(self.scene, other_asset).to(device)
-        rotated = rotate_map(
-            base, values["rotation"] - self.scene.get_number("environment.rotation")
-        )
+        base = self._load_chosen_map(values).to(values["rotation"].device)
+        scene_rotation = self.scene.get_number("environment.rotation")
+        rotated = rotate_map(base, values["rotation"] - scene_rotation)
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
         # an exposure is in stops, each of which doubles the light
         stops = values["exposure"] - self.scene.get_number("environment.exposure")
@@ -249,6 +257,22 @@ class EnvironmentControl(Control):
             added_light = compute_harmonic_light(values["harmonics"], base)
             lit = (lit + added_light).clamp_min(0.0)
         return {"environment.data": lit}
+
+    def _load_chosen_map(self, values: Values) -> Tensor:
+        """Return the map (H, W, 3) of the environment that `which` selects."""
+        which, *_ = self.instance_parameters
+        name = which.options[int(values["which"])]
+        is_scene_map = name == SCENE_ENVIRONMENT or _is_scene_environment(
+            name, self.scene
+        )
+        other_asset = None if is_scene_map else _load_environment(name)
+        return _load_map(self.scene, other_asset)
+
+
+def _list_environment_notes(files: Iterable[str]) -> list[str]:
+    """List the notes on environment files; a file that comes twice has them once."""
+    assets_by_file = {name: _load_environment(name) for name in files}
+    return [note for asset in assets_by_file.values() for note in asset.warnings]
 
 
 def _describe_table(scene: SceneDescription, files: Sequence[str]) -> list[str]:

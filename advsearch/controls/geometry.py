@@ -25,6 +25,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from scipy import linalg, sparse
 from scipy.sparse import linalg as sparse_linalg
@@ -42,7 +43,13 @@ from advsearch.controls.base import (
     make_value_with_unit,
 )
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Float64Array, IntArray, Mesh, compute_area_vectors
+from advsearch.scene.assets import (
+    BoolArray,
+    Float64Array,
+    IntArray,
+    Mesh,
+    compute_area_vectors,
+)
 from advsearch.scene.raster import weld_vertices
 
 CELL_SIZE = 0.035
@@ -187,12 +194,32 @@ def compute_shape_modes(mesh: Mesh, count: int) -> Float64Array:
     energy = (1.0 - eigenvalues) / kernel_width**2
     # (functions, 3, count)
     combination = _combine_without_rotation(landmarks, functions, mass, energy, count)
-
-    # Nystrom extension from the landmarks to all positions: a weighted mean, divided
-    # by the eigenvalue. Small eigenvalues would amplify noise.
     weights = _compute_landmark_weights(
         welded_mesh.positions, landmarks, kernel_width, density
     )
+    return _extend_fields(weights, functions, eigenvalues, combination)
+
+
+def _extend_fields(
+    weights: Float64Array,
+    functions: Float64Array,
+    eigenvalues: Float64Array,
+    combination: Float64Array,
+) -> Float64Array:
+    """Extend fields from landmarks to all positions of a mesh (Nystrom).
+
+    A field becomes a weighted mean, divided by the eigenvalue. Small eigenvalues would
+    amplify noise.
+
+    Args:
+        weights: (P, N) weights of the landmarks at the positions.
+        functions: (N, S) functions at the landmarks.
+        eigenvalues: (S,) eigenvalue of each function.
+        combination: (S, 3, K) weight of each function in each component of a field.
+
+    Returns:
+        (P, 3, K) fields, each with a largest length of 1.
+    """
     extended = weights @ (functions / np.maximum(eigenvalues, MIN_EIGENVALUE))
     # p positions, s scalar functions, c axes, k fields
     fields = np.einsum("ps,sck->pck", extended, combination)
@@ -238,11 +265,9 @@ def _compute_smooth_functions(
     # A symmetric matrix with the same eigenvalues. Its eigenvectors are those functions
     # times the square root of the mass.
     symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
-    # A sparse matrix without negligible entries, for the Lanczos method. Dense solvers
-    # run in many threads, and take ten times as long on a busy machine.
-    matrix = sparse.csr_matrix(
-        np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0)
-    )
+    # The Lanczos method takes a sparse matrix. Dense solvers run in many threads, and
+    # take ten times as long on a busy machine.
+    matrix = sparse.csr_matrix(_drop_negligible_entries(symmetric))
     # a fixed start, so that the result is deterministic
     first_vector = np.cos(np.arange(len(mass)))
     n_lanczos_vectors = min(len(mass), 4 * (n_functions + 1))
@@ -253,6 +278,11 @@ def _compute_smooth_functions(
     selected = np.argsort(-eigenvalues)[1:]
     functions = _fix_signs(vectors[:, selected]) / np.sqrt(mass)[:, None]
     return functions, eigenvalues[selected]
+
+
+def _drop_negligible_entries(matrix: Float64Array) -> Float64Array:
+    """Return a matrix (N, N) whose entries below 1e-7 of the largest one are 0."""
+    return np.asarray(np.where(matrix > 1e-7 * matrix.max(), matrix, 0.0))
 
 
 def _fix_signs(vectors: Float64Array) -> Float64Array:
@@ -271,6 +301,21 @@ def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
     into cubic cells, and all points in one cell are averaged to one landmark. Cells are
     enlarged until there are at most `MAX_LANDMARKS`; their final size is returned.
     """
+    samples = _sample_surface(welded_mesh)
+    pool = np.concatenate([samples, welded_mesh.positions])
+    cell_size = CELL_SIZE * welded_mesh.extent
+    while True:
+        cell_index = _find_cells(pool, cell_size)
+        n_cells = int(cell_index.max()) + 1
+        if n_cells <= MAX_LANDMARKS:
+            break
+        cell_size *= 1.15
+    sums = [np.bincount(cell_index, pool[:, axis]) for axis in range(3)]
+    return np.stack(sums, axis=1) / np.bincount(cell_index)[:, None], cell_size
+
+
+def _sample_surface(welded_mesh: WeldedMesh) -> Float64Array:
+    """Return `N_SURFACE_SAMPLES` points (N, 3) on a surface, evenly spread by area."""
     corners = welded_mesh.positions[welded_mesh.faces]
     areas = np.linalg.norm(compute_area_vectors(corners), axis=1)
     generator = np.random.default_rng(0)
@@ -279,19 +324,14 @@ def _sample_landmarks(welded_mesh: WeldedMesh) -> tuple[Float64Array, float]:
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), quantiles)
     face = face.clip(max=len(areas) - 1)  # if the sum is rounded to less than 1
     barycentric = generator.dirichlet((1.0, 1.0, 1.0), N_SURFACE_SAMPLES)
-    samples = np.einsum("nk,nkc->nc", barycentric, corners[face])
-    pool = np.concatenate([samples, welded_mesh.positions])
-    cell_size = CELL_SIZE * welded_mesh.extent
-    while True:
-        cubes = np.floor((pool - pool.min(axis=0)) / cell_size).astype(np.int64)
-        # index, among the cells with points, of the cell that each point lies in
-        cell_index = np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
-        n_cells = int(cell_index.max()) + 1
-        if n_cells <= MAX_LANDMARKS:
-            break
-        cell_size *= 1.15
-    sums = [np.bincount(cell_index, pool[:, axis]) for axis in range(3)]
-    return np.stack(sums, axis=1) / np.bincount(cell_index)[:, None], cell_size
+    samples: Float64Array = np.einsum("nk,nkc->nc", barycentric, corners[face])
+    return samples
+
+
+def _find_cells(points: Float64Array, cell_size: float) -> npt.NDArray[np.intp]:
+    """Return the index (N,) of the cubic cell, among those with points, of each point."""
+    cubes = np.floor((points - points.min(axis=0)) / cell_size).astype(np.int64)
+    return np.unique(cubes, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _combine_without_rotation(
@@ -322,24 +362,44 @@ def _combine_without_rotation(
         (S, 3, count), the weight of each function in each component of a field.
     """
     n_functions = functions.shape[1]
-    center = (points * mass[:, None]).sum(axis=0) / mass.sum()
-    # (N, 3) displacements by a small rotation about each axis
-    turns = [np.cross(axis, points - center) for axis in np.eye(3)]
-    # (3, 3 S) coefficients of the three rotations: projections on the functions
-    rotations = np.stack(
-        [(functions.T @ (mass[:, None] * turn)).reshape(-1) for turn in turns]
-    )
+    rotations = _compute_rotation_coefficients(points, functions, mass)
     # (3 S, M) orthonormal basis of the fields without rotation
     basis = linalg.null_space(rotations)
-    # The energy of a field is the sum of energy times weight squared over all weights: a
-    # diagonal quadratic form of the coefficients. Here it is written in the basis.
-    energy_of_coefficient = np.repeat(energy, 3)[:, None]
-    basis_energy = basis.T @ (energy_of_coefficient * basis)
     # Eigenvectors by ascending energy. The first ones are the smoothest fields.
-    _, vectors = linalg.eigh(basis_energy)
+    _, vectors = linalg.eigh(_compute_basis_energy(basis, energy))
     n_fields = min(count, basis.shape[1])
     fields = _fix_signs(basis @ vectors[:, :n_fields])
     return np.asarray(fields.reshape(n_functions, 3, n_fields))
+
+
+def _compute_basis_energy(basis: Float64Array, energy: Float64Array) -> Float64Array:
+    """Return the energy of fields as a quadratic form (M, M) in a basis of fields.
+
+    The energy of a field is the sum of energy times weight squared over all weights: a
+    diagonal quadratic form of the coefficients.
+
+    Args:
+        basis: (3 S, M) coefficients of each field of the basis.
+        energy: (S,) how fast each function varies.
+    """
+    energy_of_coefficient = np.repeat(energy, 3)[:, None]
+    return np.asarray(basis.T @ (energy_of_coefficient * basis))
+
+
+def _compute_rotation_coefficients(
+    points: Float64Array, functions: Float64Array, mass: Float64Array
+) -> Float64Array:
+    """Return the coefficients (3, 3 S) of rotations about the three axes.
+
+    They are projections of the rotations of points (N, 3) on functions (N, S), which are
+    orthonormal under the mass (N,).
+    """
+    center = (points * mass[:, None]).sum(axis=0) / mass.sum()
+    # (N, 3) displacements by a small rotation about each axis
+    turns = [np.cross(axis, points - center) for axis in np.eye(3)]
+    return np.stack(
+        [(functions.T @ (mass[:, None] * turn)).reshape(-1) for turn in turns]
+    )
 
 
 # ---- one push per vertex
@@ -399,15 +459,7 @@ def _compute_wall_laplacian(welded_mesh: WeldedMesh) -> tuple[Any, float]:
     Returns:
         The sparse Laplacian (P, P), and the mean length of an edge.
     """
-    count = len(welded_mesh.positions)
-    edges = np.concatenate(
-        [
-            welded_mesh.faces[:, [0, 1]],
-            welded_mesh.faces[:, [1, 2]],
-            welded_mesh.faces[:, [2, 0]],
-        ]
-    )
-    edges = np.unique(np.sort(edges, axis=1), axis=0)
+    edges = _list_edges(welded_mesh.faces)
     edge_vectors = (
         welded_mesh.positions[edges[:, 0]] - welded_mesh.positions[edges[:, 1]]
     )
@@ -418,12 +470,24 @@ def _compute_wall_laplacian(welded_mesh: WeldedMesh) -> tuple[Any, float]:
     wall_weights = np.full(len(welded_mesh.walls), WALL_WEIGHT)
     links = np.concatenate([edges, welded_mesh.walls])
     weights = np.concatenate([edge_weights, wall_weights])
+    laplacian = _make_laplacian(links, weights, len(welded_mesh.positions))
+    return laplacian, mean_length
+
+
+def _list_edges(faces: IntArray) -> IntArray:
+    """Return the edges (E, 2) of faces (F, 3), each once."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return np.unique(np.sort(edges, axis=1), axis=0)
+
+
+def _make_laplacian(links: IntArray, weights: Float64Array, count: int) -> Any:
+    """Return the sparse Laplacian (count, count) of weighted links (L, 2)."""
     adjacency = sparse.coo_matrix(
         (weights, (links[:, 0], links[:, 1])), shape=(count, count)
     ).tocsr()
     adjacency = adjacency + adjacency.T
     degree = np.asarray(adjacency.sum(axis=1)).reshape(-1)
-    return sparse.diags(degree) - adjacency, mean_length
+    return sparse.diags(degree) - adjacency
 
 
 class _Solve(torch.autograd.Function):
@@ -445,6 +509,36 @@ class _Solve(torch.autograd.Function):
 
 
 # ---- limits
+
+
+def _find_slivers(edge_1: Float64Array, edge_2: Float64Array) -> BoolArray:
+    """Return which faces (F,) are slivers, from two of their edges (F, 3)."""
+    edges = np.stack([edge_1, edge_2, edge_1 - edge_2])
+    longest = np.linalg.norm(edges, axis=-1).max(axis=0)
+    double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
+    # The height over the longest edge is `double_area / longest`.
+    is_limited: BoolArray = double_area > MIN_FACE_HEIGHT * longest**2
+    return ~is_limited
+
+
+def _compute_gradient_factors(
+    edge_1: Float64Array, edge_2: Float64Array
+) -> Float64Array:
+    """Return the factors (F, 3) of `DisplacementLimits`, from two edges (F, 3)."""
+    double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
+    length_1 = np.linalg.norm(edge_1, axis=1)
+    # Edge 2 is a multiple of edge 1, plus the height over edge 1.
+    projection = (edge_1 * edge_2).sum(axis=1) / length_1
+    multiple = projection / length_1
+    inverse_height = length_1 / double_area
+    return np.stack([1.0 / length_1, multiple, inverse_height], axis=1)
+
+
+def _measure_wall_widths(welded_mesh: WeldedMesh) -> Float64Array:
+    """Return the distance (W,) between both sides of each wall of a mesh."""
+    first_side = welded_mesh.positions[welded_mesh.walls[:, 0]]
+    second_side = welded_mesh.positions[welded_mesh.walls[:, 1]]
+    return np.asarray(np.linalg.norm(first_side - second_side, axis=1))
 
 
 class DisplacementLimits:
@@ -480,29 +574,14 @@ class DisplacementLimits:
         corners = welded_mesh.positions[welded_mesh.faces]
         edge_1 = corners[:, 1] - corners[:, 0]
         edge_2 = corners[:, 2] - corners[:, 0]
-        edges = np.stack([edge_1, edge_2, edge_1 - edge_2])
-        longest = np.linalg.norm(edges, axis=-1).max(axis=0)
-        double_area = np.linalg.norm(np.cross(edge_1, edge_2), axis=1)
-        # The height over the longest edge is `double_area / longest`.
-        is_limited = double_area > MIN_FACE_HEIGHT * longest**2  # others are slivers
-        edge_1 = edge_1[is_limited]
-        edge_2 = edge_2[is_limited]
-        double_area = double_area[is_limited]
-        length_1 = np.linalg.norm(edge_1, axis=1)
-        # Edge 2 is a multiple of edge 1, plus the height over edge 1.
-        projection = (edge_1 * edge_2).sum(axis=1) / length_1
-        multiple = projection / length_1
-        inverse_height = length_1 / double_area
+        is_limited = ~_find_slivers(edge_1, edge_2)
+        gradient_factors = _compute_gradient_factors(
+            edge_1[is_limited], edge_2[is_limited]
+        )
         self._faces = torch.from_numpy(welded_mesh.faces[is_limited])
-        self._gradient_factors = torch.from_numpy(
-            np.stack([1.0 / length_1, multiple, inverse_height], axis=1)
-        )
+        self._gradient_factors = torch.from_numpy(gradient_factors)
         self._walls = torch.from_numpy(welded_mesh.walls)
-        wall_vectors = (
-            welded_mesh.positions[welded_mesh.walls[:, 0]]
-            - welded_mesh.positions[welded_mesh.walls[:, 1]]
-        )
-        self._wall_widths = torch.from_numpy(np.linalg.norm(wall_vectors, axis=1))
+        self._wall_widths = torch.from_numpy(_measure_wall_widths(welded_mesh))
         self._positions = torch.from_numpy(welded_mesh.positions)
 
     def compute_squared_usage(self, field: Tensor) -> Tensor:
@@ -518,21 +597,26 @@ class DisplacementLimits:
         Returns:
             (N,): of positions first, then of faces, then of walls.
         """
-        walls = self._walls.to(field.device)
-        wall_widths = self._wall_widths.to(field.device)
         squared_gradient = self._compute_squared_gradients(field)
         face_usage = squared_gradient * (self.epsilon / MAX_FACE_STRAIN) ** 2
-        # The derivative of `index_select` is ten times faster than that of indexing.
-        difference = field.index_select(0, walls[:, 0]) - field.index_select(
-            0, walls[:, 1]
-        )
-        wall_usage = (
-            difference.square().sum(dim=1)
-            * (self.epsilon / MAX_WALL_STRAIN / wall_widths).square()
-        )
+        wall_usage = self._compute_squared_wall_usage(field)
         # |epsilon d| / epsilon = |d|
         position_usage = field.square().sum(dim=1)
         return torch.cat([position_usage, face_usage, wall_usage])
+
+    def _compute_squared_wall_usage(self, field: Tensor) -> Tensor:
+        """Return the squared fraction (W,) of the strain of each wall that is used.
+
+        The displacement is epsilon times the field (P, 3).
+        """
+        walls = self._walls.to(field.device)
+        wall_widths = self._wall_widths.to(field.device)
+        # The derivative of `index_select` is ten times faster than that of indexing.
+        first_side = field.index_select(0, walls[:, 0])
+        second_side = field.index_select(0, walls[:, 1])
+        difference = first_side - second_side
+        usage_per_unit = self.epsilon / MAX_WALL_STRAIN / wall_widths
+        return difference.square().sum(dim=1) * usage_per_unit.square()
 
     def _compute_squared_gradients(self, field: Tensor) -> Tensor:
         """Return the squared norm (F,) of the gradient of a field (P, 3) on each face.
@@ -679,28 +763,33 @@ class GeometryControl(Control):
         self._mesh = self.get_mesh(self.scene).mesh
         welded_mesh = get_welded_mesh(self._mesh)
         self._position_of_vertex = torch.from_numpy(welded_mesh.position_of_vertex)
-        self._limits = DisplacementLimits(
-            welded_mesh, float(self.choice_values["epsilon"])
-        )
+        epsilon = float(self.choice_values["epsilon"])
+        self._limits = DisplacementLimits(welded_mesh, epsilon)
         if self.form == "modes":
-            # (P, 3, modes)
-            modes = torch.from_numpy(
-                compute_shape_modes(self._mesh, int(self.choice_values["modes"]))
-            )
-            n_modes = modes.shape[2]  # fewer than requested for a small mesh
-            group = Group("amplitudes", n_modes, ESTIMATORS)
-            self._field: Callable[[Tensor], Tensor] = lambda amplitudes: (
-                modes.to(amplitudes.device) @ amplitudes
-            )
+            group = self._prepare_modes()
         else:
-            precondition = Preconditioner(welded_mesh)
-            group = Group("pushes", 3 * len(welded_mesh.positions), ESTIMATORS)
-            self._field = lambda pushes: (
-                PUSH_FACTOR * precondition(pushes.reshape(-1, 3))
-            )
+            group = self._prepare_pushes(welded_mesh)
         self.groups = (group,)
         # `compute_offsets` maps 0.5 to no displacement
         self.start = torch.full((group.size,), 0.5)
+
+    def _prepare_modes(self) -> Group:
+        """Set the field that is a sum of smooth modes, and return their group."""
+        # (P, 3, modes)
+        modes = torch.from_numpy(
+            compute_shape_modes(self._mesh, int(self.choice_values["modes"]))
+        )
+        self._field: Callable[[Tensor], Tensor] = lambda amplitudes: (
+            modes.to(amplitudes.device) @ amplitudes
+        )
+        n_modes = modes.shape[2]  # fewer than requested for a small mesh
+        return Group("amplitudes", n_modes, ESTIMATORS)
+
+    def _prepare_pushes(self, welded_mesh: WeldedMesh) -> Group:
+        """Set the field by pushes on all positions, and return the pushes' group."""
+        precondition = Preconditioner(welded_mesh)
+        self._field = lambda pushes: PUSH_FACTOR * precondition(pushes.reshape(-1, 3))
+        return Group("pushes", 3 * len(welded_mesh.positions), ESTIMATORS)
 
     def inputs(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
@@ -724,14 +813,12 @@ class GeometryControl(Control):
         """
         offsets = self.compute_offsets(u.detach())
         lengths = offsets.norm(dim=1)
+        rms = lengths.square().mean().sqrt()
+        thinnest = self._limits.find_thinnest_wall(offsets)
         return {
             f"{self.name}.largest": make_value_with_unit(lengths.max(), "object sizes"),
-            f"{self.name}.rms": make_value_with_unit(
-                lengths.square().mean().sqrt(), "object sizes"
-            ),
-            f"{self.name}.thinnest": make_value_with_unit(
-                self._limits.find_thinnest_wall(offsets), "1"
-            ),
+            f"{self.name}.rms": make_value_with_unit(rms, "object sizes"),
+            f"{self.name}.thinnest": make_value_with_unit(thinnest, "1"),
         }
 
     def get_artifact_files(
@@ -743,13 +830,16 @@ class GeometryControl(Control):
         vertices, normals = in_mesh_coordinates.transform_mesh(
             to_world=None, offsets=offsets
         )
-        lines = ["# advsearch: z is up; texture coordinates as of the original object"]
-        lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
-        lines += [
-            f"vt {right:.7g} {upwards:.7g}"
-            for right, upwards in self._mesh.uvs.tolist()
-        ]
-        lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
-        faces = (self._mesh.faces.astype(np.int64) + 1).tolist()
-        lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in faces]
-        return {f"{self.name}.obj": ("\n".join(lines) + "\n").encode("ascii")}
+        text = _format_obj(self._mesh, vertices, normals)
+        return {f"{self.name}.obj": text.encode("ascii")}
+
+
+def _format_obj(mesh: Mesh, vertices: Tensor, normals: Tensor) -> str:
+    """Return a mesh as the text of an OBJ file, with other vertices and normals (V, 3)."""
+    lines = ["# advsearch: z is up; texture coordinates as of the original object"]
+    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.tolist()]
+    lines += [f"vt {right:.7g} {upwards:.7g}" for right, upwards in mesh.uvs.tolist()]
+    lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
+    faces = (mesh.faces.astype(np.int64) + 1).tolist()
+    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in faces]
+    return "\n".join(lines) + "\n"

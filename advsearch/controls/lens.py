@@ -218,14 +218,7 @@ def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Te
         values: `x`, `y`, `radius` and `opacity` (dots,), and `falloff` (). x and y are
             fractions of width and height, the radius of the shorter side.
     """
-    shorter_side = min(height, width)
-    device = values["x"].device
-    column = torch.arange(width, device=device) + 0.5
-    row = torch.arange(height, device=device) + 0.5
-    x_offset = (column - values["x"][:, None] * width) / shorter_side
-    y_offset = (row - values["y"][:, None] * height) / shorter_side
-    squared_distance = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
-    squared_radii = squared_distance / values["radius"][:, None, None] ** 2  # r^2
+    squared_radii = _compute_squared_radii(height, width, values)
     falloff = values["falloff"]
     # Here r^2 to the falloff is `_MAX_EXPONENT`. Beyond, the exponential is practically 0,
     # and its derivative would not be finite.
@@ -234,3 +227,20 @@ def _compute_covers(height: int, width: int, values: Mapping[str, Tensor]) -> Te
     limited = squared_radii.clamp(1e-12, max_squared_radii)
     fading = torch.exp(-(limited**falloff))
     return values["opacity"][:, None, None] * fading
+
+
+def _compute_squared_radii(
+    height: int, width: int, values: Mapping[str, Tensor]
+) -> Tensor:
+    """Return the squared distance (dots, H, W) of each pixel from each dot, in radii.
+
+    The arguments are those of `_compute_covers`.
+    """
+    shorter_side = min(height, width)
+    device = values["x"].device
+    column = torch.arange(width, device=device) + 0.5
+    row = torch.arange(height, device=device) + 0.5
+    x_offset = (column - values["x"][:, None] * width) / shorter_side
+    y_offset = (row - values["y"][:, None] * height) / shorter_side
+    squared_distance = y_offset[:, :, None] ** 2 + x_offset[:, None, :] ** 2
+    return squared_distance / values["radius"][:, None, None] ** 2

@@ -151,12 +151,7 @@ class LightControl(Control):
     ) -> dict[str, Tensor]:
         """Return the lamp's position and its brightness."""
         position = torch.stack([values[axis] for axis in ("x", "y", "z")])
-        # At a distance of 1 the irradiance is the intensity.
-        intensity = (
-            color.combine_channels(values)
-            * values["power"]
-            * compute_metered_irradiance(self.scene)
-        )
+        intensity = self._compute_intensity(values)
         if self.choice_values["type"] == "point":
             return {
                 f"{self.name}.position": position,
@@ -169,6 +164,14 @@ class LightControl(Control):
             f"{self.name}.ball": make_ball_pose(position, radius),
             f"{self.name}.radiance": intensity / (math.pi * radius**2),
         }
+
+    def _compute_intensity(self, values: Values) -> Tensor:
+        """Return the radiant intensity (3,) of the lamp.
+
+        At a distance of 1 the irradiance is the intensity.
+        """
+        irradiance = compute_metered_irradiance(self.scene)
+        return color.combine_channels(values) * values["power"] * irradiance
 
 
 def make_ball_pose(center: Tensor, radius: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -110,24 +111,53 @@ def _noise(grid: Grid, cells: tuple[int, int], seed: int) -> Float64Array:
     top = np.floor(grid[1] * rows)
     x = grid[0] * columns - left
     y = grid[1] * rows - top
-    column = left.astype(np.int64)
-    row = top.astype(np.int64)
+    lattice = _Lattice(angle, left.astype(np.int64), top.astype(np.int64), x, y)
+    x_weight = _fade(x)
+    y_weight = _fade(y)
+    upper = lattice.mix_corners(0, x_weight)
+    lower = lattice.mix_corners(1, x_weight)
+    # times 1.5, since such sums of unit gradients rarely exceed 2 / 3
+    return np.asarray((upper * (1.0 - y_weight) + lower * y_weight) * 1.5)
 
-    def corner(right: int, below: int) -> Float64Array:
+
+class _Lattice(NamedTuple):
+    """A periodic lattice of gradients, and the position of each texel in it.
+
+    Attributes:
+        angle: (rows, columns) angle of the gradient at each corner of cells, radians.
+        column: (SIDE, SIDE) column of the cell that each texel is in.
+        row: (SIDE, SIDE) row of this cell.
+        x: (SIDE, SIDE) position of each texel in the cell, 0 at the left and 1 at the
+            right.
+        y: (SIDE, SIDE) the same, 0 at the top.
+    """
+
+    angle: Float64Array
+    column: npt.NDArray[np.int64]
+    row: npt.NDArray[np.int64]
+    x: Float64Array
+    y: Float64Array
+
+    def mix_corners(self, below: int, right_weight: Float64Array) -> Float64Array:
+        """Return the mean of the left and the right corner, by the weight of the right.
+
+        `below` is 0 for the upper corners of the cell, and 1 for the lower ones.
+        """
+        left = self.project_gradient(0, below)
+        right = self.project_gradient(1, below)
+        return left * (1.0 - right_weight) + right * right_weight
+
+    def project_gradient(self, right: int, below: int) -> Float64Array:
         """Return the dot product of a corner's gradient and the offset from it.
 
         `right` and `below` are 0 or 1: the corner of the cell, from its upper left.
         """
+        rows, columns = self.angle.shape
         # the lattice is periodic
-        turn = angle[(row + below) % rows, (column + right) % columns]
-        return np.asarray(np.cos(turn) * (x - right) + np.sin(turn) * (y - below))
-
-    x_weight = _fade(x)
-    y_weight = _fade(y)
-    upper = corner(0, 0) * (1.0 - x_weight) + corner(1, 0) * x_weight
-    lower = corner(0, 1) * (1.0 - x_weight) + corner(1, 1) * x_weight
-    # times 1.5, since such sums of unit gradients rarely exceed 2 / 3
-    return np.asarray((upper * (1.0 - y_weight) + lower * y_weight) * 1.5)
+        turn = self.angle[(self.row + below) % rows, (self.column + right) % columns]
+        x_part = np.cos(turn) * (self.x - right)
+        y_part = np.sin(turn) * (self.y - below)
+        return np.asarray(x_part + y_part)
 
 
 def _fade(position: Float64Array) -> Float64Array:
@@ -233,15 +263,9 @@ def _grow_turing_pattern(
         seed: seed of the noise.
         rounds: number of filterings.
     """
-    frequency = np.fft.fftfreq(TILE_SIDE, 1.0 / TILE_SIDE)
-    radius = np.hypot(
-        frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1]
-    )
-    # passes frequencies within about 22 % of one wave per wavelength
-    band = np.exp(-(((radius - 1.0) / 0.22) ** 2))
-    field = np.random.Generator(np.random.PCG64(seed)).standard_normal(
-        (TILE_SIDE, TILE_SIDE)
-    )
+    band = _make_band_filter(wavelength)
+    generator = np.random.Generator(np.random.PCG64(seed))
+    field = generator.standard_normal((TILE_SIDE, TILE_SIDE))
     for _ in range(rounds):
         field = np.fft.ifft2(np.fft.fft2(field) * band).real
         # the larger the factor, the harder the edges of stripes
@@ -249,7 +273,20 @@ def _grow_turing_pattern(
     return np.asarray(field)
 
 
-def _step(value: Float64Array, edge: float, soft: float) -> Float64Array:
+def _make_band_filter(wavelength: tuple[float, float]) -> Float64Array:
+    """Return the factor (SIDE, SIDE) of each frequency in a filter for some waves.
+
+    It passes frequencies within about 22 % of one wave per wavelength, which is along x
+    and along y, in tiles.
+    """
+    frequency = np.fft.fftfreq(TILE_SIDE, 1.0 / TILE_SIDE)
+    x_waves = frequency[None, :] * wavelength[0]
+    y_waves = frequency[:, None] * wavelength[1]
+    radius = np.hypot(x_waves, y_waves)
+    return np.asarray(np.exp(-(((radius - 1.0) / 0.22) ** 2)))
+
+
+def _step(value: Float64Array, edge: float | Float64Array, soft: float) -> Float64Array:
     """Return 0 below the edge and 1 above it, with a smooth ramp `soft` wide."""
     fraction = np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
     return np.asarray(fraction * fraction * (3.0 - 2.0 * fraction))
@@ -293,31 +330,34 @@ def wood(grid: Grid) -> Float64Array:
     Frequencies, strengths and colors are chosen by eye.
     """
     x, y = grid
-    bend = 0.16 * _clouds(grid, cells=(2, 1), octaves=2, seed=11) + 0.012 * _noise(
-        grid, cells=(8, 3), seed=12
-    )
+    bend = _bend_rings(grid)
     rings = 9.0 * (x + bend) + 0.25 * _noise(grid, cells=(5, 2), seed=17)
-    phase = rings % 1.0
-    # A ring darkens slowly during a year, and ends suddenly.
+    late_wood = _paint_late_wood(rings % 1.0)
+    bent_grid = (x + 0.6 * bend, y)
+    coarse_fibre = _noise(bent_grid, cells=(120, 3), seed=13)
+    fibre = coarse_fibre + 0.6 * _noise(bent_grid, cells=(240, 5), seed=18)
+    pores = _step(_noise(bent_grid, cells=(170, 12), seed=14), edge=0.5, soft=0.2)
+    shade = _noise(grid, cells=(3, 1), seed=15)
+    tone = 0.30 + 0.42 * late_wood + 0.13 * fibre + 0.16 * shade
+    grain = _ramp(tone, "dcb27a", "c8955a", "a06c38", "784824")
+    return _mix(grain, _color("5a3519"), 0.4 * pores)
+
+
+def _bend_rings(grid: Grid) -> Float64Array:
+    """Return how far the rings of wood are shifted along x at each texel, in tiles."""
+    wide_bend = _clouds(grid, cells=(2, 1), octaves=2, seed=11)
+    narrow_bend = _noise(grid, cells=(8, 3), seed=12)
+    return 0.16 * wide_bend + 0.012 * narrow_bend
+
+
+def _paint_late_wood(phase: Float64Array) -> Float64Array:
+    """Return how dark wood is, 0 to 1, at a phase of the year from 0 to 1.
+
+    A ring darkens slowly during a year, and ends suddenly.
+    """
     darkening = _step(phase, edge=0.66, soft=0.6)
     end_of_year = _step(phase, edge=0.96, soft=0.08)
-    late_wood = darkening * (1.0 - end_of_year)
-    bent_grid = (x + 0.6 * bend, y)
-    fibre = _noise(bent_grid, cells=(120, 3), seed=13) + 0.6 * _noise(
-        bent_grid, cells=(240, 5), seed=18
-    )
-    pores = _step(_noise(bent_grid, cells=(170, 12), seed=14), edge=0.5, soft=0.2)
-    tone = (
-        0.30
-        + 0.42 * late_wood
-        + 0.13 * fibre
-        + 0.16 * _noise(grid, cells=(3, 1), seed=15)
-    )
-    return _mix(
-        _ramp(tone, "dcb27a", "c8955a", "a06c38", "784824"),
-        _color("5a3519"),
-        0.4 * pores,
-    )
+    return darkening * (1.0 - end_of_year)
 
 
 @register_pattern(tile_size=0.9, roughness=0.15)
@@ -331,14 +371,21 @@ def marble(grid: Grid) -> Float64Array:
     clouds = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=4, seed=25)
     grayness = 0.8 * _step(clouds, edge=0.58, soft=0.8)
     clouded = _mix(_color("f4f2ee"), _color("c6c8ca"), grayness)
-    # three families of parallel veins, from wide and dark to fine and pale
+    veins = _paint_all_veins(warped, finely_warped)
+    return _mix(clouded, _color("4c5159"), np.clip(veins, 0.0, 0.9))
+
+
+def _paint_all_veins(warped: Grid, finely_warped: Grid) -> Float64Array:
+    """Return how dark three families of veins make each texel, (SIDE, SIDE).
+
+    The families go from wide and dark to fine and pale; see `_paint_veins`.
+    """
     paint_veins = partial(_paint_veins, warped, finely_warped)
-    veins = (
+    return (
         paint_veins(n_right=1, n_down=1, width=0.05, depth=0.75, seed=23)
         + paint_veins(n_right=2, n_down=1, width=0.02, depth=0.45, seed=24)
         + paint_veins(n_right=1, n_down=3, width=0.012, depth=0.3, seed=26)
     )
-    return _mix(clouded, _color("4c5159"), np.clip(veins, 0.0, 0.9))
 
 
 def _paint_veins(
@@ -399,23 +446,30 @@ def brick(grid: Grid) -> Float64Array:
     # every other course is shifted by half a brick
     course_x = x * columns + 0.5 * (row % 2.0)
     column = np.floor(course_x) % columns
-    # Distances to the edges of the brick, as fractions of its height. It is twice as
-    # long as high, so that a fraction of its length is doubled.
-    edge_x = 2.0 * (0.5 - np.abs(course_x % 1.0 - 0.5))
-    edge_y = 0.5 - np.abs(y * rows % 1.0 - 0.5)
-    # 1 on a brick, and 0 near its edges, where the mortar is
-    solid = _step(
-        np.minimum(edge_x, edge_y) + 0.02 * _noise(grid, cells=(60, 60), seed=32),
-        edge=0.075,
-        soft=0.05,
-    )
+    solid = _find_solid(grid, course_x, y * rows)
     tone = np.random.Generator(np.random.PCG64(33)).random((rows, columns))
     brick_tone = tone[row.astype(np.int64) % rows, column.astype(np.int64)]
-    mortar = (
-        _color("c3bbac")
-        + 0.10 * _clouds(grid, cells=(80, 80), octaves=2, seed=36)[..., None]
-    )
+    grain = _clouds(grid, cells=(80, 80), octaves=2, seed=36)
+    mortar = _color("c3bbac") + 0.10 * grain[..., None]
     return _mix(mortar, _paint_fired_clay(grid, brick_tone), solid)
+
+
+def _find_solid(
+    grid: Grid, x_in_bricks: Float64Array, y_in_bricks: Float64Array
+) -> Float64Array:
+    """Return 1 on a brick, and 0 near its edges, where the mortar is, (SIDE, SIDE).
+
+    Args:
+        grid: coordinates of the texels.
+        x_in_bricks: (SIDE, SIDE) position of each texel, in lengths of a brick.
+        y_in_bricks: (SIDE, SIDE) position of each texel, in heights of a brick.
+    """
+    # Distances to the edges of the brick, as fractions of its height. It is twice as
+    # long as high, so that a fraction of its length is doubled.
+    edge_x = 2.0 * (0.5 - np.abs(x_in_bricks % 1.0 - 0.5))
+    edge_y = 0.5 - np.abs(y_in_bricks % 1.0 - 0.5)
+    roughness = 0.02 * _noise(grid, cells=(60, 60), seed=32)
+    return _step(np.minimum(edge_x, edge_y) + roughness, edge=0.075, soft=0.05)
 
 
 def _paint_fired_clay(grid: Grid, brick_tone: Float64Array) -> Float64Array:
@@ -443,29 +497,38 @@ def fabric(grid: Grid) -> Float64Array:
     count = 16  # threads in each direction
     thread_x = x * count
     thread_y = y * count
-    # height of the round warp and weft threads across their widths, from 0 to 1
-    round_x = np.sin(np.pi * (thread_x % 1.0))
-    round_y = np.sin(np.pi * (thread_y % 1.0))
     # The warp is the upright thread. In a plain weave it lies over the level thread in
     # every second cell, like the fields of a chessboard.
     warp_is_over = (np.floor(thread_x) + np.floor(thread_y)) % 2.0 > 0.5
-    # The upper thread is highest in the middle of the lower one, and bends down at its
-    # sides.
-    height = np.where(
-        warp_is_over,
-        round_x * (0.55 + 0.45 * round_y),
-        round_y * (0.55 + 0.45 * round_x),
-    )
-    fibres = np.where(
-        warp_is_over,
-        _noise((x, y), cells=(count * 8, count), seed=42),
-        _noise((x, y), cells=(count, count * 8), seed=43),
-    )
+    height = _compute_thread_height(thread_x, thread_y, warp_is_over)
+    warp_fibres = _noise((x, y), cells=(count * 8, count), seed=42)
+    weft_fibres = _noise((x, y), cells=(count, count * 8), seed=43)
+    fibres = np.where(warp_is_over, warp_fibres, weft_fibres)
     generator = np.random.Generator(np.random.PCG64(44))
     warp = _color("b9a77f") * _draw_thread_tones(generator, thread_x, count)
     weft = _color("3f5f86") * _draw_thread_tones(generator, thread_y, count)
     thread = np.where(warp_is_over[..., None], warp, weft)
     return thread * (0.25 + 0.75 * height**0.7 + 0.14 * fibres)[..., None]
+
+
+def _compute_thread_height(
+    thread_x: Float64Array, thread_y: Float64Array, warp_is_over: npt.NDArray[np.bool_]
+) -> Float64Array:
+    """Return the height (SIDE, SIDE) of the upper thread, from 0 to 1.
+
+    Args:
+        thread_x: (SIDE, SIDE) position across the warp threads, in threads.
+        thread_y: (SIDE, SIDE) position across the weft threads, in threads.
+        warp_is_over: (SIDE, SIDE) whether the warp is the upper thread.
+    """
+    # height of the round warp and weft threads across their widths, from 0 to 1
+    round_x = np.sin(np.pi * (thread_x % 1.0))
+    round_y = np.sin(np.pi * (thread_y % 1.0))
+    # The upper thread is highest in the middle of the lower one, and bends down at its
+    # sides.
+    warp_height = round_x * (0.55 + 0.45 * round_y)
+    weft_height = round_y * (0.55 + 0.45 * round_x)
+    return np.where(warp_is_over, warp_height, weft_height)
 
 
 def _draw_thread_tones(
@@ -488,9 +551,8 @@ def leopard(grid: Grid) -> Float64Array:
 
     Numbers and colors are chosen by eye; lengths are in tiles.
     """
-    warped = _warp_grid(
-        _warp_grid(grid, cells=4, amount=0.03, seed=51), cells=12, amount=0.012, seed=52
-    )
+    broadly_warped = _warp_grid(grid, cells=4, amount=0.03, seed=51)
+    warped = _warp_grid(broadly_warped, cells=12, amount=0.012, seed=52)
     points = _scatter_points(count=42, seed=53)
     distances, indices = _find_nearest_points(warped, points)
     # distance and index of the rosette that each texel belongs to
@@ -498,12 +560,16 @@ def leopard(grid: Grid) -> Float64Array:
     index = indices[..., 0]
     rosettes, core = _draw_rosettes(warped, points, distance, index)
     fur = _clouds(grid, cells=(24, 90), octaves=2, seed=55)
-    shade = 0.5 + 0.5 * _clouds(grid, cells=(3, 3), octaves=2, seed=56)
-    coat = _mix(_color("d8a861"), _color("e7c58c"), shade)
-    coat = _mix(coat, _color("a9692f"), 0.75 * core)
+    coat = _mix(_paint_coat(grid), _color("a9692f"), 0.75 * core)
     between_rosettes = _step(distance, edge=0.07, soft=0.012)
     spots = np.clip(rosettes + _draw_dots(warped) * between_rosettes, 0.0, 1.0)
     return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
+
+
+def _paint_coat(grid: Grid) -> Float64Array:
+    """Return the color (SIDE, SIDE, 3) of a leopard's coat between its spots."""
+    shade = 0.5 + 0.5 * _clouds(grid, cells=(3, 3), octaves=2, seed=56)
+    return _mix(_color("d8a861"), _color("e7c58c"), shade)
 
 
 def _draw_dots(grid: Grid) -> Float64Array:
@@ -538,10 +604,26 @@ def _draw_rosettes(
     size = generator.uniform(0.85, 1.15, len(points))[index]
     turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index]
     radius = distance / size
-    # offsets from the point, in the shorter direction on the torus: -0.5 to 0.5
-    x_offset = (grid[0] - points[index, 0] + 0.5) % 1.0 - 0.5
-    y_offset = (grid[1] - points[index, 1] + 0.5) % 1.0 - 0.5
-    angle = np.arctan2(y_offset, x_offset)
+    angle = _compute_angles(grid, points[index])
+    ring = _draw_broken_rings(radius, angle, turn)
+    # The core reaches below the ring, and is visible in its gaps.
+    core = 1.0 - _step(radius, edge=0.042, soft=0.02)
+    return ring, core
+
+
+def _draw_broken_rings(
+    radius: Float64Array, angle: Float64Array, turn: Float64Array
+) -> Float64Array:
+    """Return the opacity (SIDE, SIDE), from 0 to 1, of rings with gaps.
+
+    All arguments are (SIDE, SIDE), a value for each texel.
+
+    Args:
+        radius: distance from the center of its ring, in tiles, divided by the ring's
+            size.
+        angle: direction from that center, radians.
+        turn: angle by which its ring is turned, radians.
+    """
     # A ring is between two edges. The outer one is not quite a circle.
     beyond_inner_edge = _step(radius, edge=0.031, soft=0.008)
     outer_edge = 0.056 + 0.004 * np.cos(angle + turn)
@@ -550,9 +632,18 @@ def _draw_rosettes(
     # It has gaps at the angles where the waves are low.
     waves = np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn)
     opacity_at_angle = _step(waves, edge=-0.75, soft=0.5)
-    # The core reaches below the ring, and is visible in its gaps.
-    core = 1.0 - _step(radius, edge=0.042, soft=0.02)
-    return ring * opacity_at_angle, core
+    return np.asarray(ring * opacity_at_angle)
+
+
+def _compute_angles(grid: Grid, points: Float64Array) -> Float64Array:
+    """Return the angle (SIDE, SIDE), radians, at which each texel is from its point.
+
+    `points` (SIDE, SIDE, 2) are on the torus.
+    """
+    # offsets from the point, in the shorter direction on the torus: -0.5 to 0.5
+    x_offset = (grid[0] - points[..., 0] + 0.5) % 1.0 - 0.5
+    y_offset = (grid[1] - points[..., 1] + 0.5) % 1.0 - 0.5
+    return np.asarray(np.arctan2(y_offset, x_offset))
 
 
 @register_pattern(tile_size=0.8, roughness=0.8, specular=0.2)
@@ -584,29 +675,41 @@ def rust(grid: Grid) -> Float64Array:
     Frequencies, strengths and colors are chosen by eye.
     """
     warped = _warp_grid(grid, cells=4, amount=0.06, seed=71)
-    broad = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=5, seed=72)
-    grain = _clouds(grid, cells=(48, 48), octaves=3, seed=73)
-    tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
-    oxide = _ramp(tone, "2e1710", "5a2712", "8b3f16", "b5591d", "cf7b33")
-    paint = (
-        _color("5d6668")
-        + 0.05 * _clouds(grid, cells=(20, 20), octaves=2, seed=74)[..., None]
-    )
-    flakes = _clouds(
-        _warp_grid(warped, cells=16, amount=0.015, seed=75),
-        cells=(4, 4),
-        octaves=4,
-        seed=76,
-    )
+    oxide = _paint_oxide(grid, warped)
+    paint_grain = _clouds(grid, cells=(20, 20), octaves=2, seed=74)
+    paint = _color("5d6668") + 0.05 * paint_grain[..., None]
+    finely_warped = _warp_grid(warped, cells=16, amount=0.015, seed=75)
+    flakes = _clouds(finely_warped, cells=(4, 4), octaves=4, seed=76)
+    surface = _cover_with_flakes(oxide, paint, flakes)
+    pits = _step(_noise(grid, cells=(70, 70), seed=77), edge=0.5, soft=0.15)
+    return _mix(surface, _color("1b0d09"), 0.6 * pits)
+
+
+def _cover_with_flakes(
+    oxide: Float64Array, paint: Float64Array, flakes: Float64Array
+) -> Float64Array:
+    """Return oxide under flakes of paint that have dark rims, (SIDE, SIDE, 3) sRGB.
+
+    Args:
+        oxide: (SIDE, SIDE, 3) sRGB color of the oxide.
+        paint: (SIDE, SIDE, 3) sRGB color of the paint.
+        flakes: (SIDE, SIDE) noise; paint is left where it is high.
+    """
     # The remaining paint, and a dark rim around it: a slightly larger area without the
     # paint itself.
     paint_left = _step(flakes, edge=0.26, soft=0.05)
     paint_and_rim = _step(flakes, edge=0.20, soft=0.10)
     rim = paint_and_rim - paint_left
     rimmed_oxide = _mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0))
-    surface = _mix(rimmed_oxide, paint, 0.85 * paint_left)
-    pits = _step(_noise(grid, cells=(70, 70), seed=77), edge=0.5, soft=0.15)
-    return _mix(surface, _color("1b0d09"), 0.6 * pits)
+    return _mix(rimmed_oxide, paint, 0.85 * paint_left)
+
+
+def _paint_oxide(grid: Grid, warped: Grid) -> Float64Array:
+    """Return the color (SIDE, SIDE, 3) of bare rust."""
+    broad = 0.5 + 0.5 * _clouds(warped, cells=(3, 3), octaves=5, seed=72)
+    grain = _clouds(grid, cells=(48, 48), octaves=3, seed=73)
+    tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
+    return _ramp(tone, "2e1710", "5a2712", "8b3f16", "b5591d", "cf7b33")
 
 
 def _bend_blades(
@@ -690,34 +793,31 @@ def elephant(grid: Grid) -> Float64Array:
 
     Frequencies, strengths and colors are chosen by eye.
     """
-    warped = _warp_grid(
-        _warp_grid(grid, cells=3, amount=0.05, seed=91), cells=14, amount=0.012, seed=92
-    )
-    folds = np.zeros((TILE_SIDE, TILE_SIDE))
-    # A coarse and a fine net of folds. A fold is where the two nearest of some scattered
-    # points are at the same distance: at the borders of their cells.
-    for n_cells, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
-        points = _scatter_points(n_cells, seed)
-        distance, _ = _find_nearest_points(warped, points)
-        border_distance = distance[..., 1] - distance[..., 0]
-        folds += depth * np.exp(-((border_distance / width) ** 2))
+    broadly_warped = _warp_grid(grid, cells=3, amount=0.05, seed=91)
+    warped = _warp_grid(broadly_warped, cells=14, amount=0.012, seed=92)
+    folds = _paint_fold_nets(warped)
     # long folds along x, where noise changes its sign
-    distance_from_zero = np.abs(
-        _clouds(
-            _warp_grid(grid, cells=5, amount=0.04, seed=95),
-            cells=(3, 14),
-            octaves=3,
-            seed=96,
-        )
-    )
-    folds += 0.55 * np.exp(-((distance_from_zero / 0.035) ** 2))
-    tone = (
-        0.55
-        + 0.25 * _clouds(warped, cells=(3, 3), octaves=3, seed=97)
-        + 0.16 * _clouds(grid, cells=(60, 60), octaves=2, seed=98)
-    )
+    fold_grid = _warp_grid(grid, cells=5, amount=0.04, seed=95)
+    waves = _clouds(fold_grid, cells=(3, 14), octaves=3, seed=96)
+    folds += 0.55 * np.exp(-((np.abs(waves) / 0.035) ** 2))
+    patches = _clouds(warped, cells=(3, 3), octaves=3, seed=97)
+    grains = _clouds(grid, cells=(60, 60), octaves=2, seed=98)
+    tone = 0.55 + 0.25 * patches + 0.16 * grains
     hide = _ramp(tone, "5f5850", "7d756c", "958d84", "a9a29a")
     return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
+
+
+def _paint_fold_nets(grid: Grid) -> Float64Array:
+    """Return how dark a coarse and a fine net of folds make each texel, (SIDE, SIDE)."""
+    folds = np.zeros((TILE_SIDE, TILE_SIDE))
+    # A fold is where the two nearest of some scattered points are at the same distance:
+    # at the borders of their cells.
+    for n_cells, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
+        points = _scatter_points(n_cells, seed)
+        distance, _ = _find_nearest_points(grid, points)
+        border_distance = distance[..., 1] - distance[..., 0]
+        folds += depth * np.exp(-((border_distance / width) ** 2))
+    return folds
 
 
 @register_pattern(tile_size=0.5, roughness=0.32, metallic=1.0)
@@ -781,8 +881,7 @@ def make_covering(mesh: Mesh, name: str, side: int = TILE_SIDE) -> Float32Array:
         column = positions[..., right] * texels_per_object_size
         row = -positions[..., up] * texels_per_object_size  # rows go down
         projected = look_up_texture(make_tile(name), column, row)
-        weight = weights[..., axis, None]
-        texels += weight * projected
+        texels += weights[..., axis, None] * projected
     return texels
 
 
@@ -878,6 +977,15 @@ class MaterialControl(Control):
                 object's texture.
         """
         which = (OBJECT_SURFACE, *PATTERNS)[int(values["which"])]
+        inputs = self._compute_surface_inputs(which, values)
+        if self._changes_color():
+            tint = color.combine_channels(values)
+            base = self._compute_base_color(which, earlier_inputs)
+            inputs[self._base_color_input] = tint * base.to(tint.device)
+        return inputs
+
+    def _compute_surface_inputs(self, which: str, values: Values) -> dict[str, Tensor]:
+        """Return the numbers (1,) of a material that the control changes."""
         material = self._get_material(which)
         inputs: dict[str, Tensor] = {}
         for name in SURFACE_PARAMETERS:
@@ -887,10 +995,6 @@ class MaterialControl(Control):
             elif self._may_change_material:
                 number = float(getattr(material, name))
                 inputs[input_name] = values["which"].new_tensor([number])
-        if self._changes_color():
-            tint = color.combine_channels(values)
-            base = self._compute_base_color(which, earlier_inputs)
-            inputs[self._base_color_input] = tint * base.to(tint.device)
         return inputs
 
     def _compute_base_color(

@@ -56,6 +56,14 @@ class MitsubaControl(Control):
             InputError: the scene has no such number; or it does not belong to the
                 object, and the surroundings are a photograph.
         """
+        self._check_not_in_photograph(scene)
+        numbers = mitsuba_data.find_plugin_numbers(
+            scene, self.name, keys=tuple(self._settings)
+        )
+        return scene.with_part(parts.PluginNumbers(self.name, numbers))
+
+    def _check_not_in_photograph(self, scene: SceneDescription) -> None:
+        """Raise InputError for a number of surroundings that are a photograph."""
         keys_outside_object = [
             key for key in self._settings if not key.startswith("object.")
         ]
@@ -65,10 +73,6 @@ class MitsubaControl(Control):
                 f"`backdrop={scene.backdrop_photograph.spec}` contradict each other: "
                 "everything but the object is the photograph; leave one of the two out"
             )
-        numbers = mitsuba_data.find_plugin_numbers(
-            scene, self.name, keys=tuple(self._settings)
-        )
-        return scene.with_part(parts.PluginNumbers(self.name, numbers))
 
     def list_parameter_specs(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
         """Yield one parameter for each number that was set, with its range or value.
@@ -81,22 +85,25 @@ class MitsubaControl(Control):
         for plugin_number in self._get_numbers():
             # the spec of a single number, or of all channels of a color
             full_spec = self.specs.get(plugin_number.key)
-            is_color = len(plugin_number.values) > 1
-            if isinstance(full_spec, OneOf) and is_color:
-                raise InputError(
-                    f"`controls` {self.name}:{plugin_number.key}: expected a range, "
-                    "because it is a colour; only a channel can have a list of values, "
-                    "such as "
-                    f"{self.name}:{plugin_number.key}.{color.CHANNELS[0]}"
-                )
-            for parameter, value in zip(
-                _make_channel_parameters(plugin_number),
-                plugin_number.values,
-                strict=True,
-            ):
+            self._check_is_no_list_of_colors(plugin_number, full_spec)
+            parameters = _make_channel_parameters(plugin_number)
+            for parameter, value in zip(parameters, plugin_number.values, strict=True):
                 # The spec of a channel, such as KEY.red, takes precedence.
                 spec = self.specs.get(parameter.name, full_spec or Fixed(value))
                 yield replace(parameter, default=value), spec
+
+    def _check_is_no_list_of_colors(
+        self, number: parts.PluginNumber, spec: Fixed | Range | OneOf | None
+    ) -> None:
+        """Raise InputError if a color is set to a list of values."""
+        is_color = len(number.values) > 1
+        if isinstance(spec, OneOf) and is_color:
+            raise InputError(
+                f"`controls` {self.name}:{number.key}: expected a range, "
+                "because it is a colour; only a channel can have a list of values, "
+                "such as "
+                f"{self.name}:{number.key}.{color.CHANNELS[0]}"
+            )
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]

@@ -169,8 +169,11 @@ class PatchControl(PictureControl):
         """
         super().__init__(name, **settings)
         self._check_pixels()
-        if self.is_image_searched:
-            return
+        if not self.is_image_searched:
+            self._check_has_no_ball()
+
+    def _check_has_no_ball(self) -> None:
+        """Raise InputError if a norm ball is set for pixels that are not searched."""
         fixing_setting = (
             "pixels" if self.choice_values["picture"] is None else "picture"
         )
@@ -200,11 +203,9 @@ class PatchControl(PictureControl):
         # distributions are subclasses of Range
         is_plain_range = type(pixels) is Range
         if not isinstance(pixels, Fixed) and not is_plain_range:
-            got = "a distribution"
-            if isinstance(pixels, OneOf):
-                got = f"a list of {len(pixels.values)}"
             raise InputError(
-                f"{self.name}.pixels: expected [low, high] or one number, got {got}"
+                f"{self.name}.pixels: expected [low, high] or one number, got "
+                f"{_describe_pixels(pixels)}"
             )
 
     def check_choices(self) -> None:
@@ -238,29 +239,37 @@ class PatchControl(PictureControl):
             InputError: nothing is searched.
         """
         super().bind_parameters()
-        if not self.groups:
-            raise InputError(
-                f"`controls` {self.name}: the pixels are fixed, so there is nothing to "
-                "search; set a range for another parameter, "
-                f"such as {self.name}={{azimuth: [0, 360]}}"
-            )
+        self._check_has_groups()
         side = self.image_shape[0]
         pixels = self.parameter_slots[0]  # the slots have the order of `parameters`
         picture = self.read_picture()
         self._picture = (
             None if picture is None else images.resize_to_square(picture, side)
         )
-        # The painter needs the values at the start, which `compute_values` returns, and the
-        # start of the pixels needs the painter. So the pixels are set last, and are left
-        # out here.
-        start_values = {
+        self._painter = PatchPainter(self.scene, self._compute_start_numbers(), side)
+        if isinstance(pixels.parameter_spec, Range):
+            self._start_as_underneath(pixels.parameter, pixels.parameter_spec)
+
+    def _compute_start_numbers(self) -> dict[str, float]:
+        """Return the values at the start, without the pixels.
+
+        The painter needs these values, which `compute_values` returns, and the start of
+        the pixels needs the painter. So the pixels are set last.
+        """
+        return {
             name: float(value)
             for name, value in self.compute_values(self.start).items()
             if name != "pixels"
         }
-        self._painter = PatchPainter(self.scene, start_values, side)
-        if isinstance(pixels.parameter_spec, Range):
-            self._start_as_underneath(pixels.parameter, pixels.parameter_spec)
+
+    def _check_has_groups(self) -> None:
+        """Raise InputError if nothing is searched."""
+        if not self.groups:
+            raise InputError(
+                f"`controls` {self.name}: the pixels are fixed, so there is nothing to "
+                "search; set a range for another parameter, "
+                f"such as {self.name}={{azimuth: [0, 360]}}"
+            )
 
     def _start_as_underneath(self, parameter: Parameter, pixel_range: Range) -> None:
         """Let searched pixels start as the texture underneath the patch.
@@ -388,6 +397,41 @@ def _measure_mesh(mesh: assets.Mesh) -> tuple[assets.Float64Array, float, float]
     return (low + high) / 2.0, float(half_size[:2].max()), float(half_size[2])
 
 
+def _describe_pixels(spec: Range | OneOf) -> str:
+    """Return a phrase about pixels that are set to neither a range nor one number."""
+    if isinstance(spec, OneOf):
+        return f"a list of {len(spec.values)}"
+    return "a distribution"
+
+
+def _check_texture_does_not_repeat(mesh: assets.Mesh) -> None:
+    """Raise InputError if a patch would repeat on an object, as its texture does."""
+    if mesh.repeats:
+        raise InputError(
+            "`controls` patch: the object's texture repeats on its surface, and a "
+            "patch that is painted into it would repeat too; "
+            "leave patch out, or search the full texture"
+        )
+
+
+def _blend_texels(
+    base: Tensor, indices: Tensor, patch_colors: Tensor, opacity: Tensor
+) -> Tensor:
+    """Return a base color (n, n, 3) with colors blended into some texels.
+
+    Args:
+        base: (n, n, 3) colors below.
+        indices: (N,) indices of the texels, row by row.
+        patch_colors: (N, 3) colors that are blended in.
+        opacity: (N, 1) their opacity.
+    """
+    base_colors = base.reshape(-1, 3)
+    colors_below = base_colors.index_select(0, indices)
+    blended = colors_below + opacity * (patch_colors - colors_below)
+    # the base color with the blended texels in place of those below
+    return base_colors.index_copy(0, indices, blended).reshape(base.shape)
+
+
 @dataclass(frozen=True, eq=False)
 class NearbyTexels:
     """The N texels near the center of a patch, which it may cover.
@@ -441,19 +485,13 @@ class PatchPainter:
             InputError: the object's texture repeats.
         """
         mesh = scene.object.mesh
-        if mesh.repeats:
-            raise InputError(
-                "`controls` patch: the object's texture repeats on its surface, and a "
-                "patch that is painted into it would repeat too; "
-                "leave patch out, or search the full texture"
-            )
+        _check_texture_does_not_repeat(mesh)
         self._center_and_sizes = _measure_mesh(mesh)
         self._start_values = start_values
         self._side = side
         self._surface = images.MeshSurface(mesh)
-        object_color = color.srgb_to_linear(
-            torch.from_numpy(scene.object.base_color.copy())
-        )
+        srgb_color = torch.from_numpy(scene.object.base_color.copy())
+        object_color = color.srgb_to_linear(srgb_color)
         # (n, n) faces, positions, normals and areas of the map's texels
         charts = _rasterise_finely(
             mesh,
@@ -462,16 +500,22 @@ class PatchPainter:
         )
         map_side = len(charts.face_index)
         self._object_color = _resize_to_square(object_color, map_side)
-        # Only texels on faces are stored: row i of each array is texel `_texels[i]` of the
-        # flattened map, on the face `_faces[i]` of the mesh.
+        self._store_texels(charts)
+        # The patch often stays in the same position for many images.
+        self._find_texels = lru_cache(maxsize=4)(self._find_nearby_texels)
+
+    def _store_texels(self, charts: images.Charts) -> None:
+        """Store index, face, position, normal and area of each texel on a face.
+
+        Row i of each array is texel `_texels[i]` of the flattened map, on the face
+        `_faces[i]` of the mesh.
+        """
         is_on_face = charts.is_readable
         self._texels = np.flatnonzero(is_on_face)
         self._faces = charts.face_index[is_on_face]
         self._positions = charts.compute_positions()[is_on_face].astype(np.float64)
         self._normals = charts.compute_normals()[is_on_face].astype(np.float64)
         self._areas = charts.compute_areas()[is_on_face].astype(np.float64)
-        # The patch often stays in the same position for many images.
-        self._find_texels = lru_cache(maxsize=4)(self._find_nearby_texels)
 
     def paint(
         self, base: Tensor | None, pixels: Tensor, numbers: Mapping[str, Tensor]
@@ -488,27 +532,26 @@ class PatchPainter:
             numbers: azimuth, height, size and rotation of the patch, () each.
         """
         device = pixels.device
-        if base is None:
-            base = self._object_color.to(device)
-        else:
-            base = _resize_to_square(base, len(self._object_color))
+        base = self._prepare_base(base, device)
         size = numbers["size"]
-        # in the order of the arguments of `_find_nearby_texels`
         texels = self._find_texels(
-            *(float(numbers[name].detach()) for name in ("azimuth", "height", "size"))
+            float(numbers["azimuth"].detach()),
+            float(numbers["height"].detach()),
+            float(size.detach()),
         )
-        indices = texels.indices.to(device)
         coordinates = texels.coordinates.to(device)
         # (N, 2) in sides of the patch: it reaches from -0.5 to 0.5
         on_patch = _rotate(coordinates, numbers["rotation"]) / size
         edge_opacity = _compute_edge_opacity(on_patch, size, texels.spacing)
         opacity = (texels.opacity.to(device) * edge_opacity)[:, None]
         patch_colors = _sample_pixels(pixels, on_patch)
-        base_colors = base.reshape(-1, 3)
-        colors_below = base_colors.index_select(0, indices)
-        blended = colors_below + opacity * (patch_colors - colors_below)
-        # the base color with the blended texels in place of those below
-        return base_colors.index_copy(0, indices, blended).reshape(base.shape)
+        return _blend_texels(base, texels.indices.to(device), patch_colors, opacity)
+
+    def _prepare_base(self, base: Tensor | None, device: torch.device) -> Tensor:
+        """Return a base color (h, w, 3), or the object's own, with the map's size."""
+        if base is None:
+            return self._object_color.to(device)
+        return _resize_to_square(base, len(self._object_color))
 
     def sample_underneath(self) -> Tensor:
         """Return the pixels of a patch that shows the object's own texture beneath it.
@@ -548,29 +591,45 @@ class PatchPainter:
             height: height from 0 (middle of the underside) to 1 (middle of the top).
             size: side of the patch, object sizes.
         """
-        center, radius, half_height = self._center_and_sizes
+        _, radius, half_height = self._center_and_sizes
         outwards = _outward_direction(azimuth, height, radius, half_height)
-        # far enough away to be outside of the object
-        ray_origin = center + 4.0 * (radius + half_height) * outwards
-        face, point = self._surface.find_hit(ray_origin, -outwards)
-        # If the ray hits the back of a face, the patch is on the back of the surface,
-        # and normals are flipped.
-        is_front = float(self._surface.normals[face] @ outwards) >= 0.0
-        sign = 1.0 if is_front else -1.0
+        face, point = self._find_patch_center(outwards)
+        sign = self._find_side(face, outwards)
         mean_normal = self._compute_mean_normal(face, point)
         # rows right, up and outwards of the patch
         frame = _make_frame(sign * mean_normal, _upward_direction(azimuth, outwards))
         rows = self._select_texels(face, point, mean_normal, PAINT_RADIUS * size)
-
         coordinates, cosine = unroll_surface(
             self._positions[rows] - point, sign * self._normals[rows], frame
         )
         return NearbyTexels(
-            torch.from_numpy(self._texels[rows]),
-            torch.from_numpy(coordinates.astype(np.float32)),
-            _fade_in(cosine),
-            self._measure_texel_spacing(rows),
+            indices=torch.from_numpy(self._texels[rows]),
+            coordinates=torch.from_numpy(coordinates.astype(np.float32)),
+            opacity=_fade_in(cosine),
+            spacing=self._measure_texel_spacing(rows),
         )
+
+    def _find_patch_center(
+        self, outwards: assets.Float64Array
+    ) -> tuple[int, assets.Float64Array]:
+        """Return the face that a ray towards the object's center meets, and the point (3,).
+
+        Args:
+            outwards: (3,) unit direction from the center, from which the ray comes.
+        """
+        center, radius, half_height = self._center_and_sizes
+        # far enough away to be outside of the object
+        ray_origin = center + 4.0 * (radius + half_height) * outwards
+        return self._surface.find_hit(ray_origin, -outwards)
+
+    def _find_side(self, face: int, outwards: assets.Float64Array) -> float:
+        """Return 1 for a patch on the front of a face, and -1 for one on its back.
+
+        If the ray from a direction (3,) hits the back of a face, the patch is on the
+        back of the surface, and normals are flipped.
+        """
+        is_front = float(self._surface.normals[face] @ outwards) >= 0.0
+        return 1.0 if is_front else -1.0
 
     def _compute_mean_normal(
         self, face: int, point: assets.Float64Array
@@ -595,9 +654,7 @@ class PatchPainter:
         area_weight = weight * self._areas[is_near]
         total = (self._normals[is_near] * area_weight[:, None]).sum(axis=0)
         length = float(np.linalg.norm(total))
-        if length <= 1e-12:
-            return np.asarray(face_normal)
-        return np.asarray(total / length)
+        return np.asarray(face_normal if length <= 1e-12 else total / length)
 
     def _select_texels(
         self,
@@ -660,13 +717,10 @@ def _outward_direction(
     """
     angle = math.radians(azimuth)
     latitude = (height - 0.5) * math.pi
-    outwards = np.array(
-        [
-            math.cos(latitude) * radius * math.cos(angle),
-            math.cos(latitude) * radius * math.sin(angle),
-            math.sin(latitude) * half_height,
-        ]
-    )
+    x = math.cos(latitude) * radius * math.cos(angle)
+    y = math.cos(latitude) * radius * math.sin(angle)
+    z = math.sin(latitude) * half_height
+    outwards = np.array([x, y, z])
     outwards /= np.linalg.norm(outwards)
     return outwards
 
@@ -745,14 +799,23 @@ def unroll_surface(
     cosine = normals @ frame[2]
     sine = np.linalg.norm(tilt, axis=1)
     turn_direction = tilt / np.maximum(sine, 1e-9)[:, None]
-    # The cosine is limited, so that phi stays below 90 degrees. Texels beyond are not
-    # painted (`FACING_COSINES`). The stretch is 1 where the surface is flat.
-    phi = np.arctan2(sine, np.maximum(cosine, 0.1))
-    stretch = np.where(sine > 1e-4, phi / np.maximum(np.sin(phi), 1e-9), 1.0)
+    stretch = _compute_stretch(sine, cosine)
     along_turn = (in_plane * turn_direction).sum(axis=1)
     # by how much the stretch changes the component along the turn
     extension = ((stretch - 1.0) * along_turn)[:, None] * turn_direction
     return in_plane + extension, cosine
+
+
+def _compute_stretch(
+    sine: assets.Float64Array, cosine: assets.Float64Array
+) -> assets.Float64Array:
+    """Return phi / sin(phi) (N,) by sine and cosine of phi, and 1 on a flat surface.
+
+    The cosine is limited, so that phi stays below 90 degrees. Texels beyond are not
+    painted (`FACING_COSINES`).
+    """
+    phi = np.arctan2(sine, np.maximum(cosine, 0.1))
+    return np.where(sine > 1e-4, phi / np.maximum(np.sin(phi), 1e-9), 1.0)
 
 
 def _average_in_pixels(colors: Tensor, positions: Tensor, side: int) -> Tensor:

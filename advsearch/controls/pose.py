@@ -80,18 +80,8 @@ class PoseControl(Control):
         base_pose = base_pose.to(device)
         vertices = vertices.to(device)
         center = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
-        rotation = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
-            values["yaw"], values["pitch"], values["roll"]
-        )
-        linear = values["scale"] * rotation
-        # Height of the lowest point relative to the center, which is negative.
-        if self.choice_values["on_ground"] in ("yes", True):  # text, or a YAML boolean
-            # of the turned and scaled mesh, so that its lowest point is on the floor
-            # the row 2 of the linear map gives the height, z
-            lowest = ((vertices - center) @ linear[2]).amin()
-        else:
-            # of the mesh before, so that the center keeps its height
-            lowest = floor - center[2]
+        linear = _compute_linear_map(values)
+        lowest = self._find_lowest(vertices - center, linear, floor - center[2])
         # The new center is `shift_and_height + level_center`: x and y are shifts of the
         # old center, and the height is absolute.
         new_height = floor + values["z"] - lowest
@@ -100,6 +90,31 @@ class PoseControl(Control):
         # The linear map turns about the origin, and moves the center to linear @ center.
         translation = shift_and_height - linear @ center + level_center
         return {f"{mesh.name}.to_world": make_affine(linear, translation) @ base_pose}
+
+    def _find_lowest(
+        self, offsets: Tensor, linear: Tensor, lowest_before: Tensor
+    ) -> Tensor:
+        """Return the height () of the lowest point relative to the center, below 0.
+
+        Args:
+            offsets: (V, 3) vertices of the mesh, from its center.
+            linear: (3, 3) scale and rotation of the mesh.
+            lowest_before: () height of the lowest point before the mesh is turned.
+        """
+        if self.choice_values["on_ground"] in ("yes", True):  # text, or a YAML boolean
+            # of the turned and scaled mesh, so that its lowest point is on the floor
+            # the row 2 of the linear map gives the height, z
+            return (offsets @ linear[2]).amin()
+        # of the mesh before, so that the center keeps its height
+        return lowest_before
+
+
+def _compute_linear_map(values: Values) -> Tensor:
+    """Return the scale and the rotation of a pose as a matrix (3, 3)."""
+    rotation = make_vector_rotation(values["rotation"]) @ make_euler_rotation(
+        values["yaw"], values["pitch"], values["roll"]
+    )
+    return values["scale"] * rotation
 
 
 @lru_cache(maxsize=16)

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any, TypeGuard
 
@@ -173,13 +174,11 @@ class DistributionRange(Range):
         """
         lower = 0.0
         upper = 1.0
+        probability_span = self.upper_probability - self.lower_probability
         # 60 halvings go beyond the precision of a float
         for _ in range(60):
             middle = 0.5 * (lower + upper)
-            probability = (
-                self.lower_probability
-                + (self.upper_probability - self.lower_probability) * middle
-            )
+            probability = self.lower_probability + probability_span * middle
             if float(self.quantiles(np.asarray(probability))) < value:
                 lower = middle
             else:
@@ -249,6 +248,13 @@ def parse_spec(label: str, parameter: Parameter, setting: object) -> Spec:
         setting = setting["range"]
     if not _is_list(setting):
         return Fixed(_check_value(label, parameter, setting))
+    return _parse_list(label, parameter, setting)
+
+
+def _parse_list(
+    label: str, parameter: Parameter, setting: Sequence[object]
+) -> Range | OneOf:
+    """Parse a list: two numbers are a range, and other values a choice."""
     values = [_check_value(label, parameter, value) for value in setting]
     if values and (parameter.options or len(values) > 2):
         return _make_choice(label, values)
@@ -268,18 +274,25 @@ def _read_choices(
     """Parse {"choices": [...]}, perhaps with "weights"."""
     values = setting.get(CHOICES)
     if not set(setting) <= {CHOICES, WEIGHTS} or not _is_list(values) or not values:
-        distribution = "" if parameter.options else " or {distribution: NAME, ...}"
-        raise InputError(
-            f"{label}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, "
-            f"{{choices: [value, ...], "
-            f"weights: [number, ...]}}{distribution}, got {dict(setting)!r}"
-        )
+        raise _make_choices_error(label, parameter, setting)
     choice = _make_choice(
         label, [_check_value(label, parameter, value) for value in values]
     )
     if WEIGHTS in setting:
         return _make_weighted_choice(label, choice.values, setting[WEIGHTS])
     return choice
+
+
+def _make_choices_error(
+    label: str, parameter: Parameter, setting: Mapping[str, object]
+) -> InputError:
+    """Return the error for a mapping that is no spec of a parameter."""
+    distribution = "" if parameter.options else " or {distribution: NAME, ...}"
+    return InputError(
+        f"{label}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, "
+        f"{{choices: [value, ...], "
+        f"weights: [number, ...]}}{distribution}, got {dict(setting)!r}"
+    )
 
 
 def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> None:
@@ -301,12 +314,7 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
             f"{low:g} to fix the value"
         )
     if low > high:
-        remedy = f"write [{high:g}, {low:g}]"
-        # [350, 10] may be meant as the 20 degrees through 0. With a full turn or more
-        # between the bounds, as in [400, 10], there is no such interval.
-        may_be_through_zero = low - high < FULL_TURN
-        if parameter.periodic and may_be_through_zero:
-            remedy = _explain_reversed_angles(parameter, low, high)
+        remedy = _explain_reversed_bounds(parameter, low, high)
         raise InputError(
             f"{where}: the range [{low:g}, {high:g}] is reversed; {remedy}"
         )
@@ -315,6 +323,16 @@ def _check_bounds(where: str, parameter: Parameter, low: float, high: float) -> 
             f"{where}: expected a range over 0 (it is searched on a "
             f"logarithmic scale), got {low:g}"
         )
+
+
+def _explain_reversed_bounds(parameter: Parameter, low: float, high: float) -> str:
+    """Return the end of a message on reversed bounds, of which `low` is the larger."""
+    # [350, 10] may be meant as the 20 degrees through 0. With a full turn or more
+    # between the bounds, as in [400, 10], there is no such interval.
+    may_be_through_zero = low - high < FULL_TURN
+    if parameter.periodic and may_be_through_zero:
+        return _explain_reversed_angles(parameter, low, high)
+    return f"write [{high:g}, {low:g}]"
 
 
 def _explain_reversed_angles(parameter: Parameter, low: float, high: float) -> str:
@@ -329,14 +347,7 @@ def _explain_reversed_angles(parameter: Parameter, low: float, high: float) -> s
         low: first bound as the user wrote it, which is the larger one.
         high: second bound.
     """
-    # The interval through 0 in ascending order: [350, 10] becomes [-10, 10]; or [350, 370]
-    # if the parameter has no values below 0.
-    if low - FULL_TURN >= parameter.low:
-        begin = low - FULL_TURN
-        end = high
-    else:
-        begin = low
-        end = high + FULL_TURN
+    begin, end = _find_interval_through_zero(parameter, low, high)
     # the angle that lies between both, which is 0 or 360
     inner_turn = 0 if begin <= 0 else FULL_TURN
     inner_width = FULL_TURN - low + high
@@ -346,6 +357,19 @@ def _explain_reversed_angles(parameter: Parameter, low: float, high: float) -> s
         f"{inner_turn:g} to {high:g}, or [{high:g}, {low:g}] "
         f"for the other {low - high:g}"
     )
+
+
+def _find_interval_through_zero(
+    parameter: Parameter, low: float, high: float
+) -> tuple[float, float]:
+    """Return an interval of angles that passes 0 or 360 degrees in ascending order.
+
+    [350, 10] becomes [-10, 10]; or [350, 370] if the parameter has no values below 0.
+    The arguments are those of `_explain_reversed_angles`.
+    """
+    if low - FULL_TURN >= parameter.low:
+        return low - FULL_TURN, high
+    return low, high + FULL_TURN
 
 
 def _make_choice(where: str, values: Sequence[ParameterValue]) -> OneOf:
@@ -384,21 +408,7 @@ def _make_weighted_choice(
         InputError: weights are missing or invalid, or one is so small that its value
             is not among `MAX_REPEATS` repeats.
     """
-    weight_list = list(weights) if isinstance(weights, (list, tuple)) else []
-    valid_weights = [
-        weight
-        for weight in weight_list
-        if Parameter.is_number(weight) and weight >= 0.0
-    ]
-    is_complete = len(valid_weights) == len(weight_list) == len(values)
-    if not is_complete or not sum(valid_weights):
-        raise InputError(
-            f"{where}: expected a weight of at least 0 for each of {len(values)} "
-            "values, and one over 0, got "
-            f"{weights!r:.80}"
-        )
-    total = sum(valid_weights)
-    probabilities = [weight / total for weight in valid_weights]
+    probabilities = _normalize_weights(where, weights, len(values))
     repeats = _count_repeats(probabilities)
     repeated = list[ParameterValue]()
     for value, probability, count in zip(values, probabilities, repeats, strict=True):
@@ -411,6 +421,35 @@ def _make_weighted_choice(
     return OneOf(tuple(repeated))
 
 
+def _normalize_weights(where: str, weights: object, count: int) -> list[float]:
+    """Return weights divided by their sum.
+
+    Args:
+        where: name of the parameter, for messages.
+        weights: value of the setting.
+        count: number of values.
+
+    Raises:
+        InputError: there is another number of weights, or one is no number of at least
+            0, or all are 0.
+    """
+    weight_list = list(weights) if isinstance(weights, (list, tuple)) else []
+    valid_weights = [
+        weight
+        for weight in weight_list
+        if Parameter.is_number(weight) and weight >= 0.0
+    ]
+    is_complete = len(valid_weights) == len(weight_list) == count
+    if not is_complete or not sum(valid_weights):
+        raise InputError(
+            f"{where}: expected a weight of at least 0 for each of {count} "
+            "values, and one over 0, got "
+            f"{weights!r:.80}"
+        )
+    total = sum(valid_weights)
+    return [weight / total for weight in valid_weights]
+
+
 def _count_repeats(probabilities: Sequence[float]) -> list[int]:
     """Return how often each value is repeated, in proportion to its probability.
 
@@ -418,19 +457,23 @@ def _count_repeats(probabilities: Sequence[float]) -> list[int]:
     one with which all counts are whole numbers, or `MAX_REPEATS` if there is none.
     Cumulative counts are rounded, not the counts, so that their sum is the total.
     """
-    total = MAX_REPEATS
+    total = _find_smallest_total(probabilities)
+    cumulated_counts = [
+        round(total * sum(probabilities[:k])) for k in range(len(probabilities) + 1)
+    ]
+    return [end - begin for begin, end in pairwise(cumulated_counts)]
+
+
+def _find_smallest_total(probabilities: Sequence[float]) -> int:
+    """Return the smallest total with whole counts, or `MAX_REPEATS` without one."""
     for candidate in range(1, MAX_REPEATS):
         errors = [
             abs(candidate * probability - round(candidate * probability))
             for probability in probabilities
         ]
         if max(errors) < 1e-9:  # whole but for rounding
-            total = candidate
-            break
-    cumulated_counts = [
-        round(total * sum(probabilities[:k])) for k in range(len(probabilities) + 1)
-    ]
-    return [end - begin for begin, end in pairwise(cumulated_counts)]
+            return candidate
+    return MAX_REPEATS
 
 
 def has_distribution(spec: Spec) -> bool:
@@ -457,17 +500,18 @@ def _check_value(label: str, parameter: Parameter, value: object) -> ParameterVa
         InputError: the value is neither a name nor a number within the bounds.
     """
     if parameter.options:
-        if not isinstance(value, str):
-            raise InputError(
-                f"{label}: expected one of "
-                f"{', '.join(parameter.options)}, got {value!r}"
-            )
-        if value not in parameter.options:
-            raise UnknownNameError(label, value, parameter.options)
-        return value
+        return _check_option(label, parameter, value)
     # a name without a list of options, such as a file
     if parameter.unit == "name" and isinstance(value, str) and value.strip():
         return value
+    return _check_bounded_number(label, parameter, value)
+
+
+def _check_bounded_number(label: str, parameter: Parameter, value: object) -> float:
+    """Return a value as a float; raise InputError if it is no number within the bounds.
+
+    The arguments are those of `_check_value`.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(
             f"{label}: expected a number in {parameter.unit}, got {value!r}"
@@ -479,6 +523,17 @@ def _check_value(label: str, parameter: Parameter, value: object) -> ParameterVa
             f"got {format_value(value)}"
         )
     return float(value)
+
+
+def _check_option(label: str, parameter: Parameter, value: object) -> str:
+    """Return a value if it is one of the parameter's options; raise otherwise."""
+    if not isinstance(value, str):
+        raise InputError(
+            f"{label}: expected one of {', '.join(parameter.options)}, got {value!r}"
+        )
+    if value not in parameter.options:
+        raise UnknownNameError(label, value, parameter.options)
+    return value
 
 
 FULL_TURN = 360.0
@@ -591,13 +646,18 @@ class Slot:
             return clip_to_range(
                 float(default), spec.low, spec.high, is_angle=self.is_angle
             )
-        if default in spec.values:
+        return self._find_nearest_listed(spec.values)
+
+    def _find_nearest_listed(self, values: Sequence[ParameterValue]) -> ParameterValue:
+        """Return the value that is the default or nearest to it, or the first name."""
+        default = self.parameter.default
+        if default in values:
             return default
-        has_names = any(isinstance(value, str) for value in (default, *spec.values))
+        has_names = any(isinstance(value, str) for value in (default, *values))
         if has_names:
-            return spec.values[0]
+            return values[0]
         return min(
-            spec.values,
+            values,
             key=lambda value: compute_difference(
                 float(value), float(default), is_angle=self.is_angle
             ),
@@ -646,30 +706,66 @@ def parse_distribution(
         return _read_python_quantiles(label, parameter, setting)
     name = setting[DISTRIBUTION]
     if name == FROM_PYTHON:
-        raise InputError(
-            f"{label}: its values were drawn by {setting.get('name', 'a function')}, "
-            "which only the Python session that "
-            "started the run has; pass it again in the same call, with `resume=True` "
-            "to continue"
-        )
+        raise _make_lost_function_error(label, setting)
     arguments = {key: value for key, value in setting.items() if key != DISTRIBUTION}
     frozen, text = _freeze_distribution(label, name, arguments)
+    lower_probability, upper_probability = _find_range_probabilities(
+        label, parameter, frozen, text
+    )
+    return _make_range(label, frozen.ppf, lower_probability, upper_probability, text)
+
+
+def _find_range_probabilities(
+    label: str, parameter: Parameter, frozen: Any, text: str
+) -> tuple[float, float]:
+    """Return the cumulative probabilities between which a distribution is searched.
+
+    Args:
+        label: name of the parameter in messages.
+        parameter: states the bounds, at which the distribution is cut off.
+        frozen: the distribution of scipy with its arguments.
+        text: the distribution as messages write it, e.g. "norm(loc=20, scale=5)".
+
+    Raises:
+        InputError: a larger probability than `MAX_OUTSIDE_PROBABILITY` lies outside of
+            the bounds.
+    """
     with np.errstate(all="ignore"):  # far out in the tails, some formulas overflow
         # Probabilities below each bound. The bounds themselves have the probability 0, as
         # the distribution is continuous.
         lower_probability = float(frozen.cdf(parameter.low))
         upper_probability = float(frozen.cdf(parameter.high))
         outside = lower_probability + float(frozen.sf(parameter.high))
-        # whether the distribution has a smallest and a largest value
-        has_end = np.isfinite(frozen.ppf(np.array([0.0, 1.0])))
+        # an infinite tail is cut off
+        min_probability, max_probability = _find_cut_offs(frozen.ppf)
     if outside > MAX_OUTSIDE_PROBABILITY:
         raise _make_outside_error(label, parameter, text, outside)
-    # an infinite tail is cut off
-    lower_probability = max(lower_probability, 0.0 if has_end[0] else TAIL_PROBABILITY)
-    upper_probability = min(
-        upper_probability, 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
+    return (
+        max(lower_probability, min_probability),
+        min(upper_probability, max_probability),
     )
-    return _make_range(label, frozen.ppf, lower_probability, upper_probability, text)
+
+
+def _make_lost_function_error(label: str, setting: Mapping[str, object]) -> InputError:
+    """Return the error for a function of another Python session."""
+    return InputError(
+        f"{label}: its values were drawn by {setting.get('name', 'a function')}, "
+        "which only the Python session that "
+        "started the run has; pass it again in the same call, with `resume=True` "
+        "to continue"
+    )
+
+
+def _find_cut_offs(quantiles: Quantiles) -> tuple[float, float]:
+    """Return the cumulative probabilities between which a distribution is finite.
+
+    They are 0 and 1, but an infinite tail is cut off at `TAIL_PROBABILITY`.
+    """
+    # whether there is a smallest and a largest value
+    has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
+    lower = 0.0 if has_end[0] else TAIL_PROBABILITY
+    upper = 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
+    return lower, upper
 
 
 def _make_outside_error(
@@ -707,6 +803,44 @@ def _freeze_distribution(
         UnknownNameError: scipy has no continuous distribution of that name.
         InputError: it does not take the arguments.
     """
+    family = _find_distribution_family(where, name)
+    text = f"{name}({_format_arguments(arguments)})"
+    frozen = _apply_arguments(family, arguments)
+    if frozen is None:
+        # `family.shapes` are the names of its arguments besides loc and scale, e.g. "a, b"
+        shapes = f"{family.shapes}, " if family.shapes else ""
+        raise InputError(
+            f"{where}: expected {{distribution: {name}}} with numbers for "
+            f"{shapes}loc, scale, got {text}"
+        )
+    return frozen, text
+
+
+def _apply_arguments(family: Any, arguments: Mapping[str, Any]) -> Any:
+    """Return a distribution of scipy with its arguments; None if it can't have them.
+
+    Args:
+        family: the distribution without arguments, such as scipy.stats.norm.
+        arguments: its arguments by name, such as loc and scale.
+    """
+    if not all(map(Parameter.is_number, arguments.values())):
+        return None
+    with suppress(TypeError):  # it has no such arguments, or lacks one
+        frozen = family(**arguments)
+        # scipy returns NaN for quantiles if an argument is out of its range
+        median = frozen.ppf(0.5)
+        if bool(np.isfinite(median)):
+            return frozen
+    return None
+
+
+def _find_distribution_family(where: str, name: object) -> Any:
+    """Return a family of continuous distributions of scipy by its name.
+
+    Raises:
+        UnknownNameError: scipy has none of that name. `where` is the name of the
+            parameter, for the message.
+    """
     # Imported here, since the import takes a quarter of a second and most runs have no
     # distribution.
     from scipy import stats
@@ -719,23 +853,7 @@ def _freeze_distribution(
             COMMON_DISTRIBUTIONS,
             "It is one of scipy.stats, of real numbers.",
         )
-    text = f"{name}({_format_arguments(arguments)})"
-    frozen = None
-    is_valid = False
-    if all(map(Parameter.is_number, arguments.values())):
-        with suppress(TypeError):  # it has no such arguments, or lacks one
-            frozen = family(**arguments)
-            # scipy returns NaN for quantiles if an argument is out of its range
-            median = frozen.ppf(0.5)
-            is_valid = bool(np.isfinite(median))
-    if not is_valid:
-        # `family.shapes` are the names of its arguments besides loc and scale, e.g. "a, b"
-        shapes = f"{family.shapes}, " if family.shapes else ""
-        raise InputError(
-            f"{where}: expected {{distribution: {name}}} with numbers for "
-            f"{shapes}loc, scale, got {text}"
-        )
-    return frozen, text
+    return family
 
 
 def _format_arguments(arguments: Mapping[str, Any]) -> str:
@@ -764,16 +882,9 @@ def _read_python_quantiles(
         InputError: values are outside of the parameter's bounds, or not ascending.
     """
     name = str(setting["name"])
-
-    def quantiles(probabilities: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = [float(setting.function(float(p))) for p in probabilities.flat]
-        return np.array(values).reshape(probabilities.shape)
-
+    quantiles = partial(_compute_python_quantiles, setting)
     with np.errstate(all="ignore"):
-        # Whether there is a smallest and a largest value. An infinite tail is cut off.
-        has_end = np.isfinite(quantiles(np.array([0.0, 1.0])))
-    lower_probability = 0.0 if has_end[0] else TAIL_PROBABILITY
-    upper_probability = 1.0 if has_end[1] else 1.0 - TAIL_PROBABILITY
+        lower_probability, upper_probability = _find_cut_offs(quantiles)
     probabilities = np.linspace(
         lower_probability, upper_probability, N_CHECKED_QUANTILES
     )
@@ -781,6 +892,14 @@ def _read_python_quantiles(
     return _make_range(
         label, quantiles, float(probabilities[0]), float(probabilities[-1]), name
     )
+
+
+def _compute_python_quantiles(
+    setting: PythonQuantiles, probabilities: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the values of a user's inverse CDF at probabilities of any shape."""
+    values = [float(setting.function(float(p))) for p in probabilities.flat]
+    return np.array(values).reshape(probabilities.shape)
 
 
 def _check_quantiles(
@@ -804,6 +923,14 @@ def _check_quantiles(
             f"({parameter.unit}) of {name}, got "
             f"{values[~is_inside][0]:g}"
         )
+    _check_rises(label, name, values)
+
+
+def _check_rises(label: str, name: str, values: NDArray[np.float64]) -> None:
+    """Raise InputError if a value of an inverse CDF is below the one before it.
+
+    The arguments are those of `_check_quantiles`.
+    """
     falls = np.diff(values) < 0.0
     if falls.any():
         index = int(falls.argmax())

@@ -146,23 +146,44 @@ def apply_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> 
     vignette = compute_vignette(height, width, values["vignetting"])
     light = color.srgb_to_linear(image) * vignette.to(image.device)
     light = apply_aberration(light, values["aberration"])
-    variance = values["shot"] ** 2 * light + values["read"] ** 2
-    # The square root of the variance, shifted by `_DARK` so that its derivative at 0 is
-    # finite. It is 0 there.
-    std = torch.sqrt(variance + _DARK**2) - _DARK
+    std = _compute_noise_deviation(light, values)
     light = light + std * images.draw_noise(height, width, seed, "sensor").to(light)
     # `mosaic` is the weight of the image with a mosaic of color filters.
     light = light + values["mosaic"] * (apply_mosaic(light) - light)
-    # white balance: red and blue in stops, relative to green
+    balanced = _balance_white(light, values)
+    display = color.linear_to_srgb(balanced.clamp(0.0, 1.0))
+    return _compress_as_jpeg(display, values["compression"])
+
+
+def _compress_as_jpeg(image: Tensor, compression: Tensor) -> Tensor:
+    """Return an image (H, W, 3) after JPEG compression, in [0, 1].
+
+    Args:
+        image: sRGB in [0, 1].
+        compression: () from 0, for no compression, to 95; it is rounded.
+    """
+    rounded = round(float(compression.detach()))
+    if rounded == 0:
+        return image
+    jpeg_quality = 100 - rounded  # 5 to 99, as the compression is 1 to 95 here
+    return images.compress_jpeg(image, jpeg_quality).clamp(0.0, 1.0)
+
+
+def _balance_white(light: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    """Return light (H, W, 3) after the gains of red and blue, relative to green."""
+    # both are in stops
     gains = torch.stack(
         [2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]]
     )
-    display = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
-    compression = round(float(values["compression"].detach()))
-    if compression == 0:
-        return display
-    jpeg_quality = 100 - compression  # 5 to 99, as the compression is 1 to 95 here
-    return images.compress_jpeg(display, jpeg_quality).clamp(0.0, 1.0)
+    return light * gains.to(light.device)
+
+
+def _compute_noise_deviation(light: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    """Return the standard deviation (H, W, 3) of the noise of linear light."""
+    variance = values["shot"] ** 2 * light + values["read"] ** 2
+    # The square root of the variance, shifted by `_DARK` so that its derivative at 0 is
+    # finite. It is 0 there.
+    return torch.sqrt(variance + _DARK**2) - _DARK
 
 
 def compute_vignette(height: int, width: int, amount: Tensor) -> Tensor:
@@ -209,18 +230,21 @@ def apply_mosaic(light: Tensor) -> Tensor:
     neighbors.
     """
     height, width = light.shape[:2]
+    is_measured = _make_mosaic_mask(height, width).to(light)
+    # Bilinear weights. A sum of neighbors is divided by the weight of those that have
+    # the channel.
+    weights = [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
+    kernel = light.new_tensor(weights).expand(3, 1, 3, 3)
+    total = F.conv2d(images.to_planes(light * is_measured), kernel, padding=1, groups=3)
+    weight = F.conv2d(images.to_planes(is_measured), kernel, padding=1, groups=3)
+    interpolated = images.to_image(total / weight.clamp_min(1e-6))
+    return torch.where(is_measured > 0.0, light, interpolated)
+
+
+def _make_mosaic_mask(height: int, width: int) -> Tensor:
+    """Return 1 where a pixel measures a channel, else 0, (height, width, 3) integers."""
     rows = torch.arange(height)[:, None] % 2
     columns = torch.arange(width)[None, :] % 2
     red = (1 - rows) * (1 - columns)
     blue = rows * columns
-    is_measured = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
-    # Bilinear weights. A sum of neighbors is divided by the weight of those that have
-    # the channel.
-    kernel = light.new_tensor(
-        [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]
-    ).expand(3, 1, 3, 3)
-    total = F.conv2d(images.to_planes(light * is_measured), kernel, padding=1, groups=3)
-    weight = F.conv2d(images.to_planes(is_measured), kernel, padding=1, groups=3)
-    return torch.where(
-        is_measured > 0.0, light, images.to_image(total / weight.clamp_min(1e-6))
-    )
+    return torch.stack([red, 1 - red - blue, blue], dim=-1)

@@ -140,18 +140,12 @@ class ShadowControl(Control):
         """Return the scene with the card, out of sight; `scene_inputs` moves it."""
         # a dark grey texture, the same everywhere
         texels = np.full((2, 2, 3), 0.1, dtype=np.float32)
-        hidden_pose = geometry.make_hidden_pose(
-            torch.from_numpy(geometry.camera_to_world(scene))
-        ).numpy()
+        camera_pose = torch.from_numpy(geometry.camera_to_world(scene))
+        hidden_pose = geometry.make_hidden_pose(camera_pose).numpy()
         card = parts.make_polygon(int(self.choice_values["corners"]))
+        material = assets.Material(roughness=1.0)
         return scene.with_part(
-            parts.MeshPart(
-                self.name,
-                card,
-                texels,
-                assets.Material(roughness=1.0),
-                to_world=hidden_pose,
-            )
+            parts.MeshPart(self.name, card, texels, material, to_world=hidden_pose)
         )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
@@ -182,17 +176,13 @@ class ShadowControl(Control):
         the camera would see it at all distances.
         """
         radii = values["radii"]
-        # the first vertex is the center, which stays
-        corners = parts.make_polygon(len(radii)).vertices[1:]
-        rim = torch.from_numpy(corners.copy()).to(radii)
-        offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
         distance = self._find_distance(values, earlier_inputs)
         if distance is None:
-            pose = geometry.make_hidden_pose(
-                geometry.get_camera_pose(self.scene, earlier_inputs).to(radii)
-            )
+            camera_pose = geometry.get_camera_pose(self.scene, earlier_inputs)
+            pose = geometry.make_hidden_pose(camera_pose.to(radii))
         else:
             pose = self._compute_pose(values, distance)
+        offsets = _compute_corner_offsets(radii)
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
 
     def _compute_pose(self, values: Values, distance: float) -> Tensor:
@@ -271,24 +261,26 @@ class ShadowControl(Control):
             return None
         right, up, outwards = self._compute_axes(values)
         offset = float(values["x"].detach()) * right + float(values["y"].detach()) * up
-        camera = (
-            geometry.get_camera_pose(self.scene, earlier_inputs)
-            .detach()
-            .double()
-            .cpu()
-            .numpy()
-        )
+        camera_pose = geometry.get_camera_pose(self.scene, earlier_inputs)
+        camera = camera_pose.detach().double().cpu().numpy()
         cone_angle = self._compute_image_cone_angle(earlier_inputs)
-        max_distance = self._compute_max_distance()
-        for factor in np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES):
-            # From some factor on, this is always the largest distance.
-            distance = min(requested * factor, max_distance)
+        for distance in self._list_distances(requested):
             card = geometry.compute_center(self.scene) + distance * outwards + offset
             # components along the camera's axes, the columns of its pose
             in_camera = (card - camera[:3, 3]) @ camera[:3, :3]
             if _is_outside_cone(in_camera, radius=size, angle=cone_angle):
                 return float(distance)
         return None
+
+    def _list_distances(self, requested: float) -> list[float]:
+        """List the distances of the card to try, ascending, in object sizes.
+
+        They begin at the requested one. From some factor on, each is the largest
+        distance.
+        """
+        max_distance = self._compute_max_distance()
+        factors = np.geomspace(1.0, MAX_DISTANCE_FACTOR, N_DISTANCES)
+        return [min(requested * factor, max_distance) for factor in factors]
 
     def _compute_max_distance(self) -> float:
         """Return the distance up to which the card stays nearer than the lamp."""
@@ -300,18 +292,8 @@ class ShadowControl(Control):
 
         With a camera model, or with a shift, it is an upper bound.
         """
-        model = self.scene.camera_model
         aspect = self.scene.aspect
-        fov_input = earlier_inputs.get("camera.fov")
-        if model is not None:
-            # The angle between opposite corners of the visible rectangle, in place of that
-            # of its longer side. So the corner that is computed from it below is farther
-            # from the axis than the true one.
-            fov = 2.0 * math.atan(math.hypot(*model.inner_half_tangents))
-        elif fov_input is not None:
-            fov = math.radians(float(fov_input.detach()))
-        else:
-            fov = math.radians(self.scene.get_number("camera.fov"))
+        fov = self._find_image_fov(earlier_inputs)
         # The field of view is along the longer side. At most 3.0 radians (172 degrees),
         # as the tangent is infinite at 180 degrees.
         half_tangent = math.tan(min(fov, 3.0) / 2.0)
@@ -322,6 +304,29 @@ class ShadowControl(Control):
             # A shift is in image sizes; two radians for each are more than enough.
             corner += 2.0 * float(shift.detach().abs().max())
         return corner
+
+    def _find_image_fov(self, earlier_inputs: Mapping[str, Tensor]) -> float:
+        """Return the field of view, radians; with a camera model an upper bound."""
+        model = self.scene.camera_model
+        fov_input = earlier_inputs.get("camera.fov")
+        if model is not None:
+            # The angle between opposite corners of the visible rectangle, in place of that
+            # of its longer side. So a corner that is computed from it is farther from the
+            # axis than the true one.
+            return 2.0 * math.atan(math.hypot(*model.inner_half_tangents))
+        if fov_input is not None:
+            return math.radians(float(fov_input.detach()))
+        return math.radians(self.scene.get_number("camera.fov"))
+
+
+def _compute_corner_offsets(radii: Tensor) -> Tensor:
+    """Return the offsets (1 + n, 3) of the card's vertices for its radii (n,).
+
+    The first vertex is the center, which stays.
+    """
+    corners = parts.make_polygon(len(radii)).vertices[1:]
+    rim = torch.from_numpy(corners.copy()).to(radii)
+    return torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
 
 
 def _is_outside_cone(center: assets.Float64Array, radius: float, angle: float) -> bool:
@@ -348,22 +353,28 @@ def find_strongest_light(scene: SceneDescription) -> tuple[assets.Float64Array, 
         part of the environment above `MIN_ELEVATION`; and the distance of the light,
         infinite for the environment. Without any light the direction is straight up.
     """
-    strongest_direction = np.array([0.0, 0.0, 1.0])
-    strongest_distance = math.inf
-    max_irradiance = 0.0
-    # `power` (N, 3) is the radiance of each part of the environment times its solid
-    # angle: the irradiance on a surface that faces it.
-    directions, _, power = scene.list_environment_light()
-    is_above = directions[:, 2] >= math.sin(math.radians(MIN_ELEVATION))
-    if is_above.any():
-        irradiance = np.where(is_above, power.mean(axis=1), 0.0)
-        strongest_direction = directions[int(irradiance.argmax())]
-        max_irradiance = float(irradiance.max())
+    direction, max_irradiance = _find_brightest_part(scene)
+    distance = math.inf
     for lamp in scene.lamps.values():
         to_lamp, lamp_irradiance = lamp.compute_lighting(geometry.compute_center(scene))
         is_above_center = to_lamp[2] > 0.0
         if float(lamp_irradiance.mean()) > max_irradiance and is_above_center:
-            strongest_distance = float(np.linalg.norm(to_lamp))
-            strongest_direction = to_lamp / strongest_distance
+            distance = float(np.linalg.norm(to_lamp))
+            direction = to_lamp / distance
             max_irradiance = float(lamp_irradiance.mean())
-    return strongest_direction, strongest_distance
+    return direction, distance
+
+
+def _find_brightest_part(scene: SceneDescription) -> tuple[assets.Float64Array, float]:
+    """Return the direction (3,) and the irradiance of the environment's brightest part.
+
+    Only parts above `MIN_ELEVATION` count. Without any, the direction is straight up.
+    """
+    # `power` (N, 3) is the radiance of each part of the environment times its solid
+    # angle: the irradiance on a surface that faces it.
+    directions, _, power = scene.list_environment_light()
+    is_above = directions[:, 2] >= math.sin(math.radians(MIN_ELEVATION))
+    if not is_above.any():
+        return np.array([0.0, 0.0, 1.0]), 0.0
+    irradiance = np.where(is_above, power.mean(axis=1), 0.0)
+    return directions[int(irradiance.argmax())], float(irradiance.max())

@@ -97,19 +97,23 @@ def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
     t = turbidity - 1.0 - below  # from 0 at the row below to 1 at the next
     lower = table[below]
     upper = table[below + 1]
-    slopes = []
-    for index in (below, below + 1):
-        before = max(0, index - 1)
-        after = min(last, index + 1)
-        slopes.append((table[after] - table[before]) / (after - before))
+    lower_slope = _compute_slope_at_row(table, below)
+    upper_slope = _compute_slope_at_row(table, below + 1)
     # The curve is the straight line between both rows, whose slope is `rise`, plus a cubic
-    # that is 0 at both. The cubic has the slope (slopes[0] - rise) at t = 0, and
-    # (slopes[1] - rise) at t = 1.
+    # that is 0 at both. The cubic has the slope (lower_slope - rise) at t = 0, and
+    # (upper_slope - rise) at t = 1.
     rise = upper - lower
     line = torch.lerp(lower, upper, t)
     return line + t * (1.0 - t) * (
-        (1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise)
+        (1.0 - t) * (lower_slope - rise) - t * (upper_slope - rise)
     )
+
+
+def _compute_slope_at_row(table: Tensor, index: int) -> Tensor:
+    """Return the slope of a table (10, ...) between the neighbors of a row."""
+    before = max(0, index - 1)
+    after = min(len(table) - 1, index + 1)
+    return (table[after] - table[before]) / (after - before)
 
 
 def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
@@ -136,18 +140,26 @@ def compute_sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     _, _, sun_table = load_sky_tables(radians.device)
     # of this piece: (channel, power of the elevation, power of cos(psi))
     coefficients = _at_turbidity(sun_table, turbidity)[piece]
+    mean_radiance = _compute_mean_radiance(coefficients, above)
+    solid_angle = 2.0 * math.pi * (1.0 - math.cos(REAL_SUN_RADIUS))
+    return (mean_radiance * solid_angle * SUN_UNIT_FACTOR).clamp_min(0.0)
+
+
+def _compute_mean_radiance(coefficients: Tensor, above: Tensor) -> Tensor:
+    """Return the mean radiance (3,) of the sun's disk.
+
+    Args:
+        coefficients: (3, 4, 6) by channel, power of the elevation and power of cos(psi).
+        above: () elevation from the lower bound of its piece, radians.
+    """
     elevation_powers = torch.stack([above**power for power in range(4)])
     # Means of the powers of cos(psi) over the disk: at the distance r from its center,
     # cos(psi) is sqrt(1 - r^2), and the mean of (1 - r^2)^(p / 2) is 2 / (p + 2).
     limb_means = torch.tensor(
-        [2.0 / (power + 2.0) for power in range(6)], device=radians.device
+        [2.0 / (power + 2.0) for power in range(6)], device=above.device
     )
     # c channels, k powers of the elevation, j powers of cos(psi)
-    mean_radiance = torch.einsum(
-        "ckj,k,j->c", coefficients, elevation_powers, limb_means
-    )
-    solid_angle = 2.0 * math.pi * (1.0 - math.cos(REAL_SUN_RADIUS))
-    return (mean_radiance * solid_angle * SUN_UNIT_FACTOR).clamp_min(0.0)
+    return torch.einsum("ckj,k,j->c", coefficients, elevation_powers, limb_means)
 
 
 class Sky:
@@ -168,24 +180,9 @@ class Sky:
         Args:
             ground: (3,) linear reflectance of the ground, in [0, 1].
         """
-        # Row 0 of the map is straight up, and its last row straight down. Only the upper
-        # half is above the horizon. Azimuths begin at 90 degrees and decrease from column
-        # to column; they are those of the texels' centers.
         self.ground = ground
-        n_upper_rows = MAP_ROWS // 2
-        row = torch.arange(n_upper_rows, device=ground.device)
-        elevation = 90.0 - 180.0 * row / (MAP_ROWS - 1)
-        azimuth = (
-            90.0
-            - 360.0
-            * (torch.arange(MAP_COLUMNS, device=ground.device) + 0.5)
-            / MAP_COLUMNS
-        )
-        # (H, W) each, of the texels
-        elevations, azimuths = torch.meshgrid(elevation, azimuth, indexing="ij")
-        # `meshgrid` returns a view that repeats one row; the sum is a dense tensor.
-        dense_azimuths = elevations * 0.0 + azimuths
-        directions = compute_direction(dense_azimuths, elevations)  # (3, H, W)
+        elevations, azimuths = _make_texel_angles(ground.device)
+        directions = compute_direction(azimuths, elevations)  # (3, H, W)
         self.directions = directions.permute(1, 2, 0).contiguous()
         self.cosines = self.directions[..., 2:3].clamp_min(0.0)
         # Texels get narrower towards the pole, where row 0 has no solid angle at all.
@@ -218,16 +215,10 @@ class Sky:
         cosine = (self.directions @ sun)[..., None]
         angle = compute_angles(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
-        glow = (1.0 + cosine**2) / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(
-            1.5
-        )
-        around_sun = (
-            c
-            + d * torch.exp(e * angle)
-            + f * cosine**2
-            + g * glow
-            + i * self.cosines.sqrt()
-        )
+        glow = _compute_glow(h, cosine)
+        peak = d * torch.exp(e * angle)
+        zenith = i * self.cosines.sqrt()
+        around_sun = c + peak + f * cosine**2 + g * glow + zenith
         return (horizon * around_sun * level).clamp_min(0.0)
 
     def _interpolate(
@@ -295,16 +286,52 @@ class Sky:
         upper = dome + disk
         # (H, W, 3) irradiance by each texel on a surface that faces the texel
         texel_irradiance = upper * self.solid_angles
-        ground_irradiance = (texel_irradiance * self.cosines).sum((0, 1))
-        # The ground is diffuse: its radiance is the same in all directions.
-        lower = (self.ground * ground_irradiance / math.pi).expand(
-            MAP_ROWS - MAP_ROWS // 2, MAP_COLUMNS, 3
-        )
-        radiance = torch.cat([upper, lower])
+        radiance = torch.cat([upper, self._compute_lower_half(texel_irradiance)])
         # The same for a surface that faces the sun, instead of the ground.
         cosines_to_sun = (self.directions @ sun).clamp_min(0.0)[..., None]
         irradiance = (texel_irradiance * cosines_to_sun).sum() / 3.0  # mean of channels
         return radiance, irradiance
+
+    def _compute_lower_half(self, texel_irradiance: Tensor) -> Tensor:
+        """Return the radiance of the ground, the lower half of the map.
+
+        Args:
+            texel_irradiance: (H, W, 3) irradiance by each texel of the upper half on a
+                surface that faces the texel.
+        """
+        ground_irradiance = (texel_irradiance * self.cosines).sum((0, 1))
+        # The ground is diffuse: its radiance is the same in all directions.
+        ground_radiance = self.ground * ground_irradiance / math.pi
+        n_lower_rows = MAP_ROWS - MAP_ROWS // 2
+        return ground_radiance.expand(n_lower_rows, MAP_COLUMNS, 3)
+
+
+def _make_texel_angles(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return elevations and azimuths (H, W) of the texels above the horizon, degrees.
+
+    Row 0 of the map is straight up, and its last row straight down. Only the upper half
+    is above the horizon. Azimuths begin at 90 degrees and decrease from column to
+    column; they are those of the texels' centers.
+    """
+    n_upper_rows = MAP_ROWS // 2
+    row = torch.arange(n_upper_rows, device=device)
+    elevation = 90.0 - 180.0 * row / (MAP_ROWS - 1)
+    column = torch.arange(MAP_COLUMNS, device=device)
+    azimuth = 90.0 - 360.0 * (column + 0.5) / MAP_COLUMNS
+    elevations, azimuths = torch.meshgrid(elevation, azimuth, indexing="ij")
+    # `meshgrid` returns a view that repeats one row; the sum is a dense tensor.
+    dense_azimuths = elevations * 0.0 + azimuths
+    return elevations, dense_azimuths
+
+
+def _compute_glow(h: Tensor, cosine: Tensor) -> Tensor:
+    """Return the glow (H, W, 3) around the sun, by its shape `h` (3,).
+
+    `cosine` (H, W, 1) is that of the angle between a direction and the sun.
+    """
+    # The numerator comes first: the order fixes how derivatives are rounded.
+    numerator = 1.0 + cosine**2
+    return numerator / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(1.5)
 
 
 def compute_angles(directions: Tensor, reference: Tensor) -> Tensor:

@@ -83,18 +83,19 @@ class Space:
         one is chosen later. The estimator "material" is removed if the scene does not
         support it.
         """
-        lacks_material_form = not self._has_material_form()
+        has_material_form = self._has_material_form()
         groups = []
         begin = 0
         for control in self.controls:
             for group in control.groups:
                 valid = group.valid
-                if lacks_material_form:
+                if not has_material_form:
                     valid = tuple(name for name in valid if name != "material")
                 # A control does not know where its coordinates begin in u.
-                groups.append(
-                    replace(group, control=control.name, begin=begin, valid=valid)
+                positioned_group = replace(
+                    group, control=control.name, begin=begin, valid=valid
                 )
+                groups.append(positioned_group)
                 begin += group.size
         return tuple(groups)
 
@@ -161,15 +162,7 @@ class Space:
             if not is_package_class(type(control)):
                 _check_inputs(control.name, new_inputs)
             for name in new_inputs:
-                # Only inputs that a control refines may be set again.
-                if name in merged and name not in control.refines:
-                    hint = ""
-                    if name.endswith(".base_color"):
-                        hint = "; one `texture` takes several materials"
-                    raise InputError(
-                        f"controls: two controls set {name}, {first_setter[name]} and "
-                        f"{control.name}; leave one of them out{hint}"
-                    )
+                _check_may_set(control, name, first_setter)
                 first_setter.setdefault(name, control.name)
             merged = {**merged, **new_inputs}
         return merged
@@ -191,17 +184,24 @@ class Space:
             For each control: itself, its slice (k,) of u, and the inputs.
         """
         slices = u.detach().split(self.coordinate_counts)
-        order = self._evaluation_order
-        # positions in the order of evaluation
-        refining_positions = [
-            position
-            for position, index in enumerate(order)
-            if self.controls[index].refines
+        inputs_before = self._compute_inputs_before(slices)
+        return [
+            (control, slices[index], inputs_before[index])
+            for index, control in enumerate(self.controls)
         ]
-        last_refining = max(refining_positions, default=-1)  # -1 if there is none
+
+    def _compute_inputs_before(
+        self, slices: Sequence[Tensor]
+    ) -> dict[int, Mapping[str, Tensor]]:
+        """Return the inputs of earlier controls, by the index of each control.
+
+        Args:
+            slices: slice (k,) of the configuration of each control.
+        """
+        last_refining = self._last_refining_position
         earlier_inputs = NO_INPUTS
         inputs_before = dict[int, Mapping[str, Tensor]]()
-        for position, index in enumerate(order):
+        for position, index in enumerate(self._evaluation_order):
             control = self.controls[index]
             inputs_before[index] = earlier_inputs if control.refines else NO_INPUTS
             if position < last_refining:  # a later control needs its inputs
@@ -209,10 +209,17 @@ class Space:
                     **earlier_inputs,
                     **control.inputs(slices[index], earlier_inputs),
                 }
-        return [
-            (control, slices[index], inputs_before[index])
-            for index, control in enumerate(self.controls)
+        return inputs_before
+
+    @property
+    def _last_refining_position(self) -> int:
+        """The last position, in the order of evaluation, that refines inputs, or -1."""
+        refining_positions = [
+            position
+            for position, index in enumerate(self._evaluation_order)
+            if self.controls[index].refines
         ]
+        return max(refining_positions, default=-1)
 
     def apply_to_image(self, u: Tensor, image: Tensor) -> Tensor:
         """Return the finished image (H, W, 3) sRGB as the controls change it.
@@ -299,31 +306,36 @@ class Space:
         Raises:
             InputError: no number of controls has k coordinates.
         """
-        sizes = self.coordinate_counts
-        # Several counts may fit, as the next controls may have no coordinates. These are
-        # fixed anyway, so that the smallest count is enough.
-        counts = [
-            count for count in range(len(sizes) + 1) if sum(sizes[:count]) == len(u)
-        ]
-        if not counts:
-            raise InputError(
-                "controls: expected the coordinates of the first controls, which have "
-                f"{sizes} coordinates, got {len(u)}"
-            )
-        count = counts[0]
+        count = self._count_controls(u)
         first_controls = self.controls[:count]
-        slices = u.split(sizes[:count])
+        slices = u.split(self.coordinate_counts[:count])
         fixed = [
             _FixedControl(control, u_slice)
             for control, u_slice in zip(first_controls, slices, strict=True)
         ]
-        # only to find out which environment the first controls choose
-        fixed_space = Space(first_controls, self.scene)
-        chosen_environment = fixed_space.find_environment_name(fixed_space.describe(u))
+        chosen_environment = _find_chosen_environment(first_controls, self.scene, u)
         return replace(
             self,
             controls=(*fixed, *self.controls[count:]),
             environment_name=chosen_environment or self.environment_name,
+        )
+
+    def _count_controls(self, u: Tensor) -> int:
+        """Return how many of the first controls have the coordinates (k,).
+
+        Several counts may fit, as the next controls may have no coordinates. These are
+        fixed anyway, so that the smallest count is enough.
+
+        Raises:
+            InputError: no number of controls has k coordinates.
+        """
+        sizes = self.coordinate_counts
+        for count in range(len(sizes) + 1):
+            if sum(sizes[:count]) == len(u):
+                return count
+        raise InputError(
+            "controls: expected the coordinates of the first controls, which have "
+            f"{sizes} coordinates, got {len(u)}"
         )
 
     def find_environment_name(self, values: Mapping[str, Value]) -> str | None:
@@ -356,11 +368,7 @@ class Space:
             group.setting == "environment.rotation" for group in self.groups
         )
         has_solids = any(part.solids for part in scene.surrounding_meshes.values())
-        has_limited_surroundings = find_surroundings(scene) is not None
-        # Views take time to compute, so only if a note may depend on them.
-        views = list[CameraView]()
-        if has_solids or has_limited_surroundings:
-            views = self._sample_camera_views(scene)
+        views = self._find_noted_views(scene, has_solids)
         camera_positions = []
         if has_solids:
             camera_positions = [get_camera_position(view) for view in views]
@@ -369,6 +377,18 @@ class Space:
             *list_view_remarks(scene, views, rotates_map=rotates_map),
             *list_camera_remarks(scene, camera_positions),
         )
+
+    def _find_noted_views(
+        self, scene: SceneDescription, has_solids: bool
+    ) -> list[CameraView]:
+        """Return views of the camera if a note may depend on them, as they take time.
+
+        `has_solids` states whether the surroundings have solids, such as walls.
+        """
+        has_limited_surroundings = find_surroundings(scene) is not None
+        if has_solids or has_limited_surroundings:
+            return self._sample_camera_views(scene)
+        return []
 
     def _sample_camera_views(self, scene: SceneDescription) -> list[CameraView]:
         """Return views of the camera, spread over the range in which it may move.
@@ -407,6 +427,27 @@ class Space:
             for name, content in files.items():
                 artifacts[to_file_name(name)] = content
         return artifacts
+
+
+def _check_may_set(
+    control: Control, name: str, first_setter: Mapping[str, str]
+) -> None:
+    """Raise InputError if two controls set an input, and the later does not refine it.
+
+    Args:
+        control: the later control.
+        name: name of the input.
+        first_setter: control that set each input first, by the input's name.
+    """
+    if name not in first_setter or name in control.refines:
+        return
+    hint = ""
+    if name.endswith(".base_color"):
+        hint = "; one `texture` takes several materials"
+    raise InputError(
+        f"controls: two controls set {name}, {first_setter[name]} and "
+        f"{control.name}; leave one of them out{hint}"
+    )
 
 
 def _spread_over_box(size: int) -> Tensor:
@@ -523,24 +564,40 @@ def _check_inputs(control: str, inputs: object) -> None:
             f"{type(inputs).__name__}"
         )
     for name, value in inputs.items():
-        if not (isinstance(value, Tensor) and value.is_floating_point()):
-            got = value.dtype if isinstance(value, Tensor) else type(value).__name__
-            raise InputError(
-                f"`controls` {control}: {name}: expected a tensor of real "
-                f"numbers, got {got}"
-            )
-        # "base_color" for "object.base_color"
-        last_part = name.rpartition(".")[2]
-        shape, low, high = EXPECTED_INPUTS.get(last_part, ANY_INPUT)
-        if shape is not None and not _has_shape(value, shape):
-            sides = ", ".join("N" if side is None else str(side) for side in shape)
-            if len(shape) == 1:
-                sides += ","  # as Python writes a tuple of one
-            raise InputError(
-                f"`controls` {control}: {name}: expected shape "
-                f"({sides}), got {tuple(value.shape)}"
-            )
-        _check_range(f"`controls` {control}: {name}", value, low, high)
+        _check_input(f"`controls` {control}: {name}", name, value)
+
+
+def _check_input(label: str, name: str, value: object) -> None:
+    """Check one input that a control of another package sets.
+
+    Args:
+        label: how messages name the input.
+        name: name of the input.
+        value: what the control returned for it.
+
+    Raises:
+        InputError: it is no tensor, or has a wrong shape or range.
+    """
+    if not (isinstance(value, Tensor) and value.is_floating_point()):
+        got = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        raise InputError(f"{label}: expected a tensor of real numbers, got {got}")
+    # "base_color" for "object.base_color"
+    last_part = name.rpartition(".")[2]
+    shape, low, high = EXPECTED_INPUTS.get(last_part, ANY_INPUT)
+    if shape is not None and not _has_shape(value, shape):
+        raise InputError(
+            f"{label}: expected shape "
+            f"({_format_shape(shape)}), got {tuple(value.shape)}"
+        )
+    _check_range(label, value, low, high)
+
+
+def _format_shape(shape: tuple[int | None, ...]) -> str:
+    """Return the sides of a shape as Python writes them; N stands for any size."""
+    sides = ", ".join("N" if side is None else str(side) for side in shape)
+    if len(shape) == 1:
+        sides += ","  # as Python writes a tuple of one
+    return sides
 
 
 def _has_shape(value: Tensor, shape: tuple[int | None, ...]) -> bool:
@@ -551,6 +608,20 @@ def _has_shape(value: Tensor, shape: tuple[int | None, ...]) -> bool:
         expected in (None, size)
         for expected, size in zip(shape, value.shape, strict=True)
     )
+
+
+def _find_chosen_environment(
+    controls: tuple[Control, ...], scene: SceneDescription | None, u: Tensor
+) -> str | None:
+    """Return the name of the environment that controls choose; None if they choose none.
+
+    Args:
+        controls: controls that are bound to the scene.
+        scene: the scene.
+        u: (d,) their configuration.
+    """
+    space = Space(controls, scene)
+    return space.find_environment_name(space.describe(u))
 
 
 def _check_range(label: str, value: Tensor, low: float, high: float) -> None:

@@ -24,6 +24,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -179,6 +180,11 @@ class TextureControl(Control):
             return
         if isinstance(names, str):
             names = [names]
+        self._check_are_names(names)
+        self.choice_values["materials"] = list(dict.fromkeys(names))
+
+    def _check_are_names(self, names: object) -> None:
+        """Raise InputError if the choice `materials` is no list of names."""
         is_list_of_names = (
             isinstance(names, Sequence)
             and len(names) > 0
@@ -190,7 +196,6 @@ class TextureControl(Control):
                 f"{names!r}; put quotes around a "
                 "name that reads as a number"
             )
-        self.choice_values["materials"] = list(dict.fromkeys(names))
 
     def get_mesh(self, scene: SceneDescription) -> MeshPart:
         """Return the mesh that the control paints.
@@ -247,10 +252,9 @@ class TextureControl(Control):
         names = self.list_materials(self.scene)  # None for all of them
         self._original = self._resample_original(part, names)
         shape = (self._original.shape[0], self._original.shape[1])
-        if names is None:
-            self._painted_mask = None  # all texels
-            mask = torch.ones(shape, dtype=torch.bool)
-        else:
+        self._painted_mask = None
+        mask = torch.ones(shape, dtype=torch.bool)  # all texels
+        if names is not None:
             mask = torch.from_numpy(self._find_painted_texels(part, names, shape))
             self._painted_mask = mask
         self._mesh_name = part.name
@@ -295,26 +299,40 @@ class TextureControl(Control):
             mask: (h, w) bool, texels that are painted.
         """
         texels = self._original[mask]
-        norm = self.choice_values["norm"]
         if self.form == "palette":
-            weight = _compute_texel_areas(part, mask)
-            centers = compute_palette(
-                self._original, weight, int(self.choice_values["colors"])
-            )
-            budget = Budget(norm, self._compute_radius(norm, centers.numel()))
-            return make_palette_painter(texels, centers, budget)
+            return self._make_palette(part, mask)
         if self.form == "waves":
-            max_change = self._compute_radius(norm, texels.numel())
-            if norm == "l2":
-                # Waves limit each change. If n changes are at most radius / sqrt(n),
-                # their norm is at most the radius.
-                max_change = max_change / math.sqrt(texels.numel())
-            n_waves = int(self.choice_values["waves"])
-            return make_wave_painter(texels, mask, n_waves, max_change)
+            return self._make_waves(texels, mask)
+        norm = self.choice_values["norm"]
         budget = Budget(norm, self._compute_radius(norm, texels.numel()))
         group = Group("texels", texels.numel(), ("adjoint",), budget)
         # The coordinates are the texel values themselves.
         return Painter(texels.reshape(-1), group, to_texels)
+
+    def _make_waves(self, texels: Tensor, mask: Tensor) -> Painter:
+        """Return what adds waves to the texels.
+
+        Args:
+            texels: (n, 3) sRGB, the texels that are painted.
+            mask: (h, w) bool, texels that are painted.
+        """
+        norm = self.choice_values["norm"]
+        max_change = self._compute_radius(norm, texels.numel())
+        if norm == "l2":
+            # Waves limit each change. If n changes are at most radius / sqrt(n),
+            # their norm is at most the radius.
+            max_change = max_change / math.sqrt(texels.numel())
+        n_waves = int(self.choice_values["waves"])
+        return make_wave_painter(texels, mask, n_waves, max_change)
+
+    def _make_palette(self, part: MeshPart, mask: Tensor) -> Painter:
+        """Return the painter that changes a few colors; see `_make_painter`."""
+        norm = self.choice_values["norm"]
+        weight = _compute_texel_areas(part, mask)
+        n_colors = int(self.choice_values["colors"])
+        centers = compute_palette(self._original, weight, n_colors)
+        budget = Budget(norm, self._compute_radius(norm, centers.numel()))
+        return make_palette_painter(self._original[mask], centers, budget)
 
     def _compute_radius(self, norm: str, count: int) -> float:
         """Return how far `count` values may go from the original, in a norm."""
@@ -340,6 +358,16 @@ class TextureControl(Control):
             UnknownNameError: it has no such material.
         """
         known = part.mesh.materials
+        self._check_materials_exist(part, names)
+        faces = np.concatenate([known[name] for name in names])
+        mask, fraction = find_exclusive_texels(part.mesh, faces, shape)
+        if fraction < MIN_EXCLUSIVE_FRACTION:
+            raise self._make_shared_error(names, fraction)
+        return mask
+
+    def _check_materials_exist(self, part: MeshPart, names: Sequence[str]) -> None:
+        """Raise an error if a mesh has no materials, or none of a name."""
+        known = part.mesh.materials
         owner = "the object" if part.name == OBJECT else part.name
         if not known:
             raise InputError(
@@ -349,23 +377,25 @@ class TextureControl(Control):
         for name in names:
             if name not in known:
                 raise UnknownNameError(f"material of {owner}", name, known)
-        faces = np.concatenate([known[name] for name in names])
-        mask, fraction = find_exclusive_texels(part.mesh, faces, shape)
-        if fraction < MIN_EXCLUSIVE_FRACTION:
-            shared = f"{100 * (1 - fraction):.0f}"
-            remedy = ""
-            # Texels of a low resolution may lie in several materials. Without the
-            # setting, the texture has its full resolution.
-            if self.choice_values["resolution"]:
-                remedy = "take a higher resolution, "
-            raise InputError(
-                f"{self.name}.materials: other materials use {shared} % of the texels "
-                "of "
-                f"{', '.join(names)} too, so that it cannot be painted separately; "
-                "assign different texels to each material in "
-                f"the file, {remedy}or leave materials out"
-            )
-        return mask
+
+    def _make_shared_error(self, names: Sequence[str], fraction: float) -> InputError:
+        """Return the error for materials with too few texels of their own.
+
+        `fraction` of their texels are used by no other material.
+        """
+        shared = f"{100 * (1 - fraction):.0f}"
+        remedy = ""
+        # Texels of a low resolution may lie in several materials. Without the setting,
+        # the texture has its full resolution.
+        if self.choice_values["resolution"]:
+            remedy = "take a higher resolution, "
+        return InputError(
+            f"{self.name}.materials: other materials use {shared} % of the texels "
+            "of "
+            f"{', '.join(names)} too, so that it cannot be painted separately; "
+            "assign different texels to each material in "
+            f"the file, {remedy}or leave materials out"
+        )
 
     def inputs(
         self, u: Tensor, earlier_inputs: Mapping[str, Tensor] = NO_INPUTS
@@ -506,8 +536,8 @@ def make_wave_painter(
     down = _make_cosine_waves(height, count)
     right = _make_cosine_waves(width, count)
     # of each product, in half periods
-    wave_index = torch.arange(count)
-    frequency = torch.hypot(wave_index[:, None].float(), wave_index[None, :].float())
+    wave_index = torch.arange(count).float()
+    frequency = torch.hypot(wave_index[:, None], wave_index[None, :])
     max_amplitude = (WAVE_REACH / (1.0 + frequency))[..., None]  # (count, count, 1)
     start = torch.full((count * count * 3,), 0.5)
     group = Group("amplitudes", len(start), ("adjoint",))
@@ -570,16 +600,34 @@ def compute_palette(image: Tensor, weight: Float32Array, count: int) -> Tensor:
     for _ in range(LLOYD_STEPS):
         nearest = ((points[:, None] - centers) ** 2).sum(axis=-1).argmin(axis=1)
         center_mass = np.bincount(nearest, weights=mass, minlength=len(centers))
-        sums = [
-            np.bincount(nearest, mass * points[:, channel], len(centers))
-            for channel in range(3)
-        ]
-        means = np.stack(sums, axis=1) / np.maximum(center_mass[:, None], 1e-12)
+        sums = _sum_colors(nearest, points, mass, len(centers))
+        means = sums / np.maximum(center_mass[:, None], 1e-12)
         # a center without colors stays where it is
         centers = np.where(center_mass[:, None] > 0.0, means, centers)
     # by the masses of the last step, before the centers moved once more
     order = np.argsort(-center_mass, kind="stable")
     return torch.from_numpy(centers[order].clip(0.0, 1.0).astype(np.float32))
+
+
+def _sum_colors(
+    group_of_color: npt.NDArray[np.intp],
+    colors: Float64Array,
+    weights: Float64Array,
+    n_groups: int,
+) -> Float64Array:
+    """Return the weighted sum (n_groups, 3) of the colors in each group.
+
+    Args:
+        group_of_color: (N,) index of the group of each color.
+        colors: (N, 3) colors.
+        weights: (N,) their weights.
+        n_groups: number of groups.
+    """
+    sums = [
+        np.bincount(group_of_color, weights * colors[:, channel], n_groups)
+        for channel in range(3)
+    ]
+    return np.stack(sums, axis=1)
 
 
 def _quantise_colors(
@@ -602,14 +650,9 @@ def _quantise_colors(
     cells, cell_index = np.unique(levels, axis=0, return_inverse=True)
     cell_index = cell_index.reshape(-1)
     cell_weight = np.bincount(cell_index, weights=weights, minlength=len(cells))
-    sums = [
-        np.bincount(
-            cell_index, weights=weights * colors[:, channel], minlength=len(cells)
-        )
-        for channel in range(3)
-    ]
+    sums = _sum_colors(cell_index, colors, weights, len(cells))
     has_weight = cell_weight > 0.0
-    points = np.stack(sums, axis=1)[has_weight] / cell_weight[has_weight, None]
+    points = sums[has_weight] / cell_weight[has_weight, None]
     return points, np.sqrt(cell_weight[has_weight])
 
 

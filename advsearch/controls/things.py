@@ -137,6 +137,21 @@ class ThingsControl(Control):
             UnknownNameError: a parameter names a thing that the scene does not have.
         """
         things = self.scene.things
+        self._check_things_exist()
+        super().bind_parameters()
+        # Other things keep their positions, unless another control moves them.
+        moved = self._find_moved_things()
+        self._moved_things = tuple(name for name in things if name in moved)
+        self._check_things_stand_free()
+
+    def _check_things_exist(self) -> None:
+        """Check that the scene has things, and those that parameters name.
+
+        Raises:
+            InputError: the scene has no things.
+            UnknownNameError: a parameter names a thing that the scene does not have.
+        """
+        things = self.scene.things
         if not things:
             raise InputError(
                 f"`controls` {self.name}: there is no thing around the "
@@ -149,11 +164,6 @@ class ThingsControl(Control):
                 raise errors.UnknownNameError(
                     f"`controls` {self.name}: thing around the object", thing, things
                 )
-        super().bind_parameters()
-        # Other things keep their positions, unless another control moves them.
-        moved = self._find_moved_things()
-        self._moved_things = tuple(name for name in things if name in moved)
-        self._check_things_stand_free()
 
     def _find_moved_things(self) -> set[str]:
         """Return the things with a searched parameter, or one that the user set.
@@ -237,27 +247,35 @@ class ThingsControl(Control):
             values: values of the control, such as "car.x" and "car.heading".
             earlier_inputs: inputs of earlier controls, which may move obstacles.
         """
-        inputs = {}
-        for name, stand in self._compute_stands(values, earlier_inputs).items():
-            part = self.scene.meshes[name]
-            # the pose in the scene, and the point of the thing on the ground
-            base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
-            foot = torch.from_numpy(_find_foot(part)).to(base)
-            pitch, roll = base.new_zeros(2)
-            turn = geometry.make_euler_rotation(values[f"{name}.heading"], pitch, roll)
-            # () index of the option of "presence": 0 for "there", 1 for "away"
-            is_absent = values[f"{name}.presence"]
-            if bool(is_absent):
-                turn = ABSENT_SCALE * turn
-            # without derivatives
-            position = base.new_tensor([*stand.position, stand.height])
-            absent_depth = base.new_tensor(
-                [0.0, 0.0, ABSENT_DEPTH / self.scene.size_in_metres]
-            )
-            depth = absent_depth * is_absent
-            translation = position - depth - turn @ foot
-            inputs[f"{name}.to_world"] = geometry.make_affine(turn, translation) @ base
-        return inputs
+        return {
+            f"{name}.to_world": self._compute_thing_pose(name, values, stand)
+            for name, stand in self._compute_stands(values, earlier_inputs).items()
+        }
+
+    def _compute_thing_pose(self, name: str, values: Values, stand: Stand) -> Tensor:
+        """Return the pose (4, 4) of a thing at its free position.
+
+        Args:
+            name: name of the thing.
+            values: values of the control.
+            stand: the free position.
+        """
+        part = self.scene.meshes[name]
+        # the pose in the scene, and the point of the thing on the ground
+        base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
+        foot = torch.from_numpy(_find_foot(part)).to(base)
+        pitch, roll = base.new_zeros(2)
+        turn = geometry.make_euler_rotation(values[f"{name}.heading"], pitch, roll)
+        # () index of the option of "presence": 0 for "there", 1 for "away"
+        is_absent = values[f"{name}.presence"]
+        if bool(is_absent):
+            turn = ABSENT_SCALE * turn
+        # without derivatives
+        position = base.new_tensor([*stand.position, stand.height])
+        absent_depth = ABSENT_DEPTH / self.scene.size_in_metres
+        depth = base.new_tensor([0.0, 0.0, absent_depth]) * is_absent
+        translation = position - depth - turn @ foot
+        return geometry.make_affine(turn, translation) @ base
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -288,8 +306,7 @@ class ThingsControl(Control):
         """
         scene = self.scene
         obstacles = self._list_obstacles(earlier_inputs)
-        object_outline = obstacles[0].outline  # the object is the first of them
-        object_center = (object_outline.min(axis=0) + object_outline.max(axis=0)) / 2.0
+        object_center = _compute_outline_center(obstacles[0])  # the object is the first
         solids = [
             solid for part in scene.surrounding_meshes.values() for solid in part.solids
         ]
@@ -303,9 +320,7 @@ class ThingsControl(Control):
             # index of the option: 0 for "there", 1 for "away"
             is_present = float(values[f"{name}.presence"]) == 0.0
             if is_present:
-                obstacles.append(
-                    parts.Footprint(outline, footprint.lower, footprint.upper)
-                )
+                obstacles.append(footprint._replace(outline=outline))
         return stands
 
     def _list_obstacles(
@@ -324,28 +339,37 @@ class ThingsControl(Control):
         """
         scene = self.scene
         object_footprint = _compute_footprint(scene, "object", earlier_inputs)
-        outline = object_footprint.outline
-        object_center = (outline.min(axis=0) + outline.max(axis=0)) / 2.0
-        camera = geometry.get_camera_pose(scene, earlier_inputs)
+        object_center = _compute_outline_center(object_footprint)
+        fixed_things = [name for name in scene.things if name not in self._moved_things]
+        return [
+            object_footprint,
+            self._make_camera_footprint(object_center, earlier_inputs),
+            *(_compute_footprint(scene, name, earlier_inputs) for name in fixed_things),
+        ]
+
+    def _make_camera_footprint(
+        self, object_center: assets.Float64Array, earlier_inputs: Mapping[str, Tensor]
+    ) -> parts.Footprint:
+        """Return the space around the camera in which nothing may stand.
+
+        Args:
+            object_center: (2,) the object's center.
+            earlier_inputs: inputs of earlier controls, which may have moved the camera.
+        """
+        camera = geometry.get_camera_pose(self.scene, earlier_inputs)
         camera_position = camera[:3, 3].detach().double().cpu().numpy()
         object_distance = float(np.linalg.norm(camera_position[:2] - object_center))
         clearance = min(
-            CAMERA_CLEARANCE / scene.size_in_metres,
+            CAMERA_CLEARANCE / self.scene.size_in_metres,
             CAMERA_CLEARANCE_FRACTION * object_distance,
         )
         octagon = np.stack([np.cos(EIGHT_ANGLES), np.sin(EIGHT_ANGLES)], axis=1)
         camera_height = camera_position[2]
-        around_camera = parts.Footprint(
+        return parts.Footprint(
             outline=camera_position[:2] + clearance * octagon,
             lower=camera_height,
             upper=camera_height + clearance,
         )
-        fixed_things = [name for name in scene.things if name not in self._moved_things]
-        return [
-            object_footprint,
-            around_camera,
-            *(_compute_footprint(scene, name, earlier_inputs) for name in fixed_things),
-        ]
 
     def _read_numbers(self, name: str, values: Values) -> list[float]:
         """Return the values of a thing in the order of `parameters`.
@@ -391,19 +415,21 @@ class ThingsControl(Control):
         direction = _normalize(requested - object_center)
         push_distance = 0.0
         if not is_absent:
-            footprint = parts.Footprint(
-                outline + requested, initial_footprint.lower, initial_footprint.upper
-            )
+            footprint = initial_footprint._replace(outline=outline + requested)
+            gap = MIN_GAP / scene.size_in_metres
             push_distance = _find_free_shift(
-                footprint,
-                direction,
-                obstacles,
-                solids,
-                gap=MIN_GAP / scene.size_in_metres,
+                footprint, direction, obstacles, solids, gap
             )
         position = requested + push_distance * direction
         height = _compute_height(scene, foot, position)
         return Stand(position, height, push_distance), outline + position
+
+
+def _compute_outline_center(footprint: parts.Footprint) -> assets.Float64Array:
+    """Return the center (2,) of the bounding box of a footprint's outline."""
+    outline = footprint.outline
+    center: assets.Float64Array = (outline.min(axis=0) + outline.max(axis=0)) / 2.0
+    return center
 
 
 def _rotate_outline(
@@ -449,25 +475,45 @@ def _find_free_shift(
         The shift, in scene units; negative if it is backwards.
     """
     # (begin, end) of the interval of shifts at which it overlaps with each
-    solid_intervals = [
-        geometry.find_overlap_interval(footprint, solid.footprint, direction)
-        for solid in solids
-    ]
-    obstacle_intervals = [
-        geometry.find_overlap_interval(footprint, obstacle, direction)
-        for obstacle in obstacles
-    ]
-    shift = 0.0
-    # begins of the solids that it overlaps with at the shift 0
-    solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
-    if solid_begins:
-        shift = min(solid_begins) - gap
+    solid_footprints = [solid.footprint for solid in solids]
+    solid_intervals = _find_overlaps(footprint, solid_footprints, direction)
+    obstacle_intervals = _find_overlaps(footprint, obstacles, direction)
+    shift = _find_shift_before_solids(solid_intervals, gap)
     # In ascending order of their begins: after a shift past an obstacle, the thing can
     # only overlap with those that begin later.
     for begin, end in sorted(obstacle_intervals + solid_intervals):
         if begin < shift < end:
             shift = end + gap
     return shift
+
+
+def _find_shift_before_solids(
+    solid_intervals: Iterable[tuple[float, float]], gap: float
+) -> float:
+    """Return the shift that moves a thing backwards to just before the first solid.
+
+    Args:
+        solid_intervals: (begin, end) of the interval of shifts at which the thing
+            overlaps with each solid; the shift is 0 if no interval has 0 inside.
+        gap: distance from the solid that is left free.
+    """
+    # begins of the solids that it overlaps with at the shift 0
+    solid_begins = [begin for begin, end in solid_intervals if begin < 0.0 < end]
+    return min(solid_begins) - gap if solid_begins else 0.0
+
+
+def _find_overlaps(
+    footprint: parts.Footprint,
+    others: Sequence[parts.Footprint],
+    direction: assets.Float64Array,
+) -> list[tuple[float, float]]:
+    """Return the interval of shifts at which a footprint overlaps with each other one.
+
+    The shifts are along a direction (2,), in scene units.
+    """
+    return [
+        geometry.find_overlap_interval(footprint, other, direction) for other in others
+    ]
 
 
 def _compute_height(
@@ -517,15 +563,19 @@ def _compute_footprint(
     offsets = earlier_inputs.get(f"{name}.offsets")
     if pose is None and offsets is None:
         return _compute_initial_footprint(part)
-    vertices = part.mesh.vertices
+    vertices: assets.Float32Array | assets.Float64Array = part.mesh.vertices
     if offsets is not None:
-        vertices = vertices + offsets.detach().cpu().double().numpy()
-    to_world = part.to_world
-    if pose is not None:
-        to_world = pose.detach().cpu().double().numpy()
+        vertices = vertices + _to_float64_array(offsets)
+    to_world = part.to_world if pose is None else _to_float64_array(pose)
     rotation = to_world[:3, :3]
     translation = to_world[:3, 3]
     return geometry.compute_footprint(vertices @ rotation.T + translation)
+
+
+def _to_float64_array(tensor: Tensor) -> assets.Float64Array:
+    """Return a tensor as an array of double precision, without derivatives."""
+    array: assets.Float64Array = tensor.detach().cpu().double().numpy()
+    return array
 
 
 @lru_cache(maxsize=256)

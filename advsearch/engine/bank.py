@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -110,6 +110,26 @@ class Condition:
     u: Tensor
     renderer: LinearRenderer
     depends_on_searched_only: bool
+
+
+def _predict_image_under(
+    condition: Condition, searched_inputs: Mapping[str, Tensor], u: Tensor
+) -> Tensor:
+    """Return the predicted image (H, W, 3) of u (d,) under a condition.
+
+    Args:
+        condition: the condition.
+        searched_inputs: the scene inputs that the searched controls set at u.
+        u: (d,) the searched coordinates.
+    """
+    full_u = torch.cat([u, condition.u])
+    renderer = condition.renderer
+    if not condition.depends_on_searched_only:
+        # computes the inputs from the full configuration first
+        return renderer(full_u)
+    # `linearized_at` has the inputs of the matrix by name
+    matrix_inputs = {name: searched_inputs[name] for name in renderer.linearized_at}
+    return renderer.predict_image(matrix_inputs, full_u)
 
 
 @dataclass
@@ -241,13 +261,9 @@ class Bank(PredictedSearch):
             # all conditions that it had at its latest step are old.
             previous_index = self._latest_step
         size_before = self._count_conditions(previous_index)
-        new = []
-        old = []
-        for condition in self._conditions:
-            if condition.index >= size_before:
-                new.append(condition)
-            else:
-                old.append(condition)
+        conditions = self._conditions
+        new = [condition for condition in conditions if condition.index >= size_before]
+        old = [condition for condition in conditions if condition.index < size_before]
         new = new[:count]
         return new + self._sample(old, count - len(new), f"bank {kind}", index)
 
@@ -279,19 +295,10 @@ class Bank(PredictedSearch):
             u: (d,) the searched coordinates.
         """
         searched_inputs = self.problem.searched_space.inputs(u)
-        images = []
-        for condition in conditions:
-            full_u = torch.cat([u, condition.u])
-            renderer = condition.renderer
-            if condition.depends_on_searched_only:
-                # `linearized_at` has the inputs of the matrix by name
-                matrix_inputs = {
-                    name: searched_inputs[name] for name in renderer.linearized_at
-                }
-                images.append(renderer.predict_image(matrix_inputs, full_u))
-            else:
-                # computes the inputs from the full configuration first
-                images.append(renderer(full_u))
+        images = [
+            _predict_image_under(condition, searched_inputs, u)
+            for condition in conditions
+        ]
         return torch.stack(images)
 
     def _render_image(self, u: Tensor) -> Tensor:
@@ -346,6 +353,16 @@ class Bank(PredictedSearch):
             condition_index: index of the condition in the bank's sequence.
         """
         assert self.problem.conditions is not None
+        u = self._find_light_configuration(condition_index)
+        bank_seed = seeds.derive_seed(self.problem.seed, "bank")
+        condition = sample_condition(
+            self.problem.conditions, condition_index, bank_seed
+        )
+        seed = seeds.derive_seed(self.problem.seed, "bank matrix", condition_index)
+        return Query(torch.cat([u, condition]), seed, spp=SPP, requested_output="light")
+
+    def _find_light_configuration(self, condition_index: int) -> Tensor:
+        """Return u (d,) at which the light of a condition is collected."""
         u = self.problem.domain.start
         # The steps of the comparisons after which the bank grew are ascending, so that
         # the latest one that applies remains.
@@ -354,12 +371,7 @@ class Bank(PredictedSearch):
             was_added_later = condition_index >= size_before
             if was_added_later:
                 u = self._grown_at[growth_step]
-        bank_seed = seeds.derive_seed(self.problem.seed, "bank")
-        condition = sample_condition(
-            self.problem.conditions, condition_index, bank_seed
-        )
-        seed = seeds.derive_seed(self.problem.seed, "bank matrix", condition_index)
-        return Query(torch.cat([u, condition]), seed, spp=SPP, requested_output="light")
+        return u
 
     def _fill(self, index: int, tick: ProgressCallback = lambda samples: None) -> None:
         """Make the matrices of all conditions that the bank has by an evaluation.
@@ -369,12 +381,7 @@ class Bank(PredictedSearch):
             tick: called with the samples of each condition that is made.
         """
         size = self._count_conditions(index)
-        # index of the first condition without a matrix
-        first_missing = 0
-        if self._conditions:
-            # The newest condition is the last. Older ones may have been dropped, so
-            # that their number does not tell the index.
-            first_missing = self._conditions[-1].index + 1
+        first_missing = self._first_missing
         if first_missing >= size:
             return
         with self.measure_seconds():
@@ -385,13 +392,24 @@ class Bank(PredictedSearch):
                 self._request_light(first_missing, evaluation_index=index)
             for number in range(first_missing, size):
                 # `_incoming` yields light in the order of the conditions
-                condition = self._make_condition(
-                    number, next(self._incoming).collected_light
-                )
-                self._conditions.append(condition)
-                self._bytes += condition.renderer.n_bytes
+                light = next(self._incoming).collected_light
+                self._add_condition(self._make_condition(number, light))
                 tick(SPP)
                 self._drop_oldest()
+
+    @property
+    def _first_missing(self) -> int:
+        """The index of the first condition without a matrix."""
+        if not self._conditions:
+            return 0
+        # The newest condition is the last. Older ones may have been dropped, so that
+        # their number does not tell the index.
+        return self._conditions[-1].index + 1
+
+    def _add_condition(self, condition: Condition) -> None:
+        """Add a condition to the bank, and the memory that its matrix takes."""
+        self._conditions.append(condition)
+        self._bytes += condition.renderer.n_bytes
 
     def _request_light(self, first_missing: int, evaluation_index: int) -> None:
         """Request the light of all conditions that the bank gains before a comparison.
@@ -434,17 +452,23 @@ class Bank(PredictedSearch):
         # By name, the inputs of the scene at which the matrix was computed. They were
         # set by the searched controls and those of the condition together.
         inputs = renderer.linearized_at
-        with torch.no_grad():
-            searched_inputs = self.problem.searched_space.inputs(query.u[:dim])
-        # The condition has no influence on the inputs if the searched controls by
-        # themselves set all of them, and to the same values.
-        depends_on_searched_only = all(
-            name in searched_inputs and torch.equal(searched_inputs[name], value)
-            for name, value in inputs.items()
-        )
+        depends_on_searched_only = self._depend_on_searched_only(inputs, query.u[:dim])
         # in place, so that equal tensors of several conditions take memory only once
         self._share_equal_inputs(inputs)
         return Condition(number, query.u[dim:], renderer, depends_on_searched_only)
+
+    def _depend_on_searched_only(self, inputs: dict[str, Tensor], u: Tensor) -> bool:
+        """Return whether a condition has no influence on inputs of the scene.
+
+        It has none if the searched controls, at u (d,), by themselves set all of them,
+        and to the same values.
+        """
+        with torch.no_grad():
+            searched_inputs = self.problem.searched_space.inputs(u)
+        return all(
+            name in searched_inputs and torch.equal(searched_inputs[name], value)
+            for name, value in inputs.items()
+        )
 
     def _share_equal_inputs(self, inputs: dict[str, Tensor]) -> None:
         """Replace inputs that equal those of the previous matrix by the same tensors.
@@ -481,18 +505,7 @@ class Bank(PredictedSearch):
             gap, standard_error = _compare_means(bank_objectives, unseen_objectives)
             self.gaps.append(gap)
             self.n_traced += N_COMPARED
-
-        def compare_view(number: int) -> ComparedView:
-            """Compare the predicted image under a condition with traced ones."""
-            # there may be more views than conditions, which are then used again
-            position = number % len(conditions)
-            return problem.compare_view(
-                conditions[position].renderer,
-                torch.cat([u, conditions[position].u]),
-                seeds.derive_seed(seed, "view", number),
-                SPP,
-            )
-
+        compare_view = partial(self._compare_condition_view, conditions, u, seed)
         is_accurate = self.compare(compare_view).is_accepted  # stores the deviation
         # the search has adapted to the conditions of the bank
         is_overfitted = gap > MIN_STANDARD_ERRORS * standard_error
@@ -500,6 +513,21 @@ class Bank(PredictedSearch):
             # `_count_conditions` lets the bank grow from these steps on
             self._grown_at[index] = u.detach().clone()
             self.growth_steps.append(index)
+
+    def _compare_condition_view(
+        self, conditions: Sequence[Condition], u: Tensor, seed: int, number: int
+    ) -> ComparedView:
+        """Compare the predicted image of u (d,) under a condition with traced ones.
+
+        There may be more views than conditions, which are then used again.
+        """
+        condition = conditions[number % len(conditions)]
+        return self.problem.compare_view(
+            condition.renderer,
+            torch.cat([u, condition.u]),
+            seeds.derive_seed(seed, "view", number),
+            SPP,
+        )
 
     def _predict_objectives(
         self, u: Tensor, conditions: Sequence[Condition]

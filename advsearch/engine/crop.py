@@ -84,11 +84,9 @@ class CroppedSearch(PredictedSearch):
             # images that `find_window` has rendered
             tick(self.preparation_spp)
             self.n_traced += N_WINDOW_IMAGES
+            # number 0: it belongs to no query
             self._renew_surroundings(
-                windowing,
-                "start",
-                number=0,  # it belongs to no query
-                image=windowing.start_image,  # full image of the start
+                windowing, "start", number=0, image=windowing.start_image
             )
 
     def _renew_surroundings(
@@ -153,10 +151,7 @@ class CroppedSearch(PredictedSearch):
         """
         kind = query.kind
         number = query.row_index
-        # Index of the first query that renders a full image; without one in
-        # `first_traced`, it is after all queries.
-        first_full = self.first_traced.get(kind, self.steps)
-        if query.phase != "search" or number >= first_full:
+        if query.phase != "search" or number >= self._find_first_full(kind):
             return None
         if self.selected_window is None:
             self.prepare()
@@ -168,10 +163,28 @@ class CroppedSearch(PredictedSearch):
         # surroundings do not get old.
         if not is_due or not kind.startswith("search"):
             return renderer
+        return self._compare_and_renew(query, self.selected_window, image_in_use)
+
+    def _find_first_full(self, kind: str) -> int:
+        """Return the index of the first query of a search that renders a full image.
+
+        Without one in `first_traced`, it is after all queries.
+        """
+        return self.first_traced.get(kind, self.steps)
+
+    def _compare_and_renew(
+        self, query: Query, windowing: Windowing, image_in_use: FullImage
+    ) -> Renderer | None:
+        """Compare the surroundings in use with a new full image, and renew them.
+
+        Returns:
+            The renderer with new surroundings; None if full images are rendered from
+            now on.
+        """
         was_accepted = self.deviations[-1].is_accepted
         with self.measure_seconds():
             new_image, deviation = self.measure_surroundings(
-                self.selected_window.window, image_in_use, query.u
+                windowing.window, image_in_use, query.u
             )
             self.deviations.append(deviation)
             # After a single bad comparison new surroundings may be enough.
@@ -179,7 +192,7 @@ class CroppedSearch(PredictedSearch):
                 assert self.n_renewals is not None  # None only for a `Bank`
                 self.n_renewals += 1
                 return self._renew_surroundings(
-                    self.selected_window, kind, number, new_image
+                    windowing, query.kind, query.row_index, new_image
                 )
-        self.stop_predicting(kind, number, f" of the {kind}")
+        self.stop_predicting(query.kind, query.row_index, f" of the {query.kind}")
         return None

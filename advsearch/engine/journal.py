@@ -21,12 +21,13 @@ from types import CellType, CodeType
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.cluster import BatchFunction, Workers, WorkerStats
+from advsearch.cluster import BatchFunction, BatchResult, Workers, WorkerStats
 from advsearch.engine.problem import Preparation, Problem
 from advsearch.engine.record import (
     LOST_LABEL,
@@ -104,7 +105,13 @@ class ParallelEvaluator:
         # a single query is evaluated here: sending it away would save no time
         if self.workers is None or len(queries) < 2:
             yield from map(self.problem.evaluate, queries)
-            return
+        else:
+            yield from self._evaluate_on_workers(self.workers, queries)
+
+    def _evaluate_on_workers(
+        self, workers: Workers, queries: Sequence[Query]
+    ) -> Iterator[Evaluation]:
+        """Evaluate queries on workers, and yield the evaluations in their order."""
         items: list[WorkItem] = [
             (self.problem_key, self.problem.preparation, query) for query in queries
         ]
@@ -113,17 +120,11 @@ class ParallelEvaluator:
         # evaluations that came too early, by the index of their query
         waiting = dict[int, Evaluation]()
         next_index = 0
-        results: Any = self.workers.compute([item] for item in items)
+        results: Any = workers.compute([item] for item in items)
         with closing(results):
             for result in results:
                 index = index_of_item[id(result.items[0])]
-                if result.failure_reason:
-                    evaluation = make_lost_evaluation(
-                        queries[index], result.failure_reason
-                    )
-                else:
-                    evaluation = result.value[0]
-                waiting[index] = replace(evaluation, machine=result.machine)
+                waiting[index] = _make_worker_evaluation(queries[index], result)
                 while next_index in waiting:
                     evaluation = waiting.pop(next_index)
                     # The renderer counts non-finite values as it renders. A worker has
@@ -131,6 +132,15 @@ class ParallelEvaluator:
                     self.problem.renderer.n_non_finite += evaluation.n_non_finite
                     yield evaluation
                     next_index += 1
+
+
+def _make_worker_evaluation(query: Query, result: BatchResult) -> Evaluation:
+    """Return the evaluation of a query from a worker's result, with its machine."""
+    if result.failure_reason:
+        evaluation = make_lost_evaluation(query, result.failure_reason)
+    else:
+        evaluation = result.value[0]
+    return replace(evaluation, machine=result.machine)
 
 
 def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction:
@@ -142,13 +152,8 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
     def call(items: Sequence[WorkItem]) -> list[Evaluation]:
         """Evaluate work items, and return the evaluations in their order."""
         evaluations = list[Evaluation]()
-
-        def get_key(item: WorkItem) -> ProblemKey:
-            key, _preparation, _query = item
-            return key
-
         # `groupby` groups neighbors, and queries of one problem follow one another
-        for key, group in groupby(items, get_key):
+        for key, group in groupby(items, _get_problem_key):
             items_of_problem = list(group)
             # All of them were sent together, and have the same preparation.
             _, preparation, _ = items_of_problem[0]
@@ -157,6 +162,12 @@ def make_worker_call(get_evaluator: Callable[[Any], Evaluator]) -> BatchFunction
         return evaluations
 
     return call
+
+
+def _get_problem_key(item: WorkItem) -> ProblemKey:
+    """Return the key of the problem of a work item."""
+    key, _preparation, _query = item
+    return key
 
 
 def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
@@ -172,6 +183,34 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
     Raises:
         ClusterError: the query is for an image or for light, which nothing replaces.
     """
+    _check_loss_is_replaceable(query, reason)
+    gradient = torch.zeros_like(query.u) if query.gradient else None
+    # An evaluation of a search, which has a phase, is paid from the budget of renders,
+    # also if it is lost. A trial has no cost.
+    cost = 0 if query.phase is None else query.samples
+    return Evaluation(
+        objective=math.nan,
+        gradient=gradient,
+        success=False,
+        cost=cost,
+        judgement=_make_lost_judgement(reason),
+        is_lost=True,
+    )
+
+
+def _make_lost_judgement(reason: str) -> Judgement:
+    """Return the judgement of an image that was never rendered."""
+    return Judgement(
+        score=math.nan,
+        margin=math.nan,
+        right=False,
+        prediction=Prediction(LOST_LABEL),
+        payload={"lost": reason},
+    )
+
+
+def _check_loss_is_replaceable(query: Query, reason: str) -> None:
+    """Raise ClusterError for a lost query whose image or light nothing replaces."""
     if query.requested_output != "judgement":
         product = (
             "a picture"
@@ -181,25 +220,6 @@ def make_lost_evaluation(query: Query, reason: str) -> Evaluation:
         raise ClusterError(
             f"{product}: {reason}; `advsearch resume RUN workers=null` makes it here"
         )
-    gradient = torch.zeros_like(query.u) if query.gradient else None
-    # An evaluation of a search, which has a phase, is paid from the budget of renders,
-    # also if it is lost. A trial has no cost.
-    cost = 0 if query.phase is None else query.samples
-    judgement = Judgement(
-        score=math.nan,
-        margin=math.nan,
-        right=False,
-        prediction=Prediction(LOST_LABEL),
-        payload={"lost": reason},
-    )
-    return Evaluation(
-        objective=math.nan,
-        gradient=gradient,
-        success=False,
-        cost=cost,
-        judgement=judgement,
-        is_lost=True,
-    )
 
 
 DIGESTS_NOTE = "made of"  # the note that has the digests of functions and weights
@@ -226,10 +246,7 @@ def check_digests(
     """
     digests: dict[str, str | None] = {}
     for model in models:
-        networks: Sequence[Model] = (model,)
-        if isinstance(model.module, Ensemble):
-            networks = model.module.models
-        for network in networks:
+        for network in _list_networks(model):
             if isinstance(network.module, RemoteNetwork):
                 network.module.store_answers_in(run.store)
             # None if the weights can't be read, as behind an address
@@ -244,6 +261,13 @@ def check_digests(
     run.check_unchanged(DIGESTS_NOTE, known_digests)
 
 
+def _list_networks(model: Model) -> Sequence[Model]:
+    """Return the networks of an ensemble, or the model itself if it is none."""
+    if isinstance(model.module, Ensemble):
+        return model.module.models
+    return (model,)
+
+
 def compute_weights_digest(model: Model) -> str | None:
     """Return the SHA-256 of a network's weights and buffers, with their names.
 
@@ -254,16 +278,22 @@ def compute_weights_digest(model: Model) -> str | None:
         tensors = {
             name: tensor for name, tensor in state.items() if isinstance(tensor, Tensor)
         }
-        digest = hashlib.sha256()
-        # by name, since a network may list them in any order
-        for name, tensor in sorted(tensors.items()):
-            digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
-            # as bytes, since NumPy has no bfloat16
-            flat = tensor.detach().cpu().contiguous().flatten()
-            digest.update(flat.view(torch.uint8).numpy().tobytes())
+        digest = _hash_tensors(tensors)
     except (AttributeError, RuntimeError, TypeError, NotImplementedError):
         return None  # it has no weights that can be read, such as a user's function
-    return digest.hexdigest() if tensors else None
+    return digest if tensors else None
+
+
+def _hash_tensors(tensors: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of tensors with their names, data types and shapes."""
+    digest = hashlib.sha256()
+    # by name, since a network may list them in any order
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        # as bytes, since NumPy has no bfloat16
+        flat = tensor.detach().cpu().contiguous().flatten()
+        digest.update(flat.view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
 
 
 def compute_code_digest(function: Callable[..., Any]) -> str | None:
@@ -273,12 +303,7 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
     holds. If the function is an object with `__call__` or `forward`, it also covers the
     arrays that the object holds.
     """
-    # unwrap a `partial`, perhaps of a `partial`, and note its arguments
-    partial_arguments = []
-    while isinstance(function, partial):
-        keywords = sorted(function.keywords.items())
-        partial_arguments.append((_simplify(function.args), _simplify(keywords)))
-        function = function.func
+    function, partial_arguments = _unwrap_partials(function)
     # without decorators, and a method without its object
     callee: Any = inspect.unwrap(function)
     callee = getattr(callee, "__func__", callee)
@@ -292,16 +317,34 @@ def compute_code_digest(function: Callable[..., Any]) -> str | None:
     code = getattr(callee, "__code__", None)
     if code is None:
         return None
+    components = (*_simplify_callee(callee, code), arrays, *partial_arguments)
+    return hashlib.sha256(repr(components).encode()).hexdigest()
+
+
+def _unwrap_partials(
+    function: Callable[..., Any],
+) -> tuple[Callable[..., Any], list[tuple[Any, Any]]]:
+    """Return the function in a `partial`, perhaps of a `partial`, and their arguments.
+
+    The arguments, simplified, are those of the outermost `partial` first.
+    """
+    partial_arguments = []
+    while isinstance(function, partial):
+        keywords = sorted(function.keywords.items())
+        partial_arguments.append((_simplify(function.args), _simplify(keywords)))
+        function = function.func
+    return function, partial_arguments
+
+
+def _simplify_callee(callee: Any, code: CodeType) -> tuple[Any, Any, list[Any]]:
+    """Return code, defaults and closure of a callee, each in a reproducible form."""
     closure = getattr(callee, "__closure__", None) or ()
-    components = (
+    return (
         # the docstring, to leave it out
         _simplify_code(code, getattr(callee, "__doc__", None)),
         _simplify(getattr(callee, "__defaults__", None)),
         [_simplify(cell) for cell in closure],
-        arrays,
-        *partial_arguments,
     )
-    return hashlib.sha256(repr(components).encode()).hexdigest()
 
 
 def _list_array_digests(holder: Any) -> list[tuple[str, Any]]:
@@ -343,11 +386,8 @@ def _simplify(value: Any) -> Any:
     Numbers and strings stay, also in containers; arrays become their SHA-256, and other
     objects the name of their type.
     """
-    if isinstance(value, CellType):  # a variable of a closure
-        try:
-            return _simplify(value.cell_contents)
-        except ValueError:  # the cell is empty
-            return None
+    if isinstance(value, CellType):
+        return _simplify_cell(value)
     if isinstance(value, (tuple, list)):
         return [_simplify(item) for item in value]
     # A set among the constants of code is a frozenset. Its order differs from process
@@ -355,14 +395,27 @@ def _simplify(value: Any) -> Any:
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
     if isinstance(value, (np.ndarray, Tensor)):
-        if isinstance(value, Tensor):
-            value = value.detach().cpu()
-        array = np.ascontiguousarray(value)
-        header = f"{array.dtype} {array.shape}".encode()
-        return hashlib.sha256(header + array.tobytes()).digest()
+        return _hash_array(value)
     if isinstance(value, (int, float, complex, str, bytes, type(None))):
         return value
     return type(value).__name__
+
+
+def _simplify_cell(cell: CellType) -> Any:
+    """Return the simplified value of a variable of a closure; None if it is empty."""
+    try:
+        return _simplify(cell.cell_contents)
+    except ValueError:  # the cell is empty
+        return None
+
+
+def _hash_array(value: npt.NDArray[Any] | Tensor) -> bytes:
+    """Return the SHA-256 of an array's data type, shape and contents."""
+    if isinstance(value, Tensor):
+        value = value.detach().cpu()
+    array = np.ascontiguousarray(value)
+    header = f"{array.dtype} {array.shape}".encode()
+    return hashlib.sha256(header + array.tobytes()).digest()
 
 
 # Keys of notes in the store: descriptions of machines that differ from this one, and
@@ -443,17 +496,26 @@ class Journal:
             # a query without a phase is a trial of the verification
             belongs_to_search = query.phase is not None
             if evaluation is None:
-                started = time.perf_counter()
-                evaluation = next(new_evaluations)
-                # Only searches have a time limit, for which `make_time_check` reads the
-                # seconds of their rows.
-                seconds = None
-                if belongs_to_search:
-                    seconds = time.perf_counter() - started
-                self.store([(query, replace(evaluation, seconds=seconds))])
+                evaluation = self._store_next(query, new_evaluations)
             elif belongs_to_search:
                 on_replay(query)
             yield evaluation
+
+    def _store_next(
+        self, query: Query, new_evaluations: Iterator[Evaluation]
+    ) -> Evaluation:
+        """Compute the next new evaluation, that of a query, and store it.
+
+        Only searches have a time limit, for which `make_time_check` reads the seconds
+        of their rows.
+        """
+        started = time.perf_counter()
+        evaluation = next(new_evaluations)
+        seconds = None
+        if query.phase is not None:
+            seconds = time.perf_counter() - started
+        self.store([(query, replace(evaluation, seconds=seconds))])
+        return evaluation
 
     def _trials_of(self, kind: str) -> dict[int, Evaluation]:
         """Return the evaluated trials of a kind by their index.
@@ -464,29 +526,24 @@ class Journal:
         """
         if kind in self._trials:
             return self._trials[kind]
-        rows: Iterable[Row] = ()
-        # `_counts` has the kinds of which rows were stored before
-        if self.run_directory is not None and kind in self._counts:
-            rows = self.run_directory.store.rows(kind)
-        trials = {}
-        for row in rows:
-            # Rows of old runs may have no judgement.
-            if row.correct is not None:
-                # `predicted` is the number of samples per pixel of a prediction, or 0
-                # for a rendered image. A predicted image has no seed (`_row_of_trial`).
-                predicted = 0
-                is_predicted = row.seed is None
-                if is_predicted:
-                    predicted = row.spp or 1
-                trials[row.step] = Evaluation.from_judgement(
-                    read_judgement(row), predicted=predicted
-                )
+        trials = self._read_stored_trials(kind)
         self._trials[kind] = trials
         self.n_lost += sum(
             trial.required_judgement.prediction.label == LOST_LABEL
             for trial in trials.values()
         )
         return trials
+
+    def _read_stored_trials(self, kind: str) -> dict[int, Evaluation]:
+        """Return the stored trials of a kind by their index."""
+        rows: Iterable[Row] = ()
+        # `_counts` has the kinds of which rows were stored before
+        if self.run_directory is not None and kind in self._counts:
+            rows = self.run_directory.store.rows(kind)
+        # Rows of old runs may have no judgement.
+        return {
+            row.step: _restore_trial(row) for row in rows if row.correct is not None
+        }
 
     def _read(self, query: Query) -> Evaluation | None:
         """Return the stored evaluation of a query; None if there is none.
@@ -508,16 +565,7 @@ class Journal:
         if stored is None:
             return None
         row, cached = stored
-        # `cached.u` is the digest of the configuration
-        is_same_query = cached.u == compute_digest(query.u) and row.seed == query.seed
-        if not is_same_query:
-            raise InputError(
-                f"{self.run_directory.path}: cannot resume: evaluation "
-                f"{query.row_index} of the {query.kind} is not the one that was "
-                "stored, so advsearch, its packages or the number of threads have "
-                "changed since; "
-                f"{self.run_directory.restart_advice}"
-            )
+        _check_same_query(query, row, cached, self.run_directory)
         if cached.non_finite:
             self.problem.renderer.n_non_finite += cached.non_finite
         return _restore_evaluation(row, cached)
@@ -549,27 +597,46 @@ class Journal:
         for query, evaluation in evaluated:
             self.n_lost += evaluation.is_lost
             self._note_machine(evaluation.machine)
+            if self._has_search_row(query):
+                continue
             is_trial = query.phase is None
             if is_trial:
                 row = self._row_of_trial(query, evaluation)
                 if not id_is_number:
-                    # so that later calls find it; its image is stored elsewhere
-                    trials = self._trials_of(query.kind)
-                    trials[query.row_index] = replace(evaluation, picture=None)
-            elif query.row_index < self._counts.get(query.kind, 0):
-                # The store has this row, but not its gradient, which is deleted when a
-                # run is complete. So it was evaluated again, but is not stored again.
-                continue
+                    self._cache_trial(query, evaluation)
             else:
                 row, cached = self._row_of_search(query, evaluation)
             if id_is_number:
                 row = replace(row, id=query.row_index + 1)  # ids begin at 1
             rows.append(row)
+        self._append_to_store(rows, cached)
+        return rows
+
+    def _has_search_row(self, query: Query) -> bool:
+        """Return whether the store has the row of a search's query already.
+
+        It may have the row, but not its gradient, which is deleted when a run is
+        complete. So the query was evaluated again, but is not stored again.
+        """
+        is_of_search = query.phase is not None
+        return is_of_search and query.row_index < self._counts.get(query.kind, 0)
+
+    def _append_to_store(
+        self, rows: Sequence[Row], cached: CachedEvaluation | None
+    ) -> None:
+        """Append rows to the store, or to `rows` without a run directory.
+
+        `cached` is what the store has besides the row of a search's evaluation.
+        """
         if self.run_directory is None:
             self._append_in_memory(rows)
         elif rows:
             self.run_directory.append_rows(*rows, cached=cached)
-        return rows
+
+    def _cache_trial(self, query: Query, evaluation: Evaluation) -> None:
+        """Cache a trial, so that later calls find it; its image is stored elsewhere."""
+        trials = self._trials_of(query.kind)
+        trials[query.row_index] = replace(evaluation, picture=None)
 
     def _append_in_memory(self, rows: Iterable[Row]) -> None:
         """Append rows to those of a journal without a run.
@@ -657,21 +724,7 @@ class Journal:
         )
         if evaluation.judgement is not None:
             row = add_judgement(row, evaluation.judgement)
-        gradient = None
-        if evaluation.gradient is not None:
-            gradient = evaluation.gradient.detach().numpy()
-        image = None
-        if evaluation.picture is not None:
-            image = to_uint8(evaluation.picture).numpy()
-        cached = CachedEvaluation(
-            query.row_index,
-            compute_digest(query.u),
-            evaluation.n_non_finite,
-            evaluation.cost,
-            gradient,
-            image,
-        )
-        return row, cached
+        return row, _make_cached_evaluation(query, evaluation)
 
     def make_time_check(
         self, kind: str, seconds: float | None
@@ -691,33 +744,24 @@ class Journal:
         """
         if seconds is None:
             return None
-        stored: Iterable[Row] = ()
-        # The store has cached evaluations if an earlier process has begun the run.
-        if self.run_directory is not None and self.run_directory.store.has_cached:
-            stored = self.run_directory.store.rows(kind)
         search_seconds = []
         has_ranking = False
-        for row in stored:
+        for row in self._read_earlier_rows(kind):
             if row.phase == "search":
                 search_seconds.append(row.seconds or 0.0)
             else:  # "ranking"
                 has_ranking = True
         seconds_left = seconds - math.fsum(search_seconds)
         n_stored = len(search_seconds)
-        started = time.perf_counter()
+        clock = _Clock(n_stored, has_ranking, seconds_left, started=time.perf_counter())
+        return clock.is_out_of_time
 
-        def is_out_of_time(n_evaluations: int) -> bool:
-            """Return whether the search must end after `n_evaluations`."""
-            nonlocal started
-            is_from_store = n_evaluations < n_stored
-            if is_from_store:
-                # The clock is reset as long as evaluations are read from the store, so
-                # that reading them takes none of the time.
-                started = time.perf_counter()
-                return False
-            return has_ranking or time.perf_counter() - started >= seconds_left
-
-        return is_out_of_time
+    def _read_earlier_rows(self, kind: str) -> Iterable[Row]:
+        """Return the rows of a search that an earlier process began; empty without one."""
+        # The store has cached evaluations if an earlier process has begun the run.
+        if self.run_directory is not None and self.run_directory.store.has_cached:
+            return self.run_directory.store.rows(kind)
+        return ()
 
     @property
     def remarks(self) -> list[str]:
@@ -749,10 +793,85 @@ class Journal:
             self.run_directory.store.write_note(key, json.dumps(value))
 
 
+def _check_same_query(
+    query: Query, row: Row, cached: CachedEvaluation, run: RunDirectory
+) -> None:
+    """Raise InputError if a stored evaluation is that of another configuration."""
+    # `cached.u` is the digest of the configuration
+    is_same_query = cached.u == compute_digest(query.u) and row.seed == query.seed
+    if not is_same_query:
+        raise InputError(
+            f"{run.path}: cannot resume: evaluation "
+            f"{query.row_index} of the {query.kind} is not the one that was "
+            "stored, so advsearch, its packages or the number of threads have "
+            "changed since; "
+            f"{run.restart_advice}"
+        )
+
+
+@dataclass
+class _Clock:
+    """Measures the time of a search, as described at `Journal.make_time_check`.
+
+    Attributes:
+        n_stored: number of evaluations that are read from the store.
+        has_ranking: whether the store has rows of the ranking, which follows the search.
+        seconds_left: time limit, without the time of earlier processes.
+        started: when the clock was reset.
+    """
+
+    n_stored: int
+    has_ranking: bool
+    seconds_left: float
+    started: float
+
+    def is_out_of_time(self, n_evaluations: int) -> bool:
+        """Return whether the search must end after `n_evaluations`."""
+        is_from_store = n_evaluations < self.n_stored
+        if is_from_store:
+            # The clock is reset as long as evaluations are read from the store, so
+            # that reading them takes none of the time.
+            self.started = time.perf_counter()
+            return False
+        elapsed = time.perf_counter() - self.started
+        return self.has_ranking or elapsed >= self.seconds_left
+
+
 def compute_digest(u: Tensor) -> bytes:
     """Return 16 bytes that identify a configuration (d,) by all its bits."""
     array = np.ascontiguousarray(u.detach().numpy())
     return hashlib.blake2b(array.tobytes(), digest_size=16).digest()
+
+
+def _make_cached_evaluation(query: Query, evaluation: Evaluation) -> CachedEvaluation:
+    """Return the values of a search's evaluation that its row does not have."""
+    gradient = None
+    if evaluation.gradient is not None:
+        gradient = evaluation.gradient.detach().numpy()
+    image = None
+    if evaluation.picture is not None:
+        image = to_uint8(evaluation.picture).numpy()
+    return CachedEvaluation(
+        query.row_index,
+        compute_digest(query.u),
+        evaluation.n_non_finite,
+        evaluation.cost,
+        gradient,
+        image,
+    )
+
+
+def _restore_trial(row: Row) -> Evaluation:
+    """Return the evaluation of a trial from its row.
+
+    It states the number of samples per pixel of a prediction, or 0 for a rendered image.
+    A predicted image has no seed (`Journal._row_of_trial`).
+    """
+    is_predicted = row.seed is None
+    predicted = 0
+    if is_predicted:
+        predicted = row.spp or 1
+    return Evaluation.from_judgement(read_judgement(row), predicted=predicted)
 
 
 def _restore_evaluation(row: Row, cached: CachedEvaluation) -> Evaluation:

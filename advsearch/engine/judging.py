@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from operator import attrgetter
 from types import MappingProxyType
@@ -43,6 +43,7 @@ from advsearch.runs.export import LEADING_COLUMNS, TRAILING_COLUMNS
 from advsearch.runs.results import PrintTerms
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import Surfaces
+from advsearch.scene.gradients import Group
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.things import ALL_THINGS
 from advsearch.tasks import Facts, Judgement, Task
@@ -85,23 +86,36 @@ def metrics_to_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
         )
     settings = {}
     for name, function in metrics.items():
-        is_column = name in (*LEADING_COLUMNS, *TRAILING_COLUMNS)
-        if is_column or not name:  # an empty name gets the same message
-            raise InputError(
-                f"metrics: {name!r} is a column that rows have already; "
-                "choose another name"
-            )
-        if isinstance(function, str):
-            settings[name] = function
-            continue
-        if not callable(function):
-            raise InputError(
-                f"metrics: {name}: expected a function of (image, output, "
-                f"truth), got {function!r:.80}"
-            )
-        check_takes_arguments(f"metrics: {name}", function, "image", "output", "truth")
-        settings[name] = _import_name(function)
+        _check_metric_name(name)
+        settings[name] = _metric_to_setting(name, function)
     return settings
+
+
+def _check_metric_name(name: str) -> None:
+    """Raise InputError if a name is that of a column of rows, or empty."""
+    is_column = name in (*LEADING_COLUMNS, *TRAILING_COLUMNS)
+    if is_column or not name:  # an empty name gets the same message
+        raise InputError(
+            f"metrics: {name!r} is a column that rows have already; choose another name"
+        )
+
+
+def _metric_to_setting(name: str, function: str | Metric) -> str:
+    """Return the text by which a file states a metric; a text stays as it is."""
+    if isinstance(function, str):
+        return function
+    _check_metric_is_callable(name, function)
+    check_takes_arguments(f"metrics: {name}", function, "image", "output", "truth")
+    return _import_name(function)
+
+
+def _check_metric_is_callable(name: str, function: object) -> None:
+    """Raise InputError if a metric is no function."""
+    if not callable(function):
+        raise InputError(
+            f"metrics: {name}: expected a function of (image, output, "
+            f"truth), got {function!r:.80}"
+        )
 
 
 def _import_name(function: Metric) -> str:
@@ -194,11 +208,7 @@ def _import_metric(name: str, import_name: str) -> Any:
             f"({type(error).__name__}: {error}); a module is looked for "
             f"on the Python path and in {os.getcwd()}"
         ) from error
-    if not callable(function):
-        raise InputError(
-            f"metrics: {name}: expected a function of (image, output, "
-            f"truth), got {function!r:.80}"
-        )
+    _check_metric_is_callable(name, function)
     return function
 
 
@@ -226,17 +236,26 @@ def judge_images(
             judgements = task.judge(output, common_truth)
             truths = [common_truth] * len(images)  # for the metrics
         else:
-            # A task judges a batch by one truth: here each image is its own batch.
-            judgements = [
-                task.judge(output[index : index + 1], truth)[0]
-                for index, truth in enumerate(truths)
-            ]
+            judgements = _judge_each_by_truth(task, output, truths)
     if not metrics:
         return judgements
     return [
         add_metrics(
             judgements[index], metrics, images[index], output[index : index + 1], truth
         )
+        for index, truth in enumerate(truths)
+    ]
+
+
+def _judge_each_by_truth(
+    task: Task, output: Output, truths: Sequence[Truth]
+) -> list[Judgement]:
+    """Return the judgement of each image of a batch by its truth.
+
+    A task judges a batch by one truth, so that each image is its own batch.
+    """
+    return [
+        task.judge(output[index : index + 1], truth)[0]
         for index, truth in enumerate(truths)
     ]
 
@@ -282,20 +301,24 @@ def add_metrics(
     Raises:
         InputError: a metric returns no number and no mapping of numbers.
     """
-    # what the metrics returned, with an entry for each item of a mapping
-    returned = dict[str, Any]()
     image_output, image_truth = _unbatch(output, truth)
     with torch.no_grad():
+        # what the metrics returned, with an entry for each item of a mapping
+        returned = dict[str, Any]()
         for name, metric in metrics.items():
             result = metric(*copy_value((image.detach(), image_output, image_truth)))
-            if isinstance(result, Mapping):
-                returned |= {f"{name}.{key}": value for key, value in result.items()}
-            else:
-                returned[name] = result
+            returned |= _flatten_metric_result(name, result)
         values = {
             name: _to_metric_value(name, result) for name, result in returned.items()
         }
     return replace(judgement, metrics=values)
+
+
+def _flatten_metric_result(name: str, result: Any) -> dict[str, Any]:
+    """Return what a metric returned by name, with an entry for each item of a mapping."""
+    if isinstance(result, Mapping):
+        return {f"{name}.{key}": value for key, value in result.items()}
+    return {name: result}
 
 
 def _to_metric_value(name: str, result: Any) -> float | None:
@@ -331,17 +354,24 @@ def _unbatch(output: Output, truth: Truth) -> tuple[Any, Any]:
     image_output = output[0]
     is_ensemble = isinstance(image_output, (tuple, list))
     if is_ensemble:
-        pairs = [
-            _unbatch(model_output, model_truth)
-            for model_output, model_truth in zip(image_output, truth, strict=True)
-        ]
-        outputs = tuple(model_output for model_output, _ in pairs)
-        truths = tuple(model_truth for _, model_truth in pairs)
-        return outputs, truths
+        return _unbatch_each_model(image_output, truth)
     labels = truth_to_labels(truth, output, count=1)
     # a single label is a tensor (1,); any other truth stays as it is
     image_truth = labels[0] if isinstance(labels, Tensor) else labels
     return image_output, image_truth
+
+
+def _unbatch_each_model(
+    outputs: Sequence[Output], truths: Sequence[Truth]
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Return outputs and truths of the models of an ensemble, without the batch axis."""
+    pairs = [
+        _unbatch(model_output, model_truth)
+        for model_output, model_truth in zip(outputs, truths, strict=True)
+    ]
+    image_outputs = tuple(model_output for model_output, _ in pairs)
+    image_truths = tuple(model_truth for _, model_truth in pairs)
+    return image_outputs, image_truths
 
 
 def mean_metrics(judgements: Sequence[Judgement]) -> dict[str, float | None] | None:
@@ -400,14 +430,15 @@ def calibrate_task(
     """
     if not task.calibrates:
         return task
+    # one thing is enough to see how predictions are to be read
+    judged_thing = OBJECT if judge == ALL_THINGS else judge
     for scene in scenes:
         rendering = render(
             scene,
             model,
             task=task,
             label=label,
-            # one thing is enough to see how predictions are to be read
-            judge=OBJECT if judge == ALL_THINGS else judge,
+            judge=judged_thing,
             spp=CALIBRATION_SPP,
             **image_settings,
         )
@@ -465,18 +496,25 @@ def check_truth(
             scene, model, task=task, spp=CALIBRATION_SPP, **image_settings
         )
         predictions = rendering.views[0].predictions
-        prediction_texts = ", ".join(
-            format_image_prediction(
-                task.name, replace(prediction, label=repr(prediction.label))
-            )
-            for prediction in predictions
+        raise _make_label_error(error, model, task, predictions) from None
+
+
+def _make_label_error(
+    error: InputError, model: Model, task: Task, predictions: Sequence[Prediction]
+) -> InputError:
+    """Return an error that suggests a label: the most probable of the predictions."""
+    prediction_texts = ", ".join(
+        format_image_prediction(
+            task.name, replace(prediction, label=repr(prediction.label))
         )
-        suggested_label = _get_unique_label(model, predictions[0])
-        raise InputError(
-            f"{error}; model {model.name} calls a clean picture of it "
-            f"{prediction_texts}; name what is right, such as "
-            f'`label="{suggested_label}"`'
-        ) from None
+        for prediction in predictions
+    )
+    suggested_label = _get_unique_label(model, predictions[0])
+    return InputError(
+        f"{error}; model {model.name} calls a clean picture of it "
+        f"{prediction_texts}; name what is right, such as "
+        f'`label="{suggested_label}"`'
+    )
 
 
 def find_label_warnings(
@@ -553,22 +591,27 @@ def make_domain(
             leaves the scene unchanged.
         **more: other fields of `Domain`, such as `gradient_cost`.
     """
-    blocks = []
-    for control in controls:
-        for group in control.groups:
-            block = Block(
-                group.size,
-                group.budget.norm,  # type: ignore[arg-type]
-                group.budget.epsilon,
-                periodic=group.periodic,
-                name=f"{control.name}.{group.parameter}",
-                n_options=group.options,  # number of options; 0 for a number
-            )
-            blocks.append(block)
+    blocks = [
+        _make_block(control.name, group)
+        for control in controls
+        for group in control.groups
+    ]
     if start is None:
         starts = [control.start for control in controls]
         start = torch.cat(starts) if starts else torch.zeros(0)
     return Domain(start, tuple(blocks), **more)
+
+
+def _make_block(control_name: str, group: Group) -> Block:
+    """Return the block of a domain for a group of a control's coordinates."""
+    return Block(
+        group.size,
+        group.budget.norm,  # type: ignore[arg-type]
+        group.budget.epsilon,
+        periodic=group.periodic,
+        name=f"{control_name}.{group.parameter}",
+        n_options=group.options,  # number of options; 0 for a number
+    )
 
 
 class StackedTensors(Mapping[str, Tensor]):
@@ -654,9 +697,7 @@ class ConfigurationInputs:
             values = [self._space.get_numeric_values(u) for u in self._configurations]
             return StackedTensors("number of the configuration", values)
         n_configurations = len(self._configurations)
-        # The searched coordinates come first, and are the same in all configurations,
-        # so that those of the first one are taken.
-        searched_u = self._configurations[0][: len(self._searched.start)]
+        searched_u = self._searched_u
         if name == "u":
             return searched_u.expand(n_configurations, *searched_u.shape)
         textures = self._searched.get_printable_colors(searched_u)
@@ -664,10 +705,23 @@ class ConfigurationInputs:
             return StackedTensors(
                 "control whose colours are searched:", [textures] * n_configurations
             )
+        texture = self._get_single_texture(textures)
+        return texture.expand(n_configurations, *texture.shape)
+
+    @property
+    def _searched_u(self) -> Tensor:
+        """The searched coordinates (d,), which come first in each configuration.
+
+        They are the same in all configurations, so that those of the first are taken.
+        """
+        return self._configurations[0][: len(self._searched.start)]
+
+    def _get_single_texture(self, textures: Mapping[str, Tensor]) -> Tensor:
+        """Return the only texture; raise InputError if there are none or several."""
         if len(textures) != 1:
             raise self._make_texture_error(textures)
         (texture,) = textures.values()
-        return texture.expand(n_configurations, *texture.shape)
+        return texture
 
     def _make_texture_error(self, textures: Mapping[str, Tensor]) -> InputError:
         """Return the error of a "texture" where there are none or several."""
@@ -712,6 +766,19 @@ def mean_variation(colors: Tensor) -> Tensor:
         # the step's first pixel is masked at the end, its second one here
         right = right * mask[:, 1:]
         down = down * mask[1:]
+    length = _compute_step_lengths(right, down)
+    if is_masked:
+        length = length[mask[..., 0] > 0.0]
+    return length.mean()
+
+
+def _compute_step_lengths(right: Tensor, down: Tensor) -> Tensor:
+    """Return the length (h, w) of each pixel's steps to its right and lower neighbors.
+
+    Args:
+        right: (h, w - 1, 3) differences to the right neighbors.
+        down: (h - 1, w, 3) differences to the lower neighbors.
+    """
     # Zeros are added for the last column and the last row, which have no neighbor.
     # `pad` takes the zeros before and after, from the last axis (color) to the first.
     squared_right = F.pad(right.square(), (0, 0, 0, 1))
@@ -719,10 +786,7 @@ def mean_variation(colors: Tensor) -> Tensor:
     squared = squared_right + squared_down
     # Clamped, since the square root has no derivative at 0; then minus the smallest
     # length, so that the result is 0 for an even color.
-    length = squared.clamp(min=MIN_COLOR_STEP**2).sqrt() - MIN_COLOR_STEP
-    if is_masked:
-        length = length[mask[..., 0] > 0.0]
-    return length.mean()
+    return squared.clamp(min=MIN_COLOR_STEP**2).sqrt() - MIN_COLOR_STEP
 
 
 def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
@@ -742,18 +806,25 @@ def printable_distance(colors: Tensor, palette: Tensor | None = None) -> Tensor:
     # The choice of the nearest color has no derivative.
     fixed_colors = colors.detach()
     if palette is None:
-        # The nearest color of the grid: each channel is rounded to a multiple of the
-        # step.
-        nearest = (
-            MIN_PRINTABLE
-            + PRINTABLE_STEP * ((fixed_colors - MIN_PRINTABLE) / PRINTABLE_STEP).round()
-        ).clamp(MIN_PRINTABLE, MAX_PRINTABLE)
+        nearest = _find_nearest_in_grid(fixed_colors)
     else:
-        palette = palette.to(colors)
-        palette_index = torch.cdist(fixed_colors.reshape(-1, 3), palette).argmin(dim=1)
-        nearest = palette[palette_index].reshape(colors.shape)
+        nearest = _find_nearest_in_palette(fixed_colors, palette.to(colors))
     distance: Tensor = torch.linalg.vector_norm(colors - nearest, dim=2).mean()
     return distance
+
+
+def _find_nearest_in_grid(colors: Tensor) -> Tensor:
+    """Return the nearest of the 125 printable colors for each of (h, w, 3) pixels."""
+    # each channel is rounded to a multiple of the step
+    n_steps = ((colors - MIN_PRINTABLE) / PRINTABLE_STEP).round()
+    nearest = MIN_PRINTABLE + PRINTABLE_STEP * n_steps
+    return nearest.clamp(MIN_PRINTABLE, MAX_PRINTABLE)
+
+
+def _find_nearest_in_palette(colors: Tensor, palette: Tensor) -> Tensor:
+    """Return the nearest color of a palette (P, 3) for each of (h, w, 3) pixels."""
+    palette_index = torch.cdist(colors.reshape(-1, 3), palette).argmin(dim=1)
+    return palette[palette_index].reshape(colors.shape)
 
 
 def _compute_print_terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -802,9 +873,8 @@ def subtract_print_penalty(
     """
     variable_u = u.detach().clone().requires_grad_()
     with torch.enable_grad():
-        penalty = (
-            PRINT_WEIGHT * torch.stack(_compute_print_terms(space, variable_u)).sum()
-        )
+        print_terms = _compute_print_terms(space, variable_u)
+        penalty = PRINT_WEIGHT * torch.stack(print_terms).sum()
         (penalty_gradient,) = torch.autograd.grad(penalty, variable_u)
     gradient = None
     if evaluation.gradient is not None:
@@ -854,15 +924,20 @@ def make_objective(
     kind = OBJECTIVE_KINDS.get(requested) if isinstance(requested, str) else None
     needs_features = kind is not None and kind.needs_features
     if isinstance(task, EnsembleTask):
-        if needs_features:
-            raise InputError(
-                f"objective: {requested} compares the features of one model; "
-                "take another for `ensemble`"
-            )
+        _check_needs_no_features(requested, needs_features)
         return _make_ensemble_objective(requested, task, ensemble), ""
     if not needs_features:
         return get_objective(requested, task), ""
     return _make_feature_objective(requested, task, model, renderer, seed)
+
+
+def _check_needs_no_features(requested: AnyObjective, needs_features: bool) -> None:
+    """Raise InputError if an objective of several models needs features of one."""
+    if needs_features:
+        raise InputError(
+            f"objective: {requested} compares the features of one model; "
+            "take another for `ensemble`"
+        )
 
 
 def _make_feature_objective(
@@ -934,8 +1009,23 @@ def reduce_objectives(
         objectives: objective of each model.
         reduction: "mean" or "worst".
     """
+    return _ReducedObjective(objectives, reduction)
 
-    def objective(
+
+@dataclass(frozen=True, eq=False)
+class _ReducedObjective:
+    """The mean or the smallest of the objectives of several models.
+
+    Attributes:
+        objectives: objective of each model.
+        reduction: "mean" or "worst".
+    """
+
+    objectives: Sequence[Objective]
+    reduction: EnsembleReduction
+
+    def __call__(
+        self,
         output: Sequence[Outputs],
         images: Tensor,
         truth: tuple[Any, ...],
@@ -943,13 +1033,14 @@ def reduce_objectives(
         /,
     ) -> Tensor:
         """Return the objective (N,) of images (N, H, W, 3) for all models together."""
+        outputs_of_models = regroup_by_model(output)
         values = [
             objective_of_model(output_of_model, images, truth_of_model, more)
             for objective_of_model, output_of_model, truth_of_model in zip(
-                objectives, regroup_by_model(output), truth, strict=True
+                self.objectives, outputs_of_models, truth, strict=True
             )
         ]
         stacked = torch.stack(values)
-        return stacked.mean(dim=0) if reduction == "mean" else stacked.amin(dim=0)
-
-    return objective
+        if self.reduction == "mean":
+            return stacked.mean(dim=0)
+        return stacked.amin(dim=0)

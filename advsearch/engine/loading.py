@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence, ValuesView
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeGuard, final
+from typing import Any, NamedTuple, TypeGuard, final
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +35,7 @@ from advsearch.scene.backdrop import (
     fit_to_photograph,
 )
 from advsearch.scene.backdrop_photograph import BackdropPhotograph
-from advsearch.scene.camera_model import make_bundled_models, make_pinhole
+from advsearch.scene.camera_model import CameraModel, make_bundled_models, make_pinhole
 from advsearch.scene.description import (
     ENVIRONMENT,
     NO_ENVIRONMENT,
@@ -178,11 +179,7 @@ class Scene:
             requested=description.requested | {ENVIRONMENT},
         )
         if description.photographs is not None:
-            relit_scenes = {
-                photograph: Scene(scene).with_environment(environment).description
-                for photograph, scene in description.photographs.scenes.items()
-            }
-            folder = replace(description.photographs, scenes=relit_scenes)
+            folder = _relight_photographs(description.photographs, environment)
             relit = replace(relit, photographs=folder)
         # The lamps of a place are on if the environment is dark, so that ground and
         # lamps are added again.
@@ -244,20 +241,36 @@ class Scene:
         if description.camera_model is not None:
             # a camera model has focal lengths, and takes no field of view
             description.camera_model.check_no_fov(overrides)
-        values = {**description.values, **{name: resolved[name] for name in overrides}}
-        # A camera that has a height gets its elevation from that. So a stated elevation
-        # removes the height.
-        if "camera.elevation" in overrides:
-            values["camera.height"] = None
-        changed = replace(
-            description,
-            values=values,
-            requested=description.requested | set(overrides),
-        )
+        changed_values = {name: resolved[name] for name in overrides}
+        changed = _replace_values(description, changed_values)
         # The settings may request another ground, or switch lamps on or off. So ground
         # and lamps are added anew, in place of the old ones.
         grounded = with_requested_ground(changed)
         return Scene(add_lamps(grounded), self.is_session_only)
+
+
+def _relight_photographs(
+    folder: PhotographFolder, environment: EnvironmentAsset | None
+) -> PhotographFolder:
+    """Return a folder whose photographs show their scenes under another environment."""
+    relit_scenes = {
+        photograph: Scene(scene).with_environment(environment).description
+        for photograph, scene in folder.scenes.items()
+    }
+    return replace(folder, scenes=relit_scenes)
+
+
+def _replace_values(
+    description: SceneDescription, changed_values: Mapping[str, Any]
+) -> SceneDescription:
+    """Return a description in which some parameters have other, requested values."""
+    values = {**description.values, **changed_values}
+    # A camera that has a height gets its elevation from that. So a stated elevation
+    # removes the height.
+    if "camera.elevation" in changed_values:
+        values["camera.height"] = None
+    requested = description.requested | set(changed_values)
+    return replace(description, values=values, requested=requested)
 
 
 @with_checked_arguments
@@ -333,10 +346,7 @@ def load_scene(
         InputError: a name is unknown, a file cannot be used, or a value is out of
             range.
     """
-    if scene is not None and not isinstance(object, str):
-        raise InputError(
-            f"object: expected the name of a node or shape of the scene, got {object!r}"
-        )
+    _check_object_is_node(object, scene)
     mitsuba_dict = scene if isinstance(scene, Mapping) else None
     # a node of a scene file is named as "scene.glb#chair"
     object_spec = object
@@ -358,23 +368,60 @@ def load_scene(
         plugins=mitsuba_dict,
         things=format_things(things),
     )
+    description = _apply_camera_and_backdrop(
+        description, camera, backdrop, occluder, has_environment=has_environment
+    )
+    if backdrop is None:
+        _check_no_photograph(fixed_values or {}, occluder)
+    is_session_only = mitsuba_dict is not None or _has_asset(
+        object, environment, backdrop
+    )
+    loaded = Scene(description, is_session_only)
+    return loaded if texture is None else loaded.with_texture(texture)
+
+
+def _check_object_is_node(
+    object: str | Path | ObjectAsset, scene: str | Path | Mapping[str, object] | None
+) -> None:
+    """Check that the object of a scene file or dictionary is the name of a node."""
+    if scene is not None and not isinstance(object, str):
+        raise InputError(
+            f"object: expected the name of a node or shape of the scene, got {object!r}"
+        )
+
+
+def _apply_camera_and_backdrop(
+    description: SceneDescription,
+    camera: str | None,
+    backdrop: str | Path | BackdropPhotograph | None,
+    occluder: str | Path | None,
+    *,
+    has_environment: bool,
+) -> SceneDescription:
+    """Return a scene with its camera, in its photographs if there is a backdrop.
+
+    The arguments are those of `load_scene`. `has_environment` states whether the user
+    chose the light.
+    """
     if isinstance(backdrop, (str, Path)):
-        description = _put_into_photographs(
+        return _put_into_photographs(
             description, backdrop, camera, occluder, has_environment=has_environment
         )
-    elif camera is not None:
+    if camera is not None:
         description = description.with_camera(camera)
     if isinstance(backdrop, BackdropPhotograph):
         description = description.with_backdrop(backdrop, occluder)
-    elif backdrop is None:
-        _check_no_photograph(fixed_values or {}, occluder)
-    # no other session can load things that were given as objects, without a file
-    has_asset = any(
-        asset is not None and not isinstance(asset, (str, Path))
-        for asset in (object, environment, backdrop)
+    return description
+
+
+def _has_asset(*inputs: object) -> bool:
+    """Return whether an input is a Python object instead of a name or path.
+
+    No other session can load things that were passed as objects, without a file.
+    """
+    return any(
+        asset is not None and not isinstance(asset, (str, Path)) for asset in inputs
     )
-    loaded = Scene(description, is_session_only=mitsuba_dict is not None or has_asset)
-    return loaded if texture is None else loaded.with_texture(texture)
 
 
 def _put_into_photographs(
@@ -397,8 +444,7 @@ def _put_into_photographs(
         has_environment: whether the user chose the light. If not, the scene in each
             photograph of a folder is lit by the map beside the photograph.
     """
-    is_folder = is_photograph_folder(spec)
-    if not is_folder:
+    if not is_photograph_folder(spec):
         # `load_scene` has given the scene the light next to a single photograph.
         view = read_photograph_view(spec)
         return make_photograph_scene(description, view, camera, occluder)
@@ -407,25 +453,42 @@ def _put_into_photographs(
             f"`backdrop={spec}` and `occluder` contradict each other: a mask belongs "
             "to one photograph; state it as `occluder` in the camera file beside that"
         )
-    scenes: dict[str, SceneDescription] = {}
     # Files that are opened here belong to the folder.
     with track_opened_files(spec):
-        # `camera` may be a file with the cameras of all photographs, which is parsed
-        # here only once. If it is something else, such as a name, it stays as it is.
-        photograph_camera: Any = camera
-        if camera is not None:
-            photograph_camera = read_photograph_cameras(camera) or camera
-        views = read_photograph_folder(spec, has_camera=camera is not None)
-        for name, view in views.items():
-            light = None if has_environment else find_photographed_light(view.spec)
-            lit_scene = description
-            if light is not None:
-                environment = import_environment(light)
-                lit_scene = Scene(description).with_environment(environment).description
-            scenes[name] = make_photograph_scene(lit_scene, view, photograph_camera)
+        scenes = _make_folder_scenes(
+            description, spec, camera, has_environment=has_environment
+        )
     folder = PhotographFolder(str(spec), camera, scenes)
     # The scene shows the first photograph, until a control chooses another one.
     return replace(next(iter(scenes.values())), photographs=folder)
+
+
+def _make_folder_scenes(
+    description: SceneDescription,
+    spec: str | Path,
+    camera: str | None,
+    *,
+    has_environment: bool,
+) -> dict[str, SceneDescription]:
+    """Return the scene in each photograph of a folder, by the name of the photograph.
+
+    The arguments are those of `_put_into_photographs`.
+    """
+    scenes: dict[str, SceneDescription] = {}
+    # `camera` may be a file with the cameras of all photographs, which is parsed only
+    # once. If it is something else, such as a name, it stays as it is.
+    photograph_camera: Any = camera
+    if camera is not None:
+        photograph_camera = read_photograph_cameras(camera) or camera
+    views = read_photograph_folder(spec, has_camera=camera is not None)
+    for name, view in views.items():
+        light = None if has_environment else find_photographed_light(view.spec)
+        lit_scene = description
+        if light is not None:
+            environment = import_environment(light)
+            lit_scene = Scene(description).with_environment(environment).description
+        scenes[name] = make_photograph_scene(lit_scene, view, photograph_camera)
+    return scenes
 
 
 def _check_no_photograph(
@@ -460,19 +523,29 @@ def _array_to_texels(texture: npt.ArrayLike | Tensor) -> Float32Array:
     )
     max_level = 255.0 if array.dtype == np.uint8 else 1.0
     texels: Float32Array = array.astype(np.float32) / max_level
+    _check_texture_shape(texels)
+    _check_texture_levels(array, texels)
+    return np.ascontiguousarray(texels)
+
+
+def _check_texture_shape(texels: Float32Array) -> None:
+    """Raise InputError if an array is no color image (h, w, 3)."""
     is_image = texels.ndim == 3 and texels.shape[2] == 3
     if not is_image or texels.size == 0:
         raise InputError(
             "texture: expected a picture (h, w, 3), got an array of shape "
-            f"{array.shape}"
+            f"{texels.shape}"
         )
+
+
+def _check_texture_levels(array: npt.NDArray[Any], texels: Float32Array) -> None:
+    """Raise InputError if texels are outside [0, 1]; `array` is what they come from."""
     is_in_range = texels.min() >= 0.0 and texels.max() <= 1.0
     if not np.isfinite(texels).all() or not is_in_range:
         raise InputError(
             "texture: expected sRGB in [0, 1], or 8 bits as uint8, got "
             f"{array.dtype} from {array.min():g} to {array.max():g}"
         )
-    return np.ascontiguousarray(texels)
 
 
 def scene_to_settings(scene: Scene) -> dict[str, Any]:
@@ -482,19 +555,7 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
     settings are incomplete, since no file can name its Python objects.
     """
     description = scene.description
-    photograph = description.backdrop_photograph
-    backdrop = None
-    occluder = None
-    if photograph is not None:
-        backdrop = photograph.spec
-        # file of the mask of what is in front of the object; "" without one
-        occluder = photograph.front_spec or None
-    camera = _camera_setting(description)
-    # A scene in a folder of photographs shows one of them. The settings name the
-    # folder.
-    if description.photographs is not None:
-        backdrop = description.photographs.path
-        camera = description.photographs.camera
+    backdrop, occluder, camera = _find_photograph_settings(description)
     return {
         "object": description.object_name,
         "environment": description.environment_name,
@@ -508,6 +569,32 @@ def scene_to_settings(scene: Scene) -> dict[str, Any]:
         "occluder": occluder,
         "set": description.requested_values,
     }
+
+
+class _PhotographSettings(NamedTuple):
+    """Settings that name the photograph of a scene, its mask and its camera."""
+
+    backdrop: str | None
+    occluder: str | None
+    camera: str | None
+
+
+def _find_photograph_settings(description: SceneDescription) -> _PhotographSettings:
+    """Return the settings of a scene that depend on whether it is in a photograph."""
+    photograph = description.backdrop_photograph
+    backdrop = None
+    occluder = None
+    if photograph is not None:
+        backdrop = photograph.spec
+        # file of the mask of what is in front of the object; "" without one
+        occluder = photograph.front_spec or None
+    camera = _camera_setting(description)
+    # A scene in a folder of photographs shows one of them. The settings name the
+    # folder.
+    if description.photographs is not None:
+        backdrop = description.photographs.path
+        camera = description.photographs.camera
+    return _PhotographSettings(backdrop, occluder, camera)
 
 
 def _camera_setting(description: SceneDescription) -> str | None:
@@ -575,27 +662,41 @@ def fit_camera(
             description, description.backdrop_photograph, (height, width)
         )
     camera_model = description.camera_model
-    remarks = description.remarks
     if description.get_number("camera.drops") > 0.0:
-        if description.rig:
-            raise InputError(
-                "`set` camera.drops: of one camera, not of several; leave it out"
-            )
-        # Drops bend the ray of each pixel, so they need a camera model, which has a
-        # table of rays. A pinhole that is made here has no name. If an earlier call has
-        # made it, perhaps for another aspect, it is replaced.
-        if camera_model is None or not camera_model.name:
-            camera_model = make_pinhole(description.get_number("camera.fov"), aspect)
-    if camera_model is not None:
-        # A bundled lens depends on the aspect, and is found again by its name. Any
-        # other camera model stays.
-        bundled_models = make_bundled_models(aspect)
-        camera_model = bundled_models.get(camera_model.name, camera_model)
-        scaling_remarks = camera_model.describe_scaling((height, width))
-        remarks = tuple(dict.fromkeys((*remarks, *scaling_remarks)))
+        camera_model = _find_camera_behind_drops(description, aspect)
+    if camera_model is None:
+        return replace(description, aspect=aspect, camera_model=None)
+    # A bundled lens depends on the aspect, and is found again by its name. Any other
+    # camera model stays.
+    camera_model = make_bundled_models(aspect).get(camera_model.name, camera_model)
+    scaling_remarks = camera_model.describe_scaling((height, width))
+    remarks = tuple(dict.fromkeys((*description.remarks, *scaling_remarks)))
     return replace(
         description, aspect=aspect, camera_model=camera_model, remarks=remarks
     )
+
+
+def _find_camera_behind_drops(
+    description: SceneDescription, aspect: float
+) -> CameraModel:
+    """Return the camera model of a scene with raindrops on the lens.
+
+    Drops bend the ray of each pixel, so they need a camera model, which has a table of
+    rays.
+
+    Raises:
+        InputError: the scene has several cameras.
+    """
+    if description.rig:
+        raise InputError(
+            "`set` camera.drops: of one camera, not of several; leave it out"
+        )
+    camera_model = description.camera_model
+    # A pinhole that is made here has no name. If an earlier call has made it, perhaps
+    # for another aspect, it is replaced.
+    if camera_model is None or not camera_model.name:
+        return make_pinhole(description.get_number("camera.fov"), aspect)
+    return camera_model
 
 
 def _height_and_width(resolution: int | tuple[int, int]) -> tuple[int, int]:
@@ -652,30 +753,15 @@ def make_renderer(
     # a control may have changed the scene, as one that chooses the photograph does
     description = space.scene or description
     _check_is_lit(description)
-    formation = ImageFormation(
-        denoiser=denoise,
-        sampler=sampler,
-        exposure=description.get_number("camera.exposure"),
-        resolution=size,
-        gain=description.gain,
-    )
+    formation = _make_formation(description, size, denoise, sampler)
     scene = MitsubaScene(
         description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler
     )
-    has_exposure_time = any(space.exposure)
     _check_rig_times(description, space)
-    # `Motion` computes how points move in the image. It is needed for derivatives at
-    # outlines, and for the moments of an exposure.
     motion = None
     if differentiated:
         motion = Motion(description, size, scene.input_assembler)
-    # images at these moments are averaged to an image with motion blur
-    moments: tuple[Moment, ...] = ()
-    if has_exposure_time:
-        exposure_motion = motion or Motion(description, size, scene.input_assembler)
-        moments = choose_moments(
-            space, exposure_motion, scene.input_assembler, height=size[0]
-        )
+    moments = _find_exposure_moments(description, space, size, scene, motion)
     return Renderer(
         scene,
         space,
@@ -685,6 +771,38 @@ def make_renderer(
         estimators=estimators,
         moments=moments,
     )
+
+
+def _make_formation(
+    description: SceneDescription, size: tuple[int, int], denoise: str, sampler: str
+) -> ImageFormation:
+    """Return how images of a scene are formed; `size` is (height, width) in pixels."""
+    return ImageFormation(
+        denoiser=denoise,
+        sampler=sampler,
+        exposure=description.get_number("camera.exposure"),
+        resolution=size,
+        gain=description.gain,
+    )
+
+
+def _find_exposure_moments(
+    description: SceneDescription,
+    space: Space,
+    size: tuple[int, int],
+    scene: MitsubaScene,
+    motion: Motion | None,
+) -> tuple[Moment, ...]:
+    """Return the moments whose images are averaged to an image with motion blur.
+
+    There are none if the controls state no exposure time. `motion` computes how points
+    move in the image; without it, another one is made.
+    """
+    has_exposure_time = any(space.exposure)
+    if not has_exposure_time:
+        return ()
+    exposure_motion = motion or Motion(description, size, scene.input_assembler)
+    return choose_moments(space, exposure_motion, scene.input_assembler, height=size[0])
 
 
 def _check_rig_times(description: SceneDescription, space: Space) -> None:
@@ -711,16 +829,20 @@ def _check_rig_times(description: SceneDescription, space: Space) -> None:
             f"{prefix}, and can not have motion blur or a rolling shutter; "
             "leave that out"
         )
-    # One second later: `advance_time` returns the same object for a static control.
-    controls_later = space.advance_time(1.0).controls
-    changes_with_time = any(
-        control is not control_later
-        for control, control_later in zip(space.controls, controls_later, strict=True)
-    )
-    if not changes_with_time:
+    if not _changes_with_time(space):
         raise InputError(
             f"{prefix}, but nothing in the scene changes with time; add a `path`"
         )
+
+
+def _changes_with_time(space: Space) -> bool:
+    """Return whether a control changes the scene with time."""
+    # One second later: `advance_time` returns the same object for a static control.
+    controls_later = space.advance_time(1.0).controls
+    return any(
+        control is not control_later
+        for control, control_later in zip(space.controls, controls_later, strict=True)
+    )
 
 
 MOMENTS_PER_FLASH = 8  # moments of each flash of a light
@@ -749,11 +871,7 @@ def choose_moments(
     shutter, rolling = space.exposure
     duration = shutter + abs(rolling)
     max_pixels_moved = _measure_max_motion(space, motion, assembly, duration)
-    # `flashes` is a number per second
-    n_flashes = max(control.flashes for control in space.controls) * duration
-    n_for_motion = math.ceil(MOMENTS_PER_PIXEL * max_pixels_moved)
-    n_for_flashes = math.ceil(MOMENTS_PER_FLASH * n_flashes)
-    n_moments = min(max(MIN_MOMENTS, n_for_motion, n_for_flashes), MAX_MOMENTS)
+    n_moments = _count_moments(space, duration, max_pixels_moved)
     # Time of each moment, and the rows that are exposed at it. The fraction of samples
     # is the same for all moments.
     offsets, rows, sample_fraction = divide_exposure(
@@ -763,6 +881,15 @@ def choose_moments(
         Moment(space.advance_time(float(offset)), rows_of_moment, sample_fraction)
         for offset, rows_of_moment in zip(offsets, rows, strict=True)
     )
+
+
+def _count_moments(space: Space, duration: float, max_pixels_moved: float) -> int:
+    """Return how many moments an exposure of `duration` seconds needs."""
+    # `flashes` is a number per second
+    n_flashes = max(control.flashes for control in space.controls) * duration
+    n_for_motion = math.ceil(MOMENTS_PER_PIXEL * max_pixels_moved)
+    n_for_flashes = math.ceil(MOMENTS_PER_FLASH * n_flashes)
+    return min(max(MIN_MOMENTS, n_for_motion, n_for_flashes), MAX_MOMENTS)
 
 
 def _measure_max_motion(
@@ -787,26 +914,42 @@ def _measure_max_motion(
     moving_space = replace(space, controls=moving_controls)
     space_at_begin = moving_space.advance_time(-duration / 2.0)
     space_at_end = moving_space.advance_time(duration / 2.0)
-    configurations = torch.rand(
-        N_MOTION_SAMPLES,
-        len(moving_space.start),
-        # The seed is fixed: the number of moments of an exposure (`choose_moments`)
-        # follows from the result, and must not differ between two runs.
-        generator=torch.Generator().manual_seed(0),
-    )
+    project = partial(_project_configuration, motion, assembly)
     max_moved = 0.0
-    for u in configurations:
-        before, is_visible_before = motion.project_points(
-            assembly(space_at_begin.inputs(u))
-        )
-        after, is_visible_after = motion.project_points(
-            assembly(space_at_end.inputs(u))
-        )
+    for u in _sample_moving_configurations(len(moving_space.start)):
+        before, is_visible_before = project(space_at_begin, u)
+        after, is_visible_after = project(space_at_end, u)
         is_visible = is_visible_before & is_visible_after
         moved = (after - before)[is_visible].norm(dim=1)
         if len(moved):
             max_moved = max(max_moved, float(moved.max()))
     return max_moved
+
+
+def _project_configuration(
+    motion: Motion, assembly: InputAssembler, space: Space, u: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return where points lie in the image of u (d,), and which are in or near it.
+
+    The positions (N, 2) are in pixels from the center.
+
+    Args:
+        motion: projects points of the scene into the image.
+        assembly: turns the inputs of the space into those of the scene.
+        space: space of the configuration.
+        u: (d,) the configuration.
+    """
+    return motion.project_points(assembly(space.inputs(u)))
+
+
+def _sample_moving_configurations(n_coordinates: int) -> Tensor:
+    """Return the random configurations (`N_MOTION_SAMPLES`, d) of a measured motion.
+
+    The seed is fixed: the number of moments of an exposure (`choose_moments`) follows
+    from the result, and must not differ between two runs.
+    """
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(N_MOTION_SAMPLES, n_coordinates, generator=generator)
 
 
 def controls_to_settings(controls: Controls) -> dict[str, dict[str, object]]:
@@ -841,29 +984,47 @@ def make_controls(controls: Controls) -> tuple[Control, ...]:
         InputError: a control is unknown, has wrong settings, or comes twice.
     """
     control_by_name = normalize_controls(controls)
-    instances: dict[str, Control] = {}
-    named_settings: dict[str, Mapping[str, object]] = {}
-    for name, control in control_by_name.items():
-        if isinstance(control, Control):
-            instances[name] = control
-            named_settings[name] = {}
-        else:
-            named_settings[name] = control
+    instances = _select_instances(control_by_name)
+    # an instance is entered with empty settings
+    named_settings: dict[str, Mapping[str, object]] = {
+        name: {} if isinstance(control, Control) else control
+        for name, control in control_by_name.items()
+    }
     # several names may state parameters of one control
     settings_by_control = merge_control_settings(named_settings)
-    for name in instances:
-        # An instance was entered with empty settings. If there are some now, a name has
-        # stated them.
+    _check_instances_have_no_settings(instances, settings_by_control)
+    return tuple(
+        instances.get(name) or make_control(name, control_settings)
+        for name, control_settings in settings_by_control.items()
+    )
+
+
+def _select_instances(control_by_name: Mapping[str, object]) -> dict[str, Control]:
+    """Return the controls that are instances, by name, without mere settings."""
+    return {
+        name: control
+        for name, control in control_by_name.items()
+        if isinstance(control, Control)
+    }
+
+
+def _check_instances_have_no_settings(
+    names: Iterable[str], settings_by_control: Mapping[str, Mapping[str, object]]
+) -> None:
+    """Raise InputError if a control has settings besides its instance.
+
+    Args:
+        names: names of the controls that have an instance.
+        settings_by_control: merged settings of each control; those of an instance are
+            empty unless a name has stated some.
+    """
+    for name in names:
         has_settings = bool(settings_by_control[name])
         if has_settings:
             raise InputError(
                 f"controls: {name} is given twice, by an instance and by "
                 "name; state all of it in one"
             )
-    return tuple(
-        instances.get(name) or make_control(name, control_settings)
-        for name, control_settings in settings_by_control.items()
-    )
 
 
 def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
@@ -880,11 +1041,7 @@ def normalize_controls(controls: Controls) -> dict[str, Control | Mapping[str, o
         control_by_name = _read_control_mapping(controls)
     else:
         control_by_name = _read_control_list(controls)
-    instances = {
-        name: control
-        for name, control in control_by_name.items()
-        if isinstance(control, Control)
-    }
+    instances = _select_instances(control_by_name)
     # Only settings are checked. To keep the order of the controls, an instance is
     # replaced by None (no settings) for this check, and put back afterwards.
     without_instances = {**control_by_name, **dict.fromkeys(instances)}
@@ -905,15 +1062,7 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
     """
     control_by_name: dict[str, object] = {}
     for name, control in controls.items():
-        is_misnamed = isinstance(control, Control) and control.name != name
-        if isinstance(control, type) or is_misnamed:
-            got = describe_value(control)
-            if isinstance(control, Control):
-                got = f"one that is called {control.name}"
-            raise InputError(
-                f"`controls` {name}: expected settings, or an instance of that "
-                f"name, got {got}; instances stand in a list as well, controls=[...]"
-            )
+        _check_mapped_control(name, control)
         if isinstance(control, Control):
             control_by_name[name] = control
         elif _is_settings_of_control(control):  # and not of one parameter
@@ -924,6 +1073,19 @@ def _read_control_mapping(controls: Mapping[str, object]) -> dict[str, object]:
             # the value of a single parameter, as for the name "camera.azimuth"
             control_by_name[name] = distribution_to_setting(control)
     return control_by_name
+
+
+def _check_mapped_control(name: str, control: object) -> None:
+    """Raise InputError for a class, or an instance under another name than its own."""
+    is_misnamed = isinstance(control, Control) and control.name != name
+    if isinstance(control, type) or is_misnamed:
+        got = describe_value(control)
+        if isinstance(control, Control):
+            got = f"one that is called {control.name}"
+        raise InputError(
+            f"`controls` {name}: expected settings, or an instance of that "
+            f"name, got {got}; instances stand in a list as well, controls=[...]"
+        )
 
 
 def _is_settings_of_control(value: object) -> TypeGuard[Mapping[str, Any]]:
@@ -949,15 +1111,7 @@ def _read_control_list(
         control_list = controls
     control_by_name: dict[str, object] = {}
     for control in control_list:
-        if isinstance(control, str):
-            added: dict[str, Any] = dict(parse_controls([control], "controls"))
-        elif isinstance(control, Control):
-            added = {control.name: control}
-        else:
-            raise InputError(
-                "controls: expected names or Control instances, got "
-                f"{describe_value(control)}"
-            )
+        added = _read_listed_control(control)
         for name in added:
             if name in control_by_name:
                 raise InputError(
@@ -966,6 +1120,17 @@ def _read_control_list(
                 )
         control_by_name |= added
     return control_by_name
+
+
+def _read_listed_control(control: object) -> dict[str, Any]:
+    """Return a control of a list by name: an instance, or settings parsed from text."""
+    if isinstance(control, str):
+        return dict(parse_controls([control], "controls"))
+    if isinstance(control, Control):
+        return {control.name: control}
+    raise InputError(
+        f"controls: expected names or Control instances, got {describe_value(control)}"
+    )
 
 
 def list_control_instances(controls: object) -> list[Control]:

@@ -129,38 +129,65 @@ def load_models(
     """
     threads.configure(config.n_used_threads)
     if isinstance(task, EnsembleTask):
-        tasks = task.parts
         models = to_model_list(models)
-    else:
-        tasks = (task,) * len(models)
-    if len(models) != len(tasks):
-        raise InputError(
-            f"model: expected {len(tasks)}, one for each task, got {len(models)}"
-        )
-    with warnings.catch_warnings(record=True) as caught:
-        # Python shows an equal warning only once, and "always" records every one
-        warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(
-            _load_for_task(
-                model,
-                task_of_model,
-                config,
-                # True for a single task; the parts of an `EnsembleTask` are other tasks
-                is_only_task=task_of_model is task,
-            )
-            for model, task_of_model in zip(models, tasks, strict=True)
-        )
-    sentences = _take_model_warnings(caught)
-    if config.camera is not None:
-        n_cameras = len(read_rig(config.camera))  # 0 for a camera that is no rig
-        if n_cameras:
-            _check_task_of_rig(task, config.camera, n_cameras)
-            loaded = tuple(replace(model, cameras=n_cameras) for model in loaded)
+    loaded, sentences = _load_with_warnings(models, task, config)
+    loaded = _add_rig_cameras(loaded, task, config.camera)
     for model in loaded:
         _check_n_images(model)
     if isinstance(task, EnsembleTask):
         return (join_models(loaded, config.resolution),), sentences
     return loaded, sentences
+
+
+def _load_with_warnings(
+    models: Sequence[Any], task: Task, config: SceneConfig
+) -> tuple[tuple[Model, ...], list[str]]:
+    """Load models of a task, and return them and their warnings as sentences."""
+    tasks = _list_tasks(task, len(models))
+    with warnings.catch_warnings(record=True) as caught:
+        # Python shows an equal warning only once, and "always" records every one
+        warnings.simplefilter("always", ModelWarning)
+        loaded = _load_each(models, tasks, task, config)
+    return loaded, _take_model_warnings(caught)
+
+
+def _list_tasks(task: Task, n_models: int) -> tuple[Task, ...]:
+    """Return the task of each model, for an `EnsembleTask` its parts.
+
+    Raises:
+        InputError: there is another number of models than tasks.
+    """
+    if not isinstance(task, EnsembleTask):
+        return (task,) * n_models
+    tasks = task.parts
+    if n_models != len(tasks):
+        raise InputError(
+            f"model: expected {len(tasks)}, one for each task, got {n_models}"
+        )
+    return tasks
+
+
+def _load_each(
+    models: Sequence[Any], tasks: Sequence[Task], task: Task, config: SceneConfig
+) -> tuple[Model, ...]:
+    """Load each model for its task, which is `task` or, of an ensemble, a part of it."""
+    return tuple(
+        _load_for_task(model, task_of_model, config, is_only_task=task_of_model is task)
+        for model, task_of_model in zip(models, tasks, strict=True)
+    )
+
+
+def _add_rig_cameras(
+    models: tuple[Model, ...], task: Task, camera: str | None
+) -> tuple[Model, ...]:
+    """Return the models with the number of cameras of a rig, if the camera is one."""
+    if camera is None:
+        return models
+    n_cameras = len(read_rig(camera))  # 0 for a camera that is no rig
+    if not n_cameras:
+        return models
+    _check_task_of_rig(task, camera, n_cameras)
+    return tuple(replace(model, cameras=n_cameras) for model in models)
 
 
 def _load_for_task(
@@ -391,24 +418,46 @@ def make_configured_controls(
             run, or a control is unknown.
     """
     run_settings = collect_run_settings(config, are_searched=are_searched)
+    control_by_name = _find_passed_controls(config, controls)
+    # Only to raise an error for an unknown control before settings are read. The
+    # instances are made at the end, with all settings.
+    make_controls(control_by_name)
+    completed = {
+        name: _complete_control(run_settings, name, control)
+        for name, control in control_by_name.items()
+    }
+    return make_controls(completed)
+
+
+def _find_passed_controls(config: SceneConfig, controls: Controls) -> dict[str, Any]:
+    """Return instance or settings of each control by name.
+
+    A name may be that of an instance that a Python caller passed.
+    """
     control_by_name: dict[str, Any] = {}
     for name, control in normalize_controls(controls).items():
         if not isinstance(control, Control):
             control = config.get_python_object(CONTROL, name) or control
         control_by_name[name] = control
-    # Only to raise an error for an unknown control before settings are read. The
-    # instances are made at the end, with all settings.
-    make_controls(control_by_name)
-    completed: dict[str, Control | Mapping[str, object]] = {}
-    for name, control in control_by_name.items():
-        if isinstance(control, Control):
-            _check_takes_no_run_setting(run_settings, control)
-            completed[name] = control
-        else:
-            defaults_from_run = _select_settings(run_settings, name, control)
-            # what the user stated for the control itself wins
-            completed[name] = {**defaults_from_run, **control}
-    return make_controls(completed)
+    return control_by_name
+
+
+def _complete_control(
+    run_settings: Mapping[str, Any],
+    name: str,
+    control: Control | Mapping[str, object],
+) -> Control | Mapping[str, object]:
+    """Return a control with the settings of the run that it takes; an instance stays.
+
+    Raises:
+        InputError: the instance would take a setting of the run.
+    """
+    if isinstance(control, Control):
+        _check_takes_no_run_setting(run_settings, control)
+        return control
+    defaults_from_run = _select_settings(run_settings, name, control)
+    # what the user stated for the control itself wins
+    return {**defaults_from_run, **control}
 
 
 def _check_takes_no_run_setting(
@@ -496,18 +545,8 @@ def check_run_settings(config: SceneConfig) -> None:
         UnknownNameError: a setting names a control that is not there.
     """
     for setting, value in collect_run_settings(config).items():
-        random_controls: Mapping[str, Any] = {}
-        if setting not in SETTINGS_OF_SEARCHES:
-            # `over` has the controls that vary by chance; only some commands have it
-            random_controls = getattr(config, "over", {})
-        # several names may state parameters of one control
-        controls = merge_control_settings({**config.controls, **random_controls})
-        # kind of each control that does not take the setting, by its name
-        rejecting_kinds = {}
-        for name, control_settings in controls.items():
-            if not takes_setting(name, control_settings, setting):
-                kind, _ = parse_control_name(name, control_settings)
-                rejecting_kinds[name] = kind
+        controls = _collect_setting_takers(config, setting)
+        rejecting_kinds = _find_rejecting_kinds(controls, setting)
         # a mapping from names of controls to values, such as {"key": 0.1}
         if isinstance(value, Mapping):
             _check_named_controls(setting, value, controls, rejecting_kinds)
@@ -520,6 +559,30 @@ def check_run_settings(config: SceneConfig) -> None:
         if rejecting_kinds and is_unsupported:
             name, kind = next(iter(rejecting_kinds.items()))
             raise _make_unsupported_error(setting, name, kind)
+
+
+def _collect_setting_takers(
+    config: SceneConfig, setting: str
+) -> dict[str, dict[str, object]]:
+    """Return the controls that may take a setting of the run: their settings by name."""
+    random_controls: Mapping[str, Any] = {}
+    if setting not in SETTINGS_OF_SEARCHES:
+        # `over` has the controls that vary by chance; only some commands have it
+        random_controls = getattr(config, "over", {})
+    # several names may state parameters of one control
+    return merge_control_settings({**config.controls, **random_controls})
+
+
+def _find_rejecting_kinds(
+    controls: Mapping[str, Mapping[str, object]], setting: str
+) -> dict[str, str]:
+    """Return the kind of each control that does not take a setting, by its name."""
+    rejecting_kinds = {}
+    for name, control_settings in controls.items():
+        if not takes_setting(name, control_settings, setting):
+            kind, _ = parse_control_name(name, control_settings)
+            rejecting_kinds[name] = kind
+    return rejecting_kinds
 
 
 def _check_named_controls(
@@ -615,19 +678,27 @@ def _list_active_choices(
         choice.fixes for choice in kind.choices if settings.get(choice.name) is not None
     }
     fixed |= {name for name, value in settings.items() if Parameter.is_number(value)}
-    # Names of parameters with a default range, or with a range that is set. Names of
-    # choices that are set are among these as well. They do no harm, as `Choice.bounds`
-    # is never the name of a choice.
-    searched = {
-        parameter.name for parameter in kind.parameters if parameter.search is not None
-    }
-    searched |= {name for name, value in settings.items() if value is not None}
-    searched -= fixed
+    searched = _find_searched_names(kind, settings) - fixed
     return [
         choice
         for choice in kind.choices
         if not choice.bounds or choice.bounds in searched
     ]
+
+
+def _find_searched_names(
+    kind: type[Control], settings: Mapping[str, object]
+) -> set[str]:
+    """Return the names of parameters with a default range, or with a range that is set.
+
+    Names of choices that are set are among these as well. They do no harm, as
+    `Choice.bounds` is never the name of a choice.
+    """
+    searched = {
+        parameter.name for parameter in kind.parameters if parameter.search is not None
+    }
+    searched |= {name for name, value in settings.items() if value is not None}
+    return searched
 
 
 def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
@@ -639,22 +710,7 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
         kind: kind of the control, on which the advice depends.
     """
     if setting == "epsilon":
-        choices = CONTROLS[kind].choices if kind in CONTROLS else ()
-        # Some controls take an epsilon for one of their parameters, but only if it is
-        # searched. `Choice.bounds` is the name of the parameter. The first is
-        # suggested.
-        bounded_parameters = [
-            choice.bounds
-            for choice in choices
-            if choice.run_setting == "epsilon" and choice.bounds
-        ]
-        instead = ""
-        if bounded_parameters:
-            instead = f", or search {bounded_parameters[0]} with it"
-        return InputError(
-            f"`epsilon` {name}: the control has ranges and no epsilon; give its "
-            f"ranges, as in `controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"
-        )
+        return _make_epsilon_error(name, kind)
     if setting in ("path", "shutter", "rolling"):
         return InputError(
             f"{setting}: the control {name} does not move on a path; add `over=path`, "
@@ -663,6 +719,26 @@ def _make_unsupported_error(setting: str, name: str, kind: str) -> InputError:
     return InputError(
         f"{setting}: the control {name} does not take it, nor does "
         "another one here; leave it out"
+    )
+
+
+def _make_epsilon_error(name: str, kind: str) -> InputError:
+    """Return the error of an epsilon that a control, of some kind, does not take."""
+    choices = CONTROLS[kind].choices if kind in CONTROLS else ()
+    # Some controls take an epsilon for one of their parameters, but only if it is
+    # searched. `Choice.bounds` is the name of the parameter. The first is
+    # suggested.
+    bounded_parameters = [
+        choice.bounds
+        for choice in choices
+        if choice.run_setting == "epsilon" and choice.bounds
+    ]
+    instead = ""
+    if bounded_parameters:
+        instead = f", or search {bounded_parameters[0]} with it"
+    return InputError(
+        f"`epsilon` {name}: the control has ranges and no epsilon; give its "
+        f"ranges, as in `controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{instead}"
     )
 
 

@@ -27,7 +27,7 @@ from advsearch.attacks.verification import (
     WORST_CASE,
     VerificationRule,
 )
-from advsearch.controls import Space
+from advsearch.controls import Control, Space
 from advsearch.engine.acceptance import ComparedView, compare_with_traced
 from advsearch.engine.judging import (
     ConfigurationInputs,
@@ -175,12 +175,7 @@ class Problem:
         are never requested. `domain` and `conditions` are created again, since the
         domain states the cost of a gradient, which depends on the plan.
         """
-        controls = self.space.controls
-        n_searched = self.n_searched
-        if n_searched is None:  # all are searched
-            n_searched = len(controls)
-        searched = controls[:n_searched]
-        conditions = controls[n_searched:]
+        searched, conditions = self._split_controls()
         condition_names = {control.name for control in conditions}
         estimator_by_group = {
             group.name: "none"
@@ -194,6 +189,14 @@ class Problem:
             searched, gradient_cost=self.renderer.plan.renders, partial_gradients=True
         )
         self.conditions = make_domain(conditions) if conditions else None
+
+    def _split_controls(self) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
+        """Return the controls that are searched, and those that vary by chance."""
+        controls = self.space.controls
+        n_searched = self.n_searched
+        if n_searched is None:  # all are searched
+            n_searched = len(controls)
+        return controls[:n_searched], controls[n_searched:]
 
     @property
     def preparation(self) -> Preparation:
@@ -314,30 +317,22 @@ class Problem:
         """
         with torch.no_grad():
             output = self.model(images)
-            if self.task.varies:
-                truths = [
-                    self.find_truth(full_u, values)
-                    for full_u, values in zip(
-                        full_configurations, stated_values, strict=True
-                    )
-                ]
-            else:
-                truths = [self.find_truth()]  # one that holds for all images
+            truths = self._find_truth_of_each(full_configurations, stated_values)
             judged = self._judge_outputs(output, images, truths, full_configurations)
-        judgements_without_objective = []
-        for judgement in judged:
-            # `from_margin` checks that the margin is finite, and sets no objective. It
-            # takes no metrics, so these are added below.
-            without_objective = Judgement.from_margin(
-                judgement.score,
-                judgement.margin,
-                judgement.prediction,
-                judgement.payload,
-            )
-            judgements_without_objective.append(
-                replace(without_objective, metrics=judgement.metrics)
-            )
-        return judgements_without_objective
+        return [_without_objective(judgement) for judgement in judged]
+
+    def _find_truth_of_each(
+        self,
+        full_configurations: Sequence[Tensor],
+        stated_values: Sequence[Mapping[str, Value]],
+    ) -> list[Truth]:
+        """Return the truth of each configuration, or one that holds for all of them."""
+        if not self.task.varies:
+            return [self.find_truth()]
+        return [
+            self.find_truth(full_u, values)
+            for full_u, values in zip(full_configurations, stated_values, strict=True)
+        ]
 
     def _judge_outputs(
         self,
@@ -364,13 +359,18 @@ class Problem:
         if not has_other_things:
             return judged
         for index, full_u in enumerate(full_configurations):
-            # coordinates that may change what is visible
-            key = full_u.detach()[self._changes_more_than_colors].numpy().tobytes()
-            if key not in self._things:
-                things = find_visible_things(self.renderer, full_u)
-                _add_to_cache(self._things, key, things)
-            judged[index] = add_visible_things(judged[index], self._things[key])
+            things = self._find_cached_things(full_u)
+            judged[index] = add_visible_things(judged[index], things)
         return judged
+
+    def _find_cached_things(self, full_u: Tensor) -> JsonObject | None:
+        """Return what a full configuration shows of each thing, rendered only once."""
+        # coordinates that may change what is visible
+        key = full_u.detach()[self._changes_more_than_colors].numpy().tobytes()
+        if key not in self._things:
+            things = find_visible_things(self.renderer, full_u)
+            _add_to_cache(self._things, key, things)
+        return self._things[key]
 
     def compare_view(
         self,
@@ -397,21 +397,11 @@ class Problem:
                 search may go. They are no change by the search.
             renderer: traces the images; None for that of the problem.
         """
-        dim = self.domain.dim
         with torch.no_grad():
             predicted = predict(full_u)
-            # the start of the search, under the same conditions
-            start = torch.cat([self.domain.start, full_u[dim:]])
-            # Random coordinates have the same values in both, so that only the change
-            # by the search is a difference.
-            if is_random is not None:
-                start[:dim][is_random] = full_u[:dim][is_random]
+            start = self._make_compared_start(full_u, is_random)
             is_start = torch.equal(start, full_u)
             predicted_start = None if is_start else predict(start)
-
-        def measure_margin(image: Tensor, u: Tensor) -> float:
-            """Return the model's margin on an image of a configuration."""
-            return self.judge(image, u).margin
 
         return compare_with_traced(
             renderer or self.renderer,
@@ -419,9 +409,25 @@ class Problem:
             full_u,
             seed,
             spp,
-            measure_margin,
+            self._measure_image_margin,
             predicted_start,
         )
+
+    def _measure_image_margin(self, image: Tensor, u: Tensor) -> float:
+        """Return the model's margin on an image of a full configuration u (d,)."""
+        return self.judge(image, u).margin
+
+    def _make_compared_start(self, full_u: Tensor, is_random: Tensor | None) -> Tensor:
+        """Return the start of the search (d,) under the conditions of a configuration.
+
+        Random coordinates have the same values in both, so that only the change by the
+        search is a difference.
+        """
+        dim = self.domain.dim
+        start = torch.cat([self.domain.start, full_u[dim:]])
+        if is_random is not None:
+            start[:dim][is_random] = full_u[:dim][is_random]
+        return start
 
     def find_marks(self, image: Tensor, full_u: Tensor) -> list[Mark]:
         """Return the boxes and masks of prediction and truth on an image (H, W, 3)."""
@@ -462,19 +468,15 @@ class Problem:
         if full_u is None or not self.task.varies:
             return self._start_truth
         # A truth may depend on what the camera sees, which base colors do not change.
-        # So it is cached by the other coordinates, if these are few. A truth is not
-        # cached if exact values were stated, or if the task has read values of the
-        # configuration (`Facts.numbers`), which may include colors.
+        # So it is cached by the other coordinates, if these are few.
         geometric_u = full_u.detach()[self._changes_more_than_colors]
         key = geometric_u.numpy().tobytes()
         if not stated_values and key in self._truths:
             return self._truths[key]
         facts = self._make_facts_of_cameras(full_u, stated_values or {})
         truth = self.task.truth(facts)
-        is_cacheable = not stated_values and len(geometric_u) <= MAX_CACHED_COORDINATES
-        # `numbers` is a cached property, which `vars` contains once it was read
-        has_read_numbers = "numbers" in vars(facts)
-        if is_cacheable and not has_read_numbers:
+        is_short = len(geometric_u) <= MAX_CACHED_COORDINATES
+        if not stated_values and is_short and not _has_read_numbers(facts):
             _add_to_cache(self._truths, key, truth)
         return truth
 
@@ -487,14 +489,7 @@ class Problem:
             full_u: the full configuration.
             stated_values: exact values, which replace those of the configuration.
         """
-
-        def describe() -> dict[str, Value]:
-            """Return the values of all parameters, with the stated ones."""
-            values = self.space.describe(full_u)
-            return {
-                name: stated_values.get(name, value) for name, value in values.items()
-            }
-
+        describe = partial(self._describe_with_stated, full_u, stated_values)
         n_rig_cameras = 0 if self.space.scene is None else len(self.space.scene.rig)
         # one function for the main camera, then one for each camera of a rig
         renders = list_camera_renders(self.renderer, full_u, n_rig_cameras)
@@ -502,6 +497,13 @@ class Problem:
             self.make_facts(describe, render_surfaces) for render_surfaces in renders
         ]
         return replace(facts, facts_of_views=tuple(camera_facts))
+
+    def _describe_with_stated(
+        self, full_u: Tensor, stated_values: Mapping[str, Value]
+    ) -> dict[str, Value]:
+        """Return the values of all parameters, with the stated ones."""
+        values = self.space.describe(full_u)
+        return {name: stated_values.get(name, value) for name, value in values.items()}
 
     @cached_property
     def _start_truth(self) -> Truth:
@@ -581,16 +583,24 @@ class Problem:
             return None, ""
         u = self.make_full_configuration(self.domain.start).clone()
         step = min(group.step, 0.5)  # from the center, it stays within the range
-        u[group.coordinates] = 0.5 - step
-        lower = self.space.describe(u).get(group.name)  # {"value": 30.0, "unit": ...}
-        u[group.coordinates] = 0.5 + step
-        upper = self.space.describe(u).get(group.name)
+        lower = self._describe_shifted(u, group, 0.5 - step)
+        upper = self._describe_shifted(u, group, 0.5 + step)
         if lower is None or upper is None:
             return None, ""
         if not isinstance(lower["value"], (int, float)):
             return None, ""
         difference = float(upper["value"]) - float(lower["value"])
         return abs(difference) / 2.0, lower["unit"]
+
+    def _describe_shifted(
+        self, u: Tensor, group: Group, coordinate: float
+    ) -> Value | None:
+        """Return the value of a group, {"value": 30.0, "unit": ...}, at a coordinate.
+
+        The coordinate is set in u (d,). None if the group describes no value.
+        """
+        u[group.coordinates] = coordinate
+        return self.space.describe(u).get(group.name)
 
     def describe_conditions(self, u: Tensor, draw_seed: int) -> dict[str, Value]:
         """Describe the conditions of a draw in values with units.
@@ -634,16 +644,9 @@ class Problem:
         """
         non_finite_before = self.renderer.n_non_finite
         if query.requested_output == "light":
-            linear = self.make_linear_renderer(query.u, query.seed, query.spp)
-            # neither light nor an image has an objective
-            evaluation = Evaluation(
-                math.nan, gradient=None, success=False, collected_light=linear.collected
-            )
+            evaluation = self._collect_light(query)
         elif query.requested_output == "picture":
-            image = self.picture(query.u, query.seed, query.spp)
-            evaluation = Evaluation(
-                math.nan, gradient=None, success=False, picture=image
-            )
+            evaluation = self._render_picture(query)
         elif query.phase is None:
             evaluation = self._evaluate_trial(query)
         elif self.conditions is None:
@@ -656,6 +659,18 @@ class Problem:
         if n_non_finite:
             return replace(evaluation, n_non_finite=n_non_finite)
         return evaluation
+
+    def _collect_light(self, query: Query) -> Evaluation:
+        """Evaluate a query for light, which has no objective."""
+        linear = self.make_linear_renderer(query.u, query.seed, query.spp)
+        return Evaluation(
+            math.nan, gradient=None, success=False, collected_light=linear.collected
+        )
+
+    def _render_picture(self, query: Query) -> Evaluation:
+        """Evaluate a query for an image, which has no objective."""
+        image = self.picture(query.u, query.seed, query.spp)
+        return Evaluation(math.nan, gradient=None, success=False, picture=image)
 
     def _evaluate_trial(self, query: Query) -> Evaluation:
         """Evaluate a trial of the verification: render an image anew and judge it.
@@ -682,17 +697,12 @@ class Problem:
         it is rendered under conditions that leave the scene unchanged, as no sampled
         one represents all of them.
         """
-        condition_seeds = [
-            seeds.derive_seed(query.seed, "draw", index)
-            for index in range(self.conditions_per_evaluation)
-        ]
         query_without_image = replace(query, includes_image=False)
-        evaluated = [
-            self.evaluate_full(
-                query_without_image, self.make_full_configuration(query.u, seed), seed
-            )
-            for seed in condition_seeds
-        ]
+        evaluated = []
+        for index in range(self.conditions_per_evaluation):
+            seed = seeds.derive_seed(query.seed, "draw", index)
+            full_u = self.make_full_configuration(query.u, seed)
+            evaluated.append(self.evaluate_full(query_without_image, full_u, seed))
         evaluation = self.average_evaluations(evaluated, query.u)
         if not query.includes_image:
             return evaluation
@@ -739,16 +749,8 @@ class Problem:
             collected_light: light that an earlier call collected at `full_u`; None to
                 collect it now.
         """
-        searched_names = {control.name for control in self.searched_space.controls}
-        # scene inputs that the search changes, such as "object.base_color"
-        searched_inputs: frozenset[str] = frozenset()
-        for group in self.gradient_plan.groups:
-            if group.control in searched_names:
-                searched_inputs |= self.renderer.inputs_by_group.get(
-                    group.name, frozenset()
-                )
         # images are only linear in some of them
-        input_names = searched_inputs & find_linear_inputs(self.renderer)
+        input_names = self._searched_inputs & find_linear_inputs(self.renderer)
         # Light paths are no longer than those of a search.
         depth = LIGHT_DEPTH
         if self.search_depth is not None:
@@ -764,6 +766,18 @@ class Problem:
                 names=input_names,
                 collected=collected_light,
             )
+
+    @property
+    def _searched_inputs(self) -> frozenset[str]:
+        """Scene inputs that the search changes, such as "object.base_color"."""
+        searched_names = {control.name for control in self.searched_space.controls}
+        searched_inputs: frozenset[str] = frozenset()
+        for group in self.gradient_plan.groups:
+            if group.control in searched_names:
+                searched_inputs |= self.renderer.inputs_by_group.get(
+                    group.name, frozenset()
+                )
+        return searched_inputs
 
     def evaluate_full(
         self, query: Query, full_u: Tensor, seed: int, renderer: Renderer | None = None
@@ -789,39 +803,11 @@ class Problem:
         renders_before = renderer.n_renders  # without regard to their samples
         truth = self.find_truth(full_u)
         variable_u = full_u.detach().clone().requires_grad_(bool(query.gradient))
-        inputs = self.make_objective_inputs(variable_u)
-        # Image and output of each call of the loss. The first call is at u itself; any
-        # later ones are at neighbors of u, for finite differences.
-        calls: list[tuple[Tensor, Output]] = []
-        # derivative of the objective by u that does not go through the image
-        input_gradient = torch.zeros(())
-
-        def loss(image: Tensor) -> Tensor:
-            """Return the objective of an image, and record the call."""
-            nonlocal input_gradient
-            output = self.model(image)
-            calls.append((image.detach(), output))
-            values = self._compute_objective(output, image[None], truth, inputs)
-            objective = values[0]
-            # `inputs.used` is set once the objective has read an input
-            if inputs.used and len(calls) == 1:  # the call at u itself
-                input_gradient = _differentiate_by_inputs(objective, variable_u)
-            return objective
-
-        spp = self.search_spp * query.samples
-        gradient = None
-        with self._limit_search_depth(renderer):
-            if query.gradient:
-                # a "free" gradient leaves out derivatives that cost renders
-                value, gradient = renderer.gradient(
-                    loss, full_u, seed, spp, free=query.gradient == "free"
-                )
-                if inputs.used:
-                    gradient = gradient + input_gradient
-            else:
-                with torch.no_grad():
-                    value = loss(renderer(full_u, seed=seed, spp=spp))
-        image, output = calls[0]  # at u itself
+        loss = _RecordingLoss(self, truth, variable_u)
+        value, gradient = self._compute_value_and_gradient(
+            renderer, loss, full_u, query, seed
+        )
+        image, output = loss.calls[0]  # at u itself
         (judgement,) = self._judge_outputs(output, image[None], [truth], [full_u])
         evaluation = Evaluation(
             objective=float(value),
@@ -835,6 +821,31 @@ class Problem:
             picture=round_to_8_bit(image) if query.includes_image else None,
         )
         return evaluation, output
+
+    def _compute_value_and_gradient(
+        self,
+        renderer: Renderer,
+        loss: _RecordingLoss,
+        full_u: Tensor,
+        query: Query,
+        seed: int,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return the objective at a full configuration (d,), and its gradient (d,).
+
+        The gradient is None if the query requests none.
+        """
+        spp = self.search_spp * query.samples
+        with self._limit_search_depth(renderer):
+            if not query.gradient:
+                with torch.no_grad():
+                    return loss(renderer(full_u, seed=seed, spp=spp)), None
+            # a "free" gradient leaves out derivatives that cost renders
+            value, gradient = renderer.gradient(
+                loss, full_u, seed, spp, free=query.gradient == "free"
+            )
+        if loss.inputs.used:
+            gradient = gradient + loss.input_gradient
+        return value, gradient
 
     def _limit_search_depth(self, renderer: Renderer) -> AbstractContextManager[None]:
         """Return a context in which light paths are as short as those of a search.
@@ -873,14 +884,11 @@ class Problem:
             outputs = self.model(images)
             outputs_of_images = _split_batch(outputs, len(full_configurations))
             truths = [self.find_truth(full_u) for full_u in full_configurations]
-            # An objective may read the configuration itself. So its searched
-            # coordinates are replaced by those with a graph.
-            variable_configurations = [
-                torch.cat([variable_u, full_u[len(variable_u) :]])
-                for full_u in full_configurations
-            ]
             values = self._compute_objectives_of_batch(
-                outputs, images, truths, variable_configurations
+                outputs,
+                images,
+                truths,
+                _insert_searched_coordinates(full_configurations, variable_u),
             )
             derivative = None
             if needs_gradient:
@@ -960,8 +968,7 @@ class Problem:
             batch_size: images in a batch of the model.
         """
         evaluated = []
-        # derivative of the sum of all objectives; None without a gradient
-        total_derivative = None
+        derivatives = []
         for begin in range(0, len(full_configurations), batch_size):
             batch = slice(begin, begin + batch_size)
             # `derivative` is that of the sum over the batch
@@ -969,13 +976,8 @@ class Problem:
                 partial(render, batch), full_configurations[batch], u, gradient
             )
             evaluated += batch_evaluated
-            if total_derivative is None:
-                total_derivative = derivative
-            elif derivative is not None:
-                total_derivative = total_derivative + derivative
-        mean_derivative = None
-        if total_derivative is not None:
-            mean_derivative = total_derivative / len(full_configurations)
+            derivatives.append(derivative)
+        mean_derivative = _divide_sum(derivatives, len(full_configurations))
         return self.average_evaluations(evaluated, u, mean_derivative)
 
     def average_evaluations(
@@ -997,27 +999,16 @@ class Problem:
                 is ignored, and the mean of these is taken.
         """
         evaluations, outputs = zip(*evaluated, strict=True)
-        # without the derivatives by the conditions, which come last
-        gradients = [
-            evaluation.gradient[: u.numel()]
-            for evaluation in evaluations
-            if evaluation.gradient is not None
-        ]
-        if gradients:
-            gradient = torch.stack(gradients).mean(dim=0)
-        judged = [
-            evaluation.judgement
-            for evaluation in evaluations
-            if evaluation.judgement is not None
-        ]
+        mean_gradient = _average_gradients(evaluations, u.numel())
+        if mean_gradient is not None:
+            gradient = mean_gradient
+        judged = _list_judgements(evaluations)
         judgement = self._average_judgements(judged, outputs)
-        n_successes = sum(evaluation.success for evaluation in evaluations)
-        n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
         total_objective = sum(evaluation.objective for evaluation in evaluations)
         return Evaluation(
             objective=total_objective / len(evaluations),
             gradient=gradient,
-            success=n_successes >= n_needed,
+            success=_is_success_over_conditions(evaluations),
             n_non_finite=sum(evaluation.n_non_finite for evaluation in evaluations),
             cost=max(evaluation.cost for evaluation in evaluations),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
@@ -1059,6 +1050,116 @@ class Problem:
         output = self.model(image)
         values = self._compute_objective(output, image[None], self.find_truth(), inputs)
         return values[0]
+
+
+@dataclass(eq=False)
+class _RecordingLoss:
+    """The objective of an image, as a function that records its calls.
+
+    The first call is at u itself; any later ones are at neighbors of u, for finite
+    differences.
+
+    Attributes:
+        problem: the problem.
+        truth: what is true of the scene at u.
+        variable_u: (d,) the full configuration, with a graph if a gradient is requested.
+        inputs: the inputs that the objective may read at u. `inputs.used` is set once it
+            has read one.
+        calls: image and output of each call.
+        input_gradient: derivative of the objective by u that does not go through the
+            image.
+    """
+
+    problem: Problem
+    truth: Truth
+    variable_u: Tensor
+    inputs: ConfigurationInputs = field(init=False)
+    calls: list[tuple[Tensor, Output]] = field(default_factory=list)
+    input_gradient: Tensor = field(default_factory=lambda: torch.zeros(()))
+
+    def __post_init__(self) -> None:
+        self.inputs = self.problem.make_objective_inputs(self.variable_u)
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Return the objective of an image (H, W, 3), and record the call."""
+        output = self.problem.model(image)
+        self.calls.append((image.detach(), output))
+        values = self.problem._compute_objective(
+            output, image[None], self.truth, self.inputs
+        )
+        objective = values[0]
+        if self.inputs.used and len(self.calls) == 1:  # the call at u itself
+            self.input_gradient = _differentiate_by_inputs(objective, self.variable_u)
+        return objective
+
+
+def _without_objective(judgement: Judgement) -> Judgement:
+    """Return a judgement without the value of the objective, its metrics included."""
+    # `from_margin` checks that the margin is finite, and sets no objective. It takes no
+    # metrics, so these are added.
+    without_objective = Judgement.from_margin(
+        judgement.score,
+        judgement.margin,
+        judgement.prediction,
+        judgement.payload,
+    )
+    return replace(without_objective, metrics=judgement.metrics)
+
+
+def _has_read_numbers(facts: Facts) -> bool:
+    """Return whether a task has read values of the configuration, perhaps colors.
+
+    `Facts.numbers` is a cached property, which `vars` contains once it was read.
+    """
+    return "numbers" in vars(facts)
+
+
+def _insert_searched_coordinates(
+    full_configurations: Sequence[Tensor], u: Tensor
+) -> list[Tensor]:
+    """Return full configurations with u (d,), and its graph, as searched coordinates.
+
+    An objective may read the configuration itself, so that it needs the graph.
+    """
+    return [torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations]
+
+
+def _divide_sum(derivatives: Sequence[Tensor | None], count: int) -> Tensor | None:
+    """Return the sum of derivatives (d,) divided by a count; None if all are None."""
+    total_derivative = None
+    for derivative in derivatives:
+        if total_derivative is None:
+            total_derivative = derivative
+        elif derivative is not None:
+            total_derivative = total_derivative + derivative
+    return None if total_derivative is None else total_derivative / count
+
+
+def _list_judgements(evaluations: Sequence[Evaluation]) -> list[Judgement]:
+    """List the judgements of those evaluations that have one."""
+    return [
+        evaluation.judgement
+        for evaluation in evaluations
+        if evaluation.judgement is not None
+    ]
+
+
+def _is_success_over_conditions(evaluations: Sequence[Evaluation]) -> bool:
+    """Return whether enough evaluations are successes, by the rule over conditions."""
+    n_successes = sum(evaluation.success for evaluation in evaluations)
+    n_needed = OVER_CONDITIONS.count_percent(len(evaluations))
+    return n_successes >= n_needed
+
+
+def _average_gradients(evaluations: Sequence[Evaluation], dim: int) -> Tensor | None:
+    """Return the mean of the gradients (dim,) of evaluations; None if none has one."""
+    # without the derivatives by the conditions, which come last
+    gradients = [
+        evaluation.gradient[:dim]
+        for evaluation in evaluations
+        if evaluation.gradient is not None
+    ]
+    return torch.stack(gradients).mean(dim=0) if gradients else None
 
 
 def _differentiate_by_inputs(objective: Tensor, variable_u: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ predictions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model, load_model
 from advsearch.options import Value
-from advsearch.progress import ProgressOption, as_progress
+from advsearch.progress import Progress, ProgressOption, as_progress
 from advsearch.report.figures import draw_marks, make_contact_sheet
 from advsearch.report.wording import format_image_prediction
 from advsearch.runs.files import encode_png, write_exr, write_layers, write_png
@@ -38,7 +38,7 @@ from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredicti
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, Surfaces
-from advsearch.scene.outlines import find_visible_meshes
+from advsearch.scene.outlines import VisibleMesh, find_visible_meshes
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import ALL_THINGS
@@ -346,19 +346,12 @@ def render(
         InputError: a name is unknown, a file cannot be used, a value is out of range,
             or the scene cannot take a control.
     """
-    scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    if texture is not None:
-        scene = scene.with_texture(texture)
+    scene = _load_textured_scene(scene, texture)
     description = scene.description
     unbound_task = make_task(task)
-    # A model predicts one image at a time, also for a task that judges several.
-    model = load_model(model, task=unbound_task.single_image_task)
-    # a scene without a rig has one camera
-    model = replace(model, cameras=max(1, len(description.rig)))
+    model = _load_model_for_scene(model, unbound_task, description)
     check_judged_thing(description, judge)
-    model_task = unbound_task.on(model)
-    if judge == ALL_THINGS:
-        model_task = make_each_thing_task(model_task)
+    model_task = _bind_task_to_model(unbound_task, model, judge)
     instances = make_controls(controls)
     if around is not None:
         _check_azimuth_is_free(instances)
@@ -376,25 +369,72 @@ def render(
     )
     progress = as_progress(progress)
     progress.stage("rendering", around or 1)
+    scenes_of_views = _orbit_scene(description, around)
+    rendered_views = _render_each_view(
+        scenes_of_views, model, model_task, settings, progress
+    )
+    return _make_rendering(
+        rendered_views, description, model.name, unbound_task.name, spp
+    )
+
+
+def _load_textured_scene(scene: Scene | str | Path, texture: Texture | None) -> Scene:
+    """Return a scene, loaded if it is a name, with the texture if there is one."""
+    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    return scene if texture is None else scene.with_texture(texture)
+
+
+def _load_model_for_scene(
+    model: Model | nn.Module | str | Path, task: Task, description: SceneDescription
+) -> Model:
+    """Return the model of a task, with as many cameras as the scene has."""
+    # A model predicts one image at a time, also for a task that judges several.
+    loaded_model = load_model(model, task=task.single_image_task)
+    # a scene without a rig has one camera
+    return replace(loaded_model, cameras=max(1, len(description.rig)))
+
+
+def _bind_task_to_model(unbound_task: Task, model: Model, judge: str) -> Task:
+    """Return the task for a model; it judges each thing if `judge` is "all"."""
+    task_on_model = unbound_task.on(model)
+    if judge == ALL_THINGS:
+        return make_each_thing_task(task_on_model)
+    return task_on_model
+
+
+def _render_each_view(
+    scenes_of_views: Iterable[SceneDescription],
+    model: Model,
+    task: Task,
+    settings: _ViewSettings,
+    progress: Progress,
+) -> list[_RenderedView]:
+    """Render a view of each scene, and count them as progress."""
     rendered_views = list[_RenderedView]()
-    for view_description in _orbit_scene(description, around):
-        rendered_views.append(
-            _render_view(view_description, model, model_task, settings)
-        )
+    for view_description in scenes_of_views:
+        rendered_views.append(_render_view(view_description, model, task, settings))
         # what the task has learned of the model's predictions holds for the next view
-        model_task = rendered_views[-1].task
+        task = rendered_views[-1].task
         progress.advance(1)
+    return rendered_views
+
+
+def _make_rendering(
+    rendered_views: Sequence[_RenderedView],
+    description: SceneDescription,
+    model_name: str,
+    task_name: str,
+    spp: int,
+) -> Rendering:
+    """Return the rendering of a scene from its views, with all their warnings."""
     # formation and space are the same for all views, exposure included
-    formation = rendered_views[-1].formation
     space = rendered_views[-1].space
+    environment_spec = space.environment_name or description.environment_spec
     return Rendering(
-        scene=replace(
-            description,
-            environment_spec=space.environment_name or description.environment_spec,
-        ),
-        model=model.name,
-        task=unbound_task.name,
-        formation=formation,
+        scene=replace(description, environment_spec=environment_spec),
+        model=model_name,
+        task=task_name,
+        formation=rendered_views[-1].formation,
         spp=spp,
         views=tuple(rendered.view for rendered in rendered_views),
         warnings=(
@@ -453,7 +493,39 @@ def _render_view(
     """
     description = fit_camera(description, settings.size)
     space = compose_space(settings.controls, description)
-    renderer = make_renderer(
+    renderer = _make_view_renderer(description, space, settings)
+    u = _choose_configuration(space, settings.at)
+    make_facts_of_view = partial(
+        _make_view_facts, description, space, renderer, u, settings
+    )
+    with torch.no_grad():
+        radiance, image = _render_image(renderer, u, settings)
+        output = model(image)
+        # None and a message if the truth cannot be found
+        truth, truth_error = _find_truth(task, make_facts_of_view)
+        # From here on the predictions are read as the calibrated task does.
+        task = task.after_calibration(output, truth)
+        view = View(
+            azimuth=description.get_number("camera.azimuth"),
+            picture=image,
+            linear=radiance * renderer.formation.gain,
+            # [0]: the batch has one image
+            predictions=task.predictions(output, MAX_PREDICTIONS)[0],
+            marks=() if truth is None else tuple(task.marks(output, truth)[0]),
+            output=output,
+            truth=truth,
+        )
+    surfaces = renderer.find_surfaces(u) if settings.with_surfaces else None
+    things = find_visible_things(renderer, u)
+    view = replace(view, surfaces=surfaces, things=things)
+    return _RenderedView(view, task, space, renderer.formation, truth_error)
+
+
+def _make_view_renderer(
+    description: SceneDescription, space: Space, settings: _ViewSettings
+) -> Renderer:
+    """Return the renderer of a view, with the denoiser, sampler and seed of all."""
+    return make_renderer(
         description,
         space,
         settings.size,
@@ -461,33 +533,6 @@ def _render_view(
         settings.seed,
         sampler=settings.sampler,
     )
-    u = _choose_configuration(space, settings.at)
-    with torch.no_grad():
-        radiance, image = _render_image(renderer, u, settings)
-        output = model(image)
-        truth = None
-        truth_error = ""
-        if task.varies:
-            facts = _make_view_facts(description, space, renderer, u, settings)
-            # None and a message if the truth cannot be found
-            truth, truth_error = _find_truth(task, facts)
-        # From here on the predictions are read as the calibrated task does.
-        task = task.after_calibration(output, truth)
-        # [0]: the batch has one image
-        predictions = task.predictions(output, MAX_PREDICTIONS)[0]
-        marks = () if truth is None else tuple(task.marks(output, truth)[0])
-    view = View(
-        azimuth=description.get_number("camera.azimuth"),
-        picture=image,
-        linear=radiance * renderer.formation.gain,
-        predictions=predictions,
-        marks=marks,
-        surfaces=renderer.find_surfaces(u) if settings.with_surfaces else None,
-        output=output,
-        truth=truth,
-        things=find_visible_things(renderer, u),
-    )
-    return _RenderedView(view, task, space, renderer.formation, truth_error)
 
 
 def _render_image(
@@ -502,8 +547,14 @@ def _render_image(
     return radiance, round_to_8_bit(image)
 
 
-def _find_truth(task: Task, facts: Facts) -> tuple[Any, str]:
-    """Return the truth by the facts, or None and why the task can't derive it."""
+def _find_truth(task: Task, make_facts_of_view: Callable[[], Facts]) -> tuple[Any, str]:
+    """Return the truth by the facts, or None and why the task can't derive it.
+
+    A truth that does not depend on the configuration is None, without a reason.
+    """
+    if not task.varies:
+        return None, ""
+    facts = make_facts_of_view()
     try:
         return task.truth(facts), ""
     except InputError as error:
@@ -545,17 +596,28 @@ def _make_view_facts(
         renderer, u, n_rig_cameras=len(description.rig)
     )
     facts, *camera_facts = [
-        make_facts(
-            description,
-            name=description.object_name,
-            label=settings.label,
-            describe=partial(space.describe, u),
-            render_surfaces=render_surfaces,
-            judge=settings.judge,
-        )
+        _make_camera_facts(description, space, u, settings, render_surfaces)
         for render_surfaces in render_functions
     ]
     return replace(facts, facts_of_views=tuple(camera_facts))
+
+
+def _make_camera_facts(
+    description: SceneDescription,
+    space: Space,
+    u: Tensor,
+    settings: _ViewSettings,
+    render_surfaces: Callable[[], Surfaces],
+) -> Facts:
+    """Return the facts of a configuration u (d,) as a single camera sees them."""
+    return make_facts(
+        description,
+        name=description.object_name,
+        label=settings.label,
+        describe=partial(space.describe, u),
+        render_surfaces=render_surfaces,
+        judge=settings.judge,
+    )
 
 
 def check_judged_thing(description: SceneDescription, judge: str) -> None:
@@ -637,37 +699,72 @@ def make_facts(
         UnknownNameError: no thing has the name `judge`.
     """
     check_judged_thing(description, judge)
-    # rendered at most once, even if the facts of several things need it
-    cached_render = None if render_surfaces is None else cache(render_surfaces)
-    collect_numbers = partial(_collect_numbers, description, describe)
-    # The stated label belongs to one thing. All others have their own labels.
-    labelled_mesh = OBJECT if judge == ALL_THINGS else judge
-
-    def make_thing_facts(mesh: str) -> Facts:
-        """Return the facts of a single thing by its mesh, the object or another one."""
-        # without a stated label (None), the own label of the thing is right
-        stated_label = label if mesh == labelled_mesh else None
-        # a function, so that a task that does not need it does not render
-        look = None
-        if cached_render is not None:
-            # The unit of length of the scene is the size of the object, for all things.
-            metres = description.object.size_in_metres
-            look = partial(_look_at, cached_render, mesh, metres=metres)
-        # The object has the name that the caller states. Another thing has the name of
-        # its mesh.
-        if mesh == OBJECT:
-            own_label = description.object.label
-            return Facts(name, stated_label, own_label, collect_numbers, look)
-        own_label = description.things[mesh].label
-        return Facts(mesh, stated_label, own_label, collect_numbers, look)
-
+    facts_maker = _FactsMaker(
+        description=description,
+        object_name=name,
+        label=label,
+        # The stated label belongs to one thing. All others have their own labels.
+        labelled_mesh=OBJECT if judge == ALL_THINGS else judge,
+        collect_numbers=partial(_collect_numbers, description, describe),
+        # rendered at most once, even if the facts of several things need it
+        cached_render=None if render_surfaces is None else cache(render_surfaces),
+    )
     # each with the facts of all others
     facts_by_mesh = _add_others(
-        {mesh: make_thing_facts(mesh) for mesh in (OBJECT, *description.things)}
+        {mesh: facts_maker.make(mesh) for mesh in (OBJECT, *description.things)}
     )
     if judge == ALL_THINGS:
         return replace(facts_by_mesh[OBJECT], facts_of_thing=facts_by_mesh)
     return facts_by_mesh[judge]
+
+
+@dataclass(frozen=True, eq=False)
+class _FactsMaker:
+    """Makes the facts of single things of a scene.
+
+    Attributes:
+        description: the scene.
+        object_name: name of the object.
+        label: right label of one thing; None for its own label.
+        labelled_mesh: mesh of that thing.
+        collect_numbers: returns the parameters of a configuration that are numbers.
+        cached_render: renders what the camera sees, once; None if it is not needed.
+    """
+
+    description: SceneDescription
+    object_name: str
+    label: str | None
+    labelled_mesh: str
+    collect_numbers: Callable[[], dict[str, float]]
+    cached_render: Callable[[], Surfaces] | None
+
+    def make(self, mesh: str) -> Facts:
+        """Return the facts of a single thing by its mesh, the object or another one."""
+        # without a stated label (None), the own label of the thing is right
+        stated_label = self.label if mesh == self.labelled_mesh else None
+        look = self._make_look(mesh)
+        # The object has the name that the caller states. Another thing has the name of
+        # its mesh.
+        if mesh == OBJECT:
+            default_label = self.description.object.label
+            thing_name = self.object_name
+        else:
+            default_label = self.description.things[mesh].label
+            thing_name = mesh
+        return Facts(
+            thing_name, stated_label, default_label, self.collect_numbers, look
+        )
+
+    def _make_look(self, mesh: str) -> Callable[[], Sight] | None:
+        """Return a function that renders how the camera sees a thing by its mesh.
+
+        It is a function, so that a task that does not need it does not render.
+        """
+        if self.cached_render is None:
+            return None
+        # The unit of length of the scene is the size of the object, for all things.
+        metres = self.description.object.size_in_metres
+        return partial(_look_at, self.cached_render, mesh, metres=metres)
 
 
 def _collect_numbers(
@@ -742,30 +839,37 @@ def find_visible_things(renderer: Renderer, u: Tensor) -> JsonObject | None:
     labels = {name: description.meshes[name].label for name in names}
     # Every thing gets the entry of a thing that the image does not show. The loop below
     # replaces the entries of those that it does show.
-    things: JsonObject = {
-        name: {
-            "label": labels[name],
-            "box": None,
-            "pixels": 0,
-            "share": 0.0,
-            "truncated": None,
-            "distance": None,
-        }
-        for name in names
-    }
+    things: JsonObject = {name: _make_hidden_entry(labels[name]) for name in names}
     for thing in find_visible_meshes(renderer, u, names):
-        visible_fraction = thing.visible_fraction
-        if visible_fraction is not None:  # it is None if it is not known
-            visible_fraction = round(visible_fraction, 4)
-        things[thing.name] = {
-            "label": labels[thing.name],
-            "box": [*thing.box],
-            "pixels": int(thing.mask.sum()),
-            "share": visible_fraction,
-            "truncated": thing.is_truncated,
-            "distance": round(thing.distance, 3),
-        }
+        things[thing.name] = _make_visible_entry(thing, labels[thing.name])
     return things
+
+
+def _make_hidden_entry(label: str | None) -> JsonObject:
+    """Return the entry of a thing that an image does not show."""
+    return {
+        "label": label,
+        "box": None,
+        "pixels": 0,
+        "share": 0.0,
+        "truncated": None,
+        "distance": None,
+    }
+
+
+def _make_visible_entry(thing: VisibleMesh, label: str | None) -> JsonObject:
+    """Return the entry of a thing that an image shows; its distance is rounded."""
+    visible_fraction = thing.visible_fraction
+    if visible_fraction is not None:  # it is None if it is not known
+        visible_fraction = round(visible_fraction, 4)
+    return {
+        "label": label,
+        "box": [*thing.box],
+        "pixels": int(thing.mask.sum()),
+        "share": visible_fraction,
+        "truncated": thing.is_truncated,
+        "distance": round(thing.distance, 3),
+    }
 
 
 def check_image_path(path: str | Path, n_views: int) -> Path:
@@ -779,7 +883,15 @@ def check_image_path(path: str | Path, n_views: int) -> Path:
         InputError: another suffix, an .exr of several views, or a directory.
     """
     file = Path(path)
-    suffix = file.suffix.lower()
+    _check_image_suffix(path, n_views)
+    if file.is_dir():
+        raise InputError(f"out: expected the name of a file, got the folder {file}")
+    return file
+
+
+def _check_image_suffix(path: str | Path, n_views: int) -> None:
+    """Check that a path ends in .png, or in .exr for an image of a single view."""
+    suffix = Path(path).suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
         raise InputError(
             f"out: expected the path of a .png or .exr file, got {str(path)!r}"
@@ -789,9 +901,6 @@ def check_image_path(path: str | Path, n_views: int) -> Path:
             "out: a sheet of several views has text in it and is a .png; "
             "leave `around` out for an .exr"
         )
-    if file.is_dir():
-        raise InputError(f"out: expected the name of a file, got the folder {file}")
-    return file
 
 
 def _orbit_scene(
@@ -809,12 +918,17 @@ def _orbit_scene(
     if around is None:
         yield description
         return
+    _check_camera_orbits(description)
+    first_azimuth = description.get_number("camera.azimuth")
+    for index in range(around):
+        azimuth = (first_azimuth + 360.0 * index / around) % 360.0
+        yield description.with_values(camera__azimuth=azimuth)
+
+
+def _check_camera_orbits(description: SceneDescription) -> None:
+    """Raise InputError if the camera does not orbit the object, which `around` needs."""
     if description.camera != ORBIT_CAMERA:
         raise InputError(
             "around: turns the camera that circles the object, and `camera` "
             f"{description.camera} is fixed; leave one of the two out"
         )
-    first_azimuth = description.get_number("camera.azimuth")
-    for index in range(around):
-        azimuth = (first_azimuth + 360.0 * index / around) % 360.0
-        yield description.with_values(camera__azimuth=azimuth)

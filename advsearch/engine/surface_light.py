@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -84,6 +85,17 @@ def find_surface_light_refusal(
     moves_camera = bool(changed_inputs & CAMERA_INPUTS)
     if not moves_camera:
         return NO_CAMERA
+    return (
+        _find_search_refusal(problem, steps, policy)
+        or _find_forced_refusal(problem)
+        or surface_renderer.find_refusal(problem.renderer, names)
+    )
+
+
+def _find_search_refusal(
+    problem: Problem, steps: int, policy: Policy[Any]
+) -> Refusal | None:
+    """Return why a search is too short, or needs rendered images; None if it does not."""
     n_images = steps * problem.conditions_per_evaluation
     if n_images < MIN_IMAGES:
         return Refusal(
@@ -92,13 +104,18 @@ def find_surface_light_refusal(
         )
     if policy.takes_differences(problem.domain, steps):
         return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
+    return None
+
+
+def _find_forced_refusal(problem: Problem) -> Refusal | None:
+    """Return a refusal if the user forces an estimator of rendered images, else None."""
     for group in problem.gradient_plan.groups:
         # The user may force an estimator of derivatives of rendered images. Derivatives
         # of predicted images are computed in another way.
         needs_estimator = group.estimator not in ("none", "image")
         if group.is_forced and needs_estimator:
             return Refusal(f"the estimator of {group.name} is forced")
-    return surface_renderer.find_refusal(problem.renderer, names)
+    return None
 
 
 @dataclass
@@ -145,15 +162,9 @@ class SurfaceLight(PredictedSearch):
         Sets the private attributes that the class docstring lists.
         """
         problem = self.problem
-        space = problem.space
         # number of searched coordinates
         n_searched = problem.domain.dim
-        self._inputs_of_control = {
-            control.name: surface_renderer.find_changed_inputs(
-                problem.renderer, [control.name]
-            )
-            for control in space.controls
-        }
+        self._inputs_of_control = self._find_inputs_of_controls()
         self._is_moving = self._find_moving_coordinates()
         self._has_moving = bool(self._is_moving.any())
         is_coloring = self._find_coordinates(frozenset({COLOR_INPUT}))[:n_searched]
@@ -162,6 +173,14 @@ class SurfaceLight(PredictedSearch):
         self._input_space = self._select_input_space()
         # coordinates of the conditions only, which follow the searched ones
         self._needs_new_light = self._find_coordinates_of_light()[n_searched:]
+
+    def _find_inputs_of_controls(self) -> dict[str, frozenset[str]]:
+        """Return the scene inputs that each control changes, by its name."""
+        renderer = self.problem.renderer
+        return {
+            control.name: surface_renderer.find_changed_inputs(renderer, [control.name])
+            for control in self.problem.space.controls
+        }
 
     def _find_moving_coordinates(self) -> Tensor:
         """Return which searched coordinates move something, (d,) bool.
@@ -292,23 +311,26 @@ class SurfaceLight(PredictedSearch):
         with self.measure_seconds(), torch.no_grad():
             # Without a seed, the conditions leave the scene unchanged.
             full_u = problem.make_full_configuration(u)
-            self._renderer = SurfaceRenderer(
-                problem.renderer,
-                full_u,
-                seeds.derive_seed(problem.seed, "surface light"),
-            )
+            light_seed = seeds.derive_seed(problem.seed, "surface light")
+            self._renderer = SurfaceRenderer(problem.renderer, full_u, light_seed)
             self._bank_conditions = self._sample_bank_conditions()
-            for condition in self._bank_conditions:
-                inputs = self._compute_inputs(torch.cat([u, condition]))
-                # only called to compute and store the light
-                self._renderer.get_light_and_factor(inputs)
-                # `N_LIGHTS` is the length of the progress bar (`n_samples`), also if
-                # there is a single condition
-                tick(N_LIGHTS // len(self._bank_conditions))
+            self._store_lights(self._renderer, u, tick)
             # The renderer drops stored lights if they do not fit into memory.
             n_stored = len(self._renderer.stored_lights)
             self._n_lights = n_stored + self._renderer.n_dropped
         self._compare(u, index=0)
+
+    def _store_lights(
+        self, renderer: SurfaceRenderer, u: Tensor, tick: ProgressCallback
+    ) -> None:
+        """Compute and store the light of u (d,) under each condition of the bank."""
+        for condition in self._bank_conditions:
+            inputs = self._compute_inputs(torch.cat([u, condition]))
+            # only called to compute and store the light
+            renderer.get_light_and_factor(inputs)
+            # `N_LIGHTS` is the length of the progress bar (`n_samples`), also if there
+            # is a single condition
+            tick(N_LIGHTS // len(self._bank_conditions))
 
     def _sample_bank_conditions(self) -> list[Tensor]:
         """Return the conditions (k,) of the bank, each of which gets its light.
@@ -360,11 +382,17 @@ class SurfaceLight(PredictedSearch):
                 return
             if can_batch and position not in predicted_images:
                 batch = queries[position : position + self.renderer.batch_size]
-                images = self.renderer.predict_images([batched.u for batched in batch])
-                predicted_images = dict(enumerate(images, start=position))
+                predicted_images = self._predict_batch(batch, first_position=position)
             # None without batches: then `evaluate` predicts the image
             image = predicted_images.get(position)
             yield self.evaluate(query, image)
+
+    def _predict_batch(
+        self, batch: Sequence[Query], first_position: int
+    ) -> dict[int, Tensor]:
+        """Return the predicted image (H, W, 3) of each query of a batch, by position."""
+        images = self.renderer.predict_images([query.u for query in batch])
+        return dict(enumerate(images, start=first_position))
 
     def _must_trace(self, query: Query) -> bool:
         """Return whether a query has to be rendered.
@@ -443,33 +471,57 @@ class SurfaceLight(PredictedSearch):
         An image that the query requests shows the scene without random conditions.
         """
         problem = self.problem
-        set_index = query.row_index
-        reuses_conditions = self._reuses_conditions(query.kind)
-        if reuses_conditions:
-            set_index = query.row_index % N_CONDITION_SETS
         conditions = self._choose_conditions(
-            query.kind, set_index, problem.conditions_per_evaluation
+            query.kind,
+            self._find_set_index(query),
+            problem.conditions_per_evaluation,
         )
         full_configurations = [
             torch.cat([query.u, condition]) for condition in conditions
         ]
-
-        def predict(batch: slice, u: Tensor) -> Tensor:
-            # the key under which the views of this batch of conditions are stored
-            key = (set_index, batch.start) if reuses_conditions else None
-            return self._predict_images(full_configurations[batch], u, key)
-
+        predict = partial(self._predict_slice, query, full_configurations)
         evaluation = problem.evaluate_conditions(
             predict, full_configurations, query.u, query.gradient, BATCH_SIZE
         )
         evaluation = replace(evaluation, cost=query.samples, predicted=RAYS_PER_PIXEL)
         if not query.includes_image:
             return evaluation
+        return replace(evaluation, picture=self._predict_clean_image(query.u))
+
+    def _find_set_index(self, query: Query) -> int:
+        """Return the index of the set of conditions under which a query is evaluated."""
+        if self._reuses_conditions(query.kind):
+            return query.row_index % N_CONDITION_SETS
+        return query.row_index
+
+    def _predict_slice(
+        self,
+        query: Query,
+        full_configurations: Sequence[Tensor],
+        batch: slice,
+        u: Tensor,
+    ) -> Tensor:
+        """Return predicted images (n, H, W, 3) of a slice of full configurations.
+
+        Args:
+            query: the query, on which it depends if views of the cameras are stored.
+            full_configurations: all full configurations.
+            batch: the slice.
+            u: (d,) the searched coordinates, perhaps with a gradient.
+        """
+        key: tuple[int, int] | None = None
+        if self._reuses_conditions(query.kind):
+            # the key under which the views of this batch of conditions are stored
+            key = (self._find_set_index(query), batch.start)
+        return self._predict_images(full_configurations[batch], u, key)
+
+    def _predict_clean_image(self, u: Tensor) -> Tensor:
+        """Return the predicted image (H, W, 3) of u (d,), without random conditions."""
         with torch.no_grad():
             # Without a seed, the conditions leave the scene unchanged.
-            clean_full_u = problem.make_full_configuration(query.u)
-            images = self._predict_images([clean_full_u], query.u)
-            return replace(evaluation, picture=round_to_8_bit(images[0]))
+            clean_full_u = self.problem.make_full_configuration(u)
+            images = self._predict_images([clean_full_u], u)
+            return round_to_8_bit(images[0])
 
     def _reuses_conditions(self, kind: str) -> bool:
         """Return whether a search uses a few sets of conditions in turn.
@@ -495,21 +547,18 @@ class SurfaceLight(PredictedSearch):
         if problem.conditions is None:
             # the bank has a single condition without coordinates, which is repeated
             return self._bank_conditions * count
-        generator = torch.Generator().manual_seed(
-            seeds.derive_seed(problem.seed, f"surface {kind}", number)
-        )
+        condition_seed = seeds.derive_seed(problem.seed, f"surface {kind}", number)
+        generator = torch.Generator().manual_seed(condition_seed)
         n_lights = len(self._bank_conditions)
         positions = torch.randint(n_lights, (count,), generator=generator).tolist()
         new_conditions = problem.conditions.sample(generator, count)
-        conditions = []
-        for position, new_condition in zip(positions, new_conditions, strict=True):
-            stored_condition = self._bank_conditions[position]
-            # both are (k,), as `_needs_new_light` is
-            condition = torch.where(
-                self._needs_new_light, stored_condition, new_condition
+        # all are (k,), as `_needs_new_light` is
+        return [
+            torch.where(
+                self._needs_new_light, self._bank_conditions[position], new_condition
             )
-            conditions.append(condition)
-        return conditions
+            for position, new_condition in zip(positions, new_conditions, strict=True)
+        ]
 
     def _compute_inputs(self, full_u: Tensor) -> dict[str, Tensor]:
         """Return the scene inputs of a full configuration.
@@ -549,17 +598,21 @@ class SurfaceLight(PredictedSearch):
             torch.cat([u, full_u[len(u) :]]) for full_u in full_configurations
         ]
         inputs = [self._compute_inputs(full_u) for full_u in full_configurations]
-        views: Iterable[LitCameraView]
-        if key is None:
-            # an iterator, so that only one view at a time is in memory
-            views = self.renderer.trace_views(inputs)
-        else:
-            if key not in self._stored_views:
-                self._stored_views[key] = list(self.renderer.trace_views(inputs))
-            views = self._stored_views[key]
+        views = self._find_views(inputs, key)
         return self.renderer.compose_images(
             views, inputs, color, variable_configurations
         )
+
+    def _find_views(
+        self, inputs: Sequence[dict[str, Tensor]], key: tuple[int, int] | None
+    ) -> Iterable[LitCameraView]:
+        """Return the views of the cameras, traced or stored under a key."""
+        if key is None:
+            # an iterator, so that only one view at a time is in memory
+            return self.renderer.trace_views(inputs)
+        if key not in self._stored_views:
+            self._stored_views[key] = list(self.renderer.trace_views(inputs))
+        return self._stored_views[key]
 
     def replay(self, query: Query) -> None:
         """Bring the predictor to its state at a query: compare it if that is due.
@@ -576,13 +629,7 @@ class SurfaceLight(PredictedSearch):
         Args:
             query: the query that is evaluated next.
         """
-        # Other kinds, such as "baseline", and the ranking take the predictor as the
-        # search has left it.
-        is_of_search = query.kind == "search" and query.phase == "search"
-        predictions_failed = self.tracing_reason is not None
-        next_comparison = self._next_comparison or COMPARISON_INTERVAL
-        is_due = query.row_index >= next_comparison
-        if not is_of_search or predictions_failed or not is_due:
+        if not self._is_comparison_due(query):
             return
         # the comparison before, whose deviation is the latest so far
         was_accurate = self.deviations[-1].is_accepted
@@ -598,12 +645,27 @@ class SurfaceLight(PredictedSearch):
         if not was_accurate:
             self.stop_predicting("search", query.row_index)
         elif self._searches_colors:
-            with self.measure_seconds():
-                self.renderer.update_base_color(
-                    self.problem.make_full_configuration(query.u)
-                )
-            assert self.n_renewals is not None  # None only for a `Bank`
-            self.n_renewals += 1
+            self._renew_light(query.u)
+
+    def _is_comparison_due(self, query: Query) -> bool:
+        """Return whether predictions have to be compared before a query.
+
+        Other kinds than "search", such as "baseline", and the ranking take the
+        predictor as the search has left it.
+        """
+        is_of_search = query.kind == "search" and query.phase == "search"
+        predictions_failed = self.tracing_reason is not None
+        next_comparison = self._next_comparison or COMPARISON_INTERVAL
+        is_due = query.row_index >= next_comparison
+        return is_of_search and not predictions_failed and is_due
+
+    def _renew_light(self, u: Tensor) -> None:
+        """Compute the light again for the base colors of u (d,)."""
+        with self.measure_seconds():
+            full_u = self.problem.make_full_configuration(u)
+            self.renderer.update_base_color(full_u)
+        assert self.n_renewals is not None  # None only for a `Bank`
+        self.n_renewals += 1
 
     def _compare(self, u: Tensor, index: int) -> Deviation:
         """Compare predicted images with traced ones, and store the deviation.
@@ -620,32 +682,38 @@ class SurfaceLight(PredictedSearch):
         kind = "surface check"
         seed = seeds.derive_seed(problem.seed, kind, index)
         with self.measure_seconds():
-            generator = torch.Generator().manual_seed(seed)
-            random_configurations = problem.domain.sample(generator, N_VIEWS)
-            # (N_VIEWS, d): random in the moving coordinates, else u
-            configurations = torch.where(self._is_moving, random_configurations, u)
-            configurations[0] = u  # the first view is that of u itself
+            configurations = self._sample_compared_configurations(u, seed)
             conditions = self._choose_conditions(kind, index, N_VIEWS)
             full_configurations = [
                 torch.cat([view_u, condition])
                 for view_u, condition in zip(configurations, conditions, strict=True)
             ]
-            # The allowed error of the margin grows with the change that the search has
-            # made (`Problem.compare_view`). Random coordinates are no such change. If
-            # no colors are searched, all coordinates move something, and count as
-            # random.
-            is_random = self._is_moving
-            if not self._searches_colors:
-                is_random = torch.ones_like(self._is_moving)
-
-        def compare_view(number: int) -> ComparedView:
-            """Compare the predicted image of a view with traced ones."""
-            return problem.compare_view(
-                self.renderer,
-                full_configurations[number],
-                seeds.derive_seed(seed, "view", number),
-                problem.search_spp,
-                is_random=is_random,
-            )
-
+        compare_view = partial(self._compare_surface_view, full_configurations, seed)
         return self.compare(compare_view)
+
+    def _sample_compared_configurations(self, u: Tensor, seed: int) -> Tensor:
+        """Return the searched coordinates (N_VIEWS, d) of the views of a comparison."""
+        generator = torch.Generator().manual_seed(seed)
+        random_configurations = self.problem.domain.sample(generator, N_VIEWS)
+        # random in the moving coordinates, else u
+        configurations = torch.where(self._is_moving, random_configurations, u)
+        configurations[0] = u  # the first view is that of u itself
+        return configurations
+
+    def _compare_surface_view(
+        self, full_configurations: Sequence[Tensor], seed: int, number: int
+    ) -> ComparedView:
+        """Compare the predicted image of a view, by its number, with traced ones."""
+        # The allowed error of the margin grows with the change that the search has made
+        # (`Problem.compare_view`). Random coordinates are no such change. If no colors
+        # are searched, all coordinates move something, and count as random.
+        is_random = self._is_moving
+        if not self._searches_colors:
+            is_random = torch.ones_like(self._is_moving)
+        return self.problem.compare_view(
+            self.renderer,
+            full_configurations[number],
+            seeds.derive_seed(seed, "view", number),
+            self.problem.search_spp,
+            is_random=is_random,
+        )

@@ -89,12 +89,7 @@ def find_matrix_refusal(
         return Refusal(
             f"a matrix pays from {MIN_STEPS} evaluations on", RefusalCause.TOO_FEW_STEPS
         )
-    condition_names = []
-    if problem.conditions is not None:
-        # the controls that vary by chance come after the searched ones
-        conditions = problem.space.controls[problem.n_searched :]
-        condition_names = [control.name for control in conditions]
-    refusal = find_refusal(problem.renderer, condition_names)
+    refusal = find_refusal(problem.renderer, _list_condition_names(problem))
     if refusal is not None:
         return refusal
     # If lights are searched, an image of each light (basis image) takes the place of a
@@ -102,6 +97,20 @@ def find_matrix_refusal(
     # and they pay if any number of steps may follow.
     if problem.conditions is not None or steps is None:
         return None
+    return _find_basis_refusal(problem, steps)
+
+
+def _list_condition_names(problem: Problem) -> list[str]:
+    """List the names of the controls that vary by chance."""
+    if problem.conditions is None:
+        return []
+    # the controls that vary by chance come after the searched ones
+    conditions = problem.space.controls[problem.n_searched :]
+    return [control.name for control in conditions]
+
+
+def _find_basis_refusal(problem: Problem, steps: int) -> Refusal | None:
+    """Return a refusal if basis images do not pay; None if they do."""
     # an image is rendered for each light before the first prediction
     min_steps = MIN_STEPS_PER_LIGHT * count_lights(problem.renderer)
     if steps < min_steps:
@@ -373,24 +382,26 @@ class Transport(PredictedSearch):
             tick: called with samples per pixel as they are traced.
         """
         if not self._is_prepared:
-            with self.measure_seconds():
-                windowing = find_window(self.problem)
-            # It may be a `Refusal`: there is no window, and full images are predicted.
-            if isinstance(windowing, Windowing):
-                self.window = windowing.window
-                self._full_images["start"] = windowing.start_image
-                self.n_traced += N_WINDOW_IMAGES  # those of `find_window`
+            self._set_window()
             self._is_prepared = True
         # `clean_matrix` has predictors by window (None for full images). It may be
         # shared with another search, which has computed this one.
         if self.window not in self.clean_matrix.predictors:
+            # number 0: it belongs to no query
             predictor = self._make_predictor(
-                self.problem.domain.start,
-                "start",
-                number=0,  # it belongs to no query
-                tick=tick,
+                self.problem.domain.start, "start", number=0, tick=tick
             )
             self.clean_matrix.predictors[self.window] = predictor
+
+    def _set_window(self) -> None:
+        """Choose the window; without one, full images are predicted."""
+        with self.measure_seconds():
+            windowing = find_window(self.problem)
+        # it may be a `Refusal`: there is no window
+        if isinstance(windowing, Windowing):
+            self.window = windowing.window
+            self._full_images["start"] = windowing.start_image
+            self.n_traced += N_WINDOW_IMAGES  # those of `find_window`
 
     @property
     def clean_predictor(self) -> Predictor:
@@ -481,24 +492,41 @@ class Transport(PredictedSearch):
         # predictor does not get old.
         if not is_due or not kind.startswith("search"):
             return predictor
+        return self._compare_and_replace(predictor, query)
+
+    def _compare_and_replace(
+        self, predictor: Predictor, query: Query
+    ) -> Predictor | None:
+        """Compare a predictor with traced images, and replace it if it is inaccurate.
+
+        Returns:
+            The predictor to use; None if images are traced from now on.
+        """
+        kind = query.kind
         deviation = self._compare_predictor(predictor, query)
         # Also compared if the predictor is rejected, since the next one needs the full
         # image.
         has_same_surroundings, full_image = self._compare_surroundings(kind, query.u)
         if deviation.is_accepted and has_same_surroundings:
             return predictor
-        # Basis images of lights do not depend on u, so that computing them again would
-        # change nothing. They are no matrix, and so have 0 entries.
-        has_basis_images = self.clean_predictor.n_entries == 0
-        if has_basis_images:
-            self.stop_predicting(kind, number, f" of the {kind}")
+        if self._has_basis_images:
+            self.stop_predicting(kind, query.row_index, f" of the {kind}")
             return None
-        self._current[kind] = self._make_predictor(query.u, kind, number)
+        self._current[kind] = self._make_predictor(query.u, kind, query.row_index)
         if full_image is not None:
             self._full_images[kind] = full_image
         assert self.n_renewals is not None  # None only for a `Bank`
         self.n_renewals += 1
         return self._current[kind]
+
+    @property
+    def _has_basis_images(self) -> bool:
+        """Whether images of each light are weighted, in place of a matrix.
+
+        They do not depend on u, so that computing them again would change nothing. They
+        are no matrix, and so have 0 entries.
+        """
+        return self.clean_predictor.n_entries == 0
 
     def _compare_predictor(self, predictor: Predictor, query: Query) -> Deviation:
         """Compare a predictor with traced images of a query's configuration.

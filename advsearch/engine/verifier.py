@@ -32,6 +32,7 @@ from advsearch.attacks.trials import (
     LADDER,
     N_CONDITIONS,
     OVER_LADDER,
+    MarginsOf,
     SampleCount,
     choose_rate_spp,
     count_max_samples,
@@ -136,18 +137,22 @@ class Verifier:
             queries = [replace(query, has_success=False) for query in queries]
         evaluations = self.journal.evaluate_all(queries, evaluate)
         for query, evaluation in zip(queries, evaluations, strict=True):
-            trial = (query.kind, query.row_index)
-            if evaluation.picture is not None:
-                self.run_state.trial_images[trial] = evaluation.picture
-            if evaluation.predicted:
-                self.run_state.n_predicted_trials += 1
-            else:
-                self._rendered.add(trial)  # a set, in which each trial counts once
-            self.run_state.verification_renders = len(self._rendered)
+            self._record_trial(query, evaluation)
             steps = query.spp if in_samples else 1
             worker_stats = self.journal.evaluator.progress_stats
             self.progress_stages.progress.advance(steps, **worker_stats)
             yield evaluation
+
+    def _record_trial(self, query: Query, evaluation: Evaluation) -> None:
+        """Store the image of a trial, if it has one, and count its render."""
+        trial = (query.kind, query.row_index)
+        if evaluation.picture is not None:
+            self.run_state.trial_images[trial] = evaluation.picture
+        if evaluation.predicted:
+            self.run_state.n_predicted_trials += 1
+        else:
+            self._rendered.add(trial)  # a set, in which each trial counts once
+        self.run_state.verification_renders = len(self._rendered)
 
     def choose_spp(
         self, candidates: dict[str, Tensor], search_samples: int | None = None
@@ -164,39 +169,56 @@ class Verifier:
                 conditions vary, the verification may not take more. None for no limit.
         """
         has_conditions = self.problem.conditions is not None
-        # sample counts to choose from, ascending
-        ladder = self.spp_ladder
-        is_set_by_user = len(ladder) == 1
-        n_trials_of_first_look = self.look_sizes[0]
-        # `max_samples` is for the progress bar: samples per pixel of all renders, if
-        # every sample count of the ladder is tried.
-        if has_conditions:
-            choose: Callable[..., SampleCount] = choose_rate_spp
-            if not is_set_by_user:
-                ladder = self._list_affordable_counts(len(candidates), search_samples)
-            max_samples = N_CONDITIONS * len(candidates) * sum(ladder)
-        else:
-            choose = partial(choose_spp, trials=n_trials_of_first_look)
-            max_samples = count_max_samples(
-                len(candidates), ladder, n_trials_of_first_look
-            )
+        choose: Callable[..., SampleCount] = choose_rate_spp
+        if not has_conditions:
+            choose = partial(choose_spp, trials=self.look_sizes[0])
+        ladder = self._find_ladder(len(candidates), search_samples)
         # with a single sample count nothing is rendered
         if len(ladder) > 1:
-            self._begin_sample_count_stage(max_samples)
+            self._begin_sample_count_stage(
+                self._count_max_samples(len(candidates), ladder)
+            )
+        margins = self._make_margin_functions(candidates, has_conditions)
+        self.run_state.sample_count = choose(
+            margins, seed=self.problem.seed, ladder=ladder
+        )
+
+    def _count_max_samples(self, n_candidates: int, ladder: Sequence[int]) -> int:
+        """Return the samples per pixel of all renders that choose a sample count.
+
+        It is for the progress bar, as if every sample count of the ladder was tried.
+        """
+        if self.problem.conditions is not None:
+            return N_CONDITIONS * n_candidates * sum(ladder)
+        return count_max_samples(n_candidates, ladder, self.look_sizes[0])
+
+    def _find_ladder(
+        self, n_candidates: int, search_samples: int | None
+    ) -> Sequence[int]:
+        """Return the sample counts to choose from, ascending.
+
+        If conditions vary, they are limited, but a single count, set by the user, stays.
+        """
+        is_set_by_user = len(self.spp_ladder) == 1
+        if self.problem.conditions is None or is_set_by_user:
+            return self.spp_ladder
+        return self._list_affordable_counts(n_candidates, search_samples)
+
+    def _make_margin_functions(
+        self, candidates: Mapping[str, Tensor], draws_conditions: bool
+    ) -> dict[str, MarginsOf]:
+        """Return functions that measure margins of candidates (d,), by their name."""
         evaluate = partial(self.evaluate_all, in_samples=True)
-        margins = {
+        return {
             name: make_margin_function(
                 evaluate,
                 f"sample count {name}",
                 u,
                 n_images=MAX_STORED_IMAGES,
-                draws_conditions=has_conditions,
+                draws_conditions=draws_conditions,
             )
             for name, u in candidates.items()
         }
-        self.run_state.sample_count = choose(
-            margins, seed=self.problem.seed, ladder=ladder
-        )
 
     def _begin_sample_count_stage(self, max_samples: int) -> None:
         """Begin the stage of the progress in which the sample count is chosen.
@@ -325,28 +347,31 @@ class Verifier:
             has_success: whether rows state if the trial is a success.
             predictor: predicts images in place of renders; None to render all.
         """
-        problem = self.problem
-        queries = list[Query]()
-        for number, u in configurations.items():
-            seed = seeds.derive_seed(problem.seed, kind, number)
-            # The row of the trial states the values of the configuration, unless it has
-            # many: the texels of a texture would fill the store.
-            values: dict[str, Any] = {}
-            if problem.domain.dim <= MAX_DESCRIBED_COORDINATES:
-                # values may depend on the conditions, which follow from the seed
-                values = problem.describe(u, seed)
-            query = Query(
-                u,
-                seed,
-                kind,
-                number,
-                spp=self.run_state.spp,
-                values=values,
-                has_success=has_success,
-            )
-            queries.append(query)
+        queries = [
+            self._make_trial_query(kind, number, u, has_success=has_success)
+            for number, u in configurations.items()
+        ]
         for evaluation in self.evaluate_all(queries, predictor=predictor):
             yield evaluation.required_judgement
+
+    def _make_trial_query(
+        self, kind: str, number: int, u: Tensor, *, has_success: bool
+    ) -> Query:
+        """Return the query of a single trial of a configuration (d,).
+
+        The row of the trial states the values of the configuration, unless it has many:
+        the texels of a texture would fill the store.
+        """
+        problem = self.problem
+        seed = seeds.derive_seed(problem.seed, kind, number)
+        values: dict[str, Any] = {}
+        if problem.domain.dim <= MAX_DESCRIBED_COORDINATES:
+            # values may depend on the conditions, which follow from the seed
+            values = problem.describe(u, seed)
+        spp = self.run_state.spp
+        return Query(
+            u, seed, kind, number, spp=spp, values=values, has_success=has_success
+        )
 
     def try_in_batches(
         self,
@@ -366,9 +391,8 @@ class Verifier:
             has_success: whether rows state if the trial is a success.
             predictor: predicts images in place of renders; None to render all.
         """
-        for numbers in split_into_batches(
-            0, count, max_batch_size(self.problem.domain.dim)
-        ):
+        batch_size = max_batch_size(self.problem.domain.dim)
+        for numbers in split_into_batches(0, count, batch_size):
             configurations = {number: find_configuration(number) for number in numbers}
             yield from self.try_configurations(
                 kind, configurations, has_success=has_success, predictor=predictor
@@ -478,18 +502,7 @@ class Retrials:
         self._progress = progress
         self._n_trials = trials
         self._seed = seed
-        # All journals are copies of one, so that rows and notes are read from the store
-        # only once. Its own evaluator is replaced in all of them.
-        template_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
-        self._journals = {
-            condition.name: replace(
-                template_journal,
-                evaluator=ParallelEvaluator(
-                    condition.problem, executor, condition.name
-                ),
-            )
-            for condition in conditions
-        }
+        self._journals = _make_journals(conditions, run, executor)
         # clean trials by the name of their condition
         self._clean: dict[str, tuple[Judgement, ...]] = {}
         # Cached images and radiances. A key is (`image_key` or `radiance_key`, seed,
@@ -578,10 +591,7 @@ class Retrials:
             condition: condition of the trials.
             queries: the trials; each has another seed, and so another image.
         """
-        if kind != self._cached_kind:
-            self._images.clear()
-            self._radiances.clear()
-            self._cached_kind = kind
+        self._begin_kind(kind)
         # In the cache of one kind, a seed belongs to one configuration.
         keys = [(condition.image_key, query.seed, condition.spp) for query in queries]
         missing = [
@@ -592,17 +602,34 @@ class Retrials:
         # The loop below takes the next one for each missing image, in the same order.
         from_workers = self._render_on_workers(condition, missing)
         for query, key in zip(queries, keys, strict=True):
-            machine = None  # name of the worker's machine, if one rendered the image
+            # name of the worker's machine, if one rendered the image
+            machine: str | None = None
             if key not in self._images:
                 rendered = next(from_workers, None)
-                if rendered is None or rendered.picture is None:  # not by a worker
-                    self._images[key] = self._render(condition, query.u, query.seed)
-                else:
-                    self._images[key] = rendered.picture
-                    machine = rendered.machine
+                self._images[key], machine = self._find_image(
+                    condition, query, rendered
+                )
             # with the change of the image that belongs to the condition
             judgement = self._judge_changed(condition, self._images[key], query)
             yield Evaluation.from_judgement(judgement, machine=machine)
+
+    def _begin_kind(self, kind: str) -> None:
+        """Empty the caches if they have images and radiances of another kind."""
+        if kind != self._cached_kind:
+            self._images.clear()
+            self._radiances.clear()
+            self._cached_kind = kind
+
+    def _find_image(
+        self, condition: RetrialCondition, query: Query, rendered: Evaluation | None
+    ) -> tuple[Tensor, str | None]:
+        """Return the image (H, W, 3) of a trial, and the worker's machine.
+
+        It is rendered here, without a machine, if no worker has `rendered` it.
+        """
+        if rendered is None or rendered.picture is None:
+            return self._render(condition, query.u, query.seed), None
+        return rendered.picture, rendered.machine
 
     @staticmethod
     def _judge_changed(
@@ -649,15 +676,41 @@ class Retrials:
         is_radiance_shared = n_conditions >= 2
         if not is_radiance_shared:
             return problem.picture(u, seed, condition.spp)
-        renderer = problem.renderer
         full_u = problem.make_full_configuration(u, seed)
-        key = (condition.radiance_key, seed, condition.spp)
         with torch.no_grad():
-            if key not in self._radiances:
-                self._radiances[key] = renderer.radiance(full_u, seed, condition.spp)
+            radiance = self._find_shared_radiance(condition, full_u, seed)
             # the same two steps by which `problem.picture` forms an image
-            displayed = renderer.formation.map_to_display(self._radiances[key])
-            return round_to_8_bit(renderer.space.apply_to_image(full_u, displayed))
+            displayed = problem.renderer.formation.map_to_display(radiance)
+            image = problem.renderer.space.apply_to_image(full_u, displayed)
+            return round_to_8_bit(image)
+
+    def _find_shared_radiance(
+        self, condition: RetrialCondition, full_u: Tensor, seed: int
+    ) -> Tensor:
+        """Return the radiance (H, W, 3) of a full configuration, rendered only once."""
+        key = (condition.radiance_key, seed, condition.spp)
+        if key not in self._radiances:
+            renderer = condition.problem.renderer
+            self._radiances[key] = renderer.radiance(full_u, seed, condition.spp)
+        return self._radiances[key]
+
+
+def _make_journals(
+    conditions: Sequence[RetrialCondition],
+    run: RunDirectory,
+    executor: Workers | None,
+) -> dict[str, Journal]:
+    """Return a journal for each condition, by its name; all of them share one store.
+
+    All journals are copies of one, so that rows and notes are read from the store only
+    once. Its own evaluator is replaced in all of them.
+    """
+    template_journal = Journal(run, ParallelEvaluator(conditions[0].problem))
+    journals = {}
+    for condition in conditions:
+        evaluator = ParallelEvaluator(condition.problem, executor, condition.name)
+        journals[condition.name] = replace(template_journal, evaluator=evaluator)
+    return journals
 
 
 def read_stored_configuration(directory: Path, problem: Problem) -> torch.Tensor:

@@ -11,7 +11,7 @@ picture").
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,6 +29,7 @@ from advsearch.engine.acceptance import (
 from advsearch.engine.problem import Problem
 from advsearch.scene.assembly import IMAGE_INPUTS
 from advsearch.scene.predictor import NOISE, Refusal, RefusalCause
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.renderer import find_changed_inputs
 from advsearch.scene.transport.lights import HAZE, find_light_inputs
 from advsearch.scene.window import Window
@@ -98,7 +99,6 @@ def find_window(problem: Problem) -> Windowing | Refusal:
     refusal = find_crop_refusal(problem)
     if refusal is not None:
         return refusal
-    domain = problem.domain
     resolution = problem.renderer.formation.resolution
     max_area = MAX_AREA * resolution[0] * resolution[1]
     box = _find_box(problem)
@@ -106,11 +106,19 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         return Refusal("nothing of what is searched is in the picture")
     if box.grow(MARGINS[0], resolution).area > max_area:
         return Refusal("what is searched fills much of the picture")
-    # Bounds of the budget: all coordinates as small and as large as it allows. u is in
-    # [0, 1], and `project` moves it into the budget.
-    lower = domain.project(torch.zeros_like(domain.start))
-    upper = domain.project(torch.ones_like(domain.start))
-    start, *extremes = [render_full(problem, u) for u in (domain.start, lower, upper)]
+    return _grow_window(problem, box, max_area)
+
+
+def _grow_window(problem: Problem, box: Window, max_area: float) -> Windowing | Refusal:
+    """Return the smallest accepted window around a box, or why there is none.
+
+    Args:
+        problem: problem of the search.
+        box: the box around what is searched.
+        max_area: area of the largest window that pays, in pixels.
+    """
+    resolution = problem.renderer.formation.resolution
+    start, *extremes = _render_extremes(problem)
     # The first window is small enough, as was checked above, so that there is a
     # deviation after the loop: that of the largest window.
     for margin in MARGINS:
@@ -121,6 +129,16 @@ def find_window(problem: Problem) -> Windowing | Refusal:
         if deviation.is_accepted:
             return Windowing(window, start, deviation)
     return Refusal(f"its surroundings change with it: {_describe_excess(deviation)}")
+
+
+def _render_extremes(problem: Problem) -> list[FullImage]:
+    """Render the full images of the start and of both bounds of the budget."""
+    domain = problem.domain
+    # Bounds of the budget: all coordinates as small and as large as it allows. u is in
+    # [0, 1], and `project` moves it into the budget.
+    lower = domain.project(torch.zeros_like(domain.start))
+    upper = domain.project(torch.ones_like(domain.start))
+    return [render_full(problem, u) for u in (domain.start, lower, upper)]
 
 
 def find_crop_refusal(problem: Problem) -> Refusal | None:
@@ -139,15 +157,18 @@ def find_crop_refusal(problem: Problem) -> Refusal | None:
         return Refusal(
             f"a crop pays from {MIN_STEPS} evaluations on", RefusalCause.TOO_FEW_STEPS
         )
+    return _find_render_refusal(renderer) or find_searched_refusal(problem)
+
+
+def _find_render_refusal(renderer: Renderer) -> Refusal | None:
+    """Return why images of a renderer can't be pasted together; None if they can."""
     if renderer.scene.is_volumetric:
         return HAZE
     description, _filter = renderer.scene.description_and_filter
     if description.camera_model is not None:
         return Refusal("the camera has a lens of its own")
     is_denoised = renderer.formation.denoiser == "oidn"
-    if not is_denoised:
-        return NOISE
-    return find_searched_refusal(problem)
+    return None if is_denoised else NOISE
 
 
 def find_searched_refusal(problem: Problem) -> Refusal | None:
@@ -164,14 +185,24 @@ def find_searched_refusal(problem: Problem) -> Refusal | None:
         return Refusal("nothing that is searched needs a render")
     mesh_names = problem.renderer.find_surfaces(problem.renderer.start).shape_names
     for name in sorted(input_names):
-        part = name.partition(".")[0]  # "mug": the mesh or light that has the input
-        if name in light_inputs:
-            return Refusal(f"{part} is light, which shows everywhere")
-        if name.endswith(MOVING_SUFFIXES):
-            return Refusal(f"{part} moves")
-        is_mesh = part in mesh_names  # only a mesh has a place in the image
-        if not is_mesh:
-            return Refusal(f"{part} shows in more than a part of the picture")
+        refusal = _find_input_refusal(name, light_inputs, mesh_names)
+        if refusal is not None:
+            return refusal
+    return None
+
+
+def _find_input_refusal(
+    name: str, light_inputs: Container[str], mesh_names: Container[str]
+) -> Refusal | None:
+    """Return why a scene input may change all of the image; None if it does not."""
+    part = name.partition(".")[0]  # "mug": the mesh or light that has the input
+    if name in light_inputs:
+        return Refusal(f"{part} is light, which shows everywhere")
+    if name.endswith(MOVING_SUFFIXES):
+        return Refusal(f"{part} moves")
+    is_mesh = part in mesh_names  # only a mesh has a place in the image
+    if not is_mesh:
+        return Refusal(f"{part} shows in more than a part of the picture")
     return None
 
 
@@ -240,11 +271,12 @@ def measure_outside(
         margin_biases.append(bias)
         margin_changes.append(change)
     count = len(others)
+    mean_square = sum(squared_differences) / count
     # The bias may be a fraction of the change of the margin by the search itself.
     allowed_bias = max(MAX_MARGIN_BIAS, MAX_BIAS_FRACTION * sum(margin_changes) / count)
     return Deviation(
         # The mean square is an estimate without noise, and may be below 0 by chance.
-        levels=math.sqrt(max(0.0, sum(squared_differences) / count)),
+        levels=math.sqrt(max(0.0, mean_square)),
         margin_bias=sum(margin_biases) / count,  # mean error of the margin
         allowed_levels=MAX_LEVELS,
         n_traced=count,  # full images
@@ -279,21 +311,33 @@ def _measure_square(
     # converts a small difference of radiance to one of displayed values, in [0, 1]
     slope = _compute_slope(problem, before)
     # for each of the two seeds, differences summed over the squares: (1, 3, h, w)
-    difference_sums = []
-    for old, new in zip(
-        before.independent_renders, after.independent_renders, strict=True
-    ):
-        difference = (new - old)[..., :3]  # without coverage
-        levels = 255.0 * slope * difference * outside
-        difference_sums.append(_sum_over_squares(levels))
+    first_sum, second_sum = [
+        _sum_levels(old, new, slope, outside)
+        for old, new in zip(
+            before.independent_renders, after.independent_renders, strict=True
+        )
+    ]
     # number of pixels outside of the window in each square, (1, 1, h, w)
     n_pixels = _sum_over_squares(outside)
     # A sum over a square is n_pixels times a mean. The product of both means is
     # weighted by the number of pixels: mean * mean * n_pixels = sum * sum / n_pixels.
-    first_sum, second_sum = difference_sums
     products = first_sum * second_sum / n_pixels.clamp_min(1.0)
     n_channels = 3.0
     return float(products.sum() / (n_channels * n_pixels.sum().clamp_min(1.0)))
+
+
+def _sum_levels(old: Tensor, new: Tensor, slope: Tensor, outside: Tensor) -> Tensor:
+    """Return the difference of two renders, in levels of 255, summed over squares.
+
+    Args:
+        old: (H, W, 3 or 4) linear radiance.
+        new: (H, W, 3 or 4) linear radiance of the same seed.
+        slope: (H, W, 3) derivative of displayed values by radiance.
+        outside: (H, W, 1) 1 for the pixels that count, else 0.
+    """
+    difference = (new - old)[..., :3]  # without coverage
+    levels = 255.0 * slope * difference * outside
+    return _sum_over_squares(levels)
 
 
 def _sum_over_squares(image: Tensor) -> Tensor:

@@ -248,15 +248,23 @@ def _apply_stepped(
     if applied_severity > 0:
         result = apply_at(image, applied_severity)
     if severity.requires_grad:
-        # The interpolation is between `below` and `below + 1`, which must exist.
-        below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
-        low = image.detach()
-        if below > 0:
-            low = apply_at(image, below).detach()
-        high = apply_at(image, below + 1).detach()
+        slope = _compute_severity_slope(image, apply_at, severity)
         # The added term is 0, but its derivative is not.
-        result = result + (severity - severity.detach()) * (high - low)
+        result = result + (severity - severity.detach()) * slope
     return result.clamp(0.0, 1.0)
+
+
+def _compute_severity_slope(
+    image: Tensor, apply_at: Callable[[Tensor, int], Tensor], severity: Tensor
+) -> Tensor:
+    """Return the difference (H, W, 3) of the results at two integers around a severity."""
+    # they are `below` and `below + 1`, which must exist
+    below = min(int(severity.detach()), filters.MAX_SEVERITY - 1)
+    low = image.detach()
+    if below > 0:
+        low = apply_at(image, below).detach()
+    high = apply_at(image, below + 1).detach()
+    return high - low
 
 
 def round_severity(severity: Tensor) -> int:

@@ -99,16 +99,11 @@ def blur_gaussian(image: Tensor, sigma: Tensor) -> Tensor:
     padded = F.pad(images.to_planes(image), (reach,) * 4, mode="replicate")
     # A Gaussian is separable: first along columns, then along rows, each channel by
     # itself.
-    blurred_down = F.conv2d(
-        padded, weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels
-    )
-    return images.to_image(
-        F.conv2d(
-            blurred_down,
-            weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1),
-            groups=channels,
-        )
-    )
+    vertical = weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1)
+    horizontal = weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1)
+    blurred_down = F.conv2d(padded, vertical, groups=channels)
+    blurred = F.conv2d(blurred_down, horizontal, groups=channels)
+    return images.to_image(blurred)
 
 
 def blur_along_line(
@@ -129,25 +124,33 @@ def blur_along_line(
         angle: angle of the line, radians; 0 is to the right, and pi / 2 down.
         step: pixels of this image for a reference pixel.
     """
-    kernel_length = 2.0 * radius + 1.0
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
     # (count,) distance of each weight from the pixel, in reference pixels
     distance = torch.arange(count, device=image.device) / step
-    # falls from 1 to 0 over the last pixel: differentiable in the radius
-    cut_off = (kernel_length - distance).clamp(0.0, 1.0)
-    weights = torch.exp(-0.5 * (distance / sigma) ** 2) * cut_off
-    weights = weights / weights.sum()
-    height, width = image.shape[:2]
+    weights = _compute_line_weights(distance, radius, sigma)
     # enough on all four sides for lines in any direction
     padded = F.pad(images.to_planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
+    height, width = image.shape[:2]
     for index, weight in enumerate(weights):
+        # the image as it is `index` pixels further along the line
         top = count + round(index * math.sin(angle))
         left = count + round(index * math.cos(angle))
-        # the image as it is `index` pixels further along the line
         shifted = padded[:, :, top : top + height, left : left + width]
         total = total + weight * images.to_image(shifted)
     return total
+
+
+def _compute_line_weights(distance: Tensor, radius: Tensor, sigma: Tensor) -> Tensor:
+    """Return the weights (n,) of pixels at some distances (n,), which add up to 1.
+
+    All lengths are in reference pixels, see `blur_along_line`.
+    """
+    kernel_length = 2.0 * radius + 1.0
+    # falls from 1 to 0 over the last pixel: differentiable in the radius
+    cut_off = (kernel_length - distance).clamp(0.0, 1.0)
+    weights = torch.exp(-0.5 * (distance / sigma) ** 2) * cut_off
+    return weights / weights.sum()
 
 
 GAUSSIAN = ((0.08,), (0.12,), (0.18,), (0.26,), (0.38,))  # standard deviation, sRGB
@@ -346,21 +349,27 @@ def zoom_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
         seed: has no effect.
     """
     (largest,) = interpolate_table(ZOOM, severity)
-    zooms = 1.0 + (largest - 1.0) * torch.linspace(
-        0.0, 1.0, ZOOM_STEPS, device=severity.device
-    )
-    # A magnified image is looked up 1 / zoom as far from its center: affine maps
-    # (ZOOM_STEPS, 2, 3) that scale x and y, without a shift.
-    scales = (1.0 / zooms)[:, None].expand(-1, 2)
-    scale_matrices = torch.diag_embed(scales)
-    no_shift = scale_matrices.new_zeros(ZOOM_STEPS, 2, 1)
-    theta = torch.cat([scale_matrices, no_shift], dim=2).to(image.device)
+    steps = torch.linspace(0.0, 1.0, ZOOM_STEPS, device=severity.device)
+    zooms = 1.0 + (largest - 1.0) * steps
+    theta = _make_zoom_matrices(zooms).to(image.device)
     height, width = image.shape[:2]
     grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
     copies = images.to_planes(image).expand(ZOOM_STEPS, -1, -1, -1)
     zoomed = F.grid_sample(copies, grid, padding_mode="border", align_corners=False)
     # The image counts twice, as in the published code: the first zoom is 1.
     return (image + zoomed.sum(dim=0).permute(1, 2, 0)) / (ZOOM_STEPS + 1)
+
+
+def _make_zoom_matrices(zooms: Tensor) -> Tensor:
+    """Return the affine maps (n, 2, 3) by which an image is magnified n times.
+
+    A magnified image is looked up 1 / zoom as far from its center: the maps scale x and
+    y, without a shift.
+    """
+    scales = (1.0 / zooms)[:, None].expand(-1, 2)
+    scale_matrices = torch.diag_embed(scales)
+    no_shift = scale_matrices.new_zeros(len(zooms), 2, 1)
+    return torch.cat([scale_matrices, no_shift], dim=2)
 
 
 def glass_blur(image: Tensor, severity: Tensor, seed: int) -> Tensor:
@@ -409,6 +418,22 @@ def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tens
         (H, W, 2) to the right and down, in pixels of the reference image.
     """
     rows, columns = compute_reference_size(height, width)
+    origins = _shuffle_pixels(rows, columns, seed, severity)
+    shift = _compute_shifts(torch.tensor(origins), columns)
+    shift = shift.view(1, 2, rows, columns).float()
+    # Shifts are repeated, not interpolated, so that pixels stay scattered.
+    return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
+
+
+def _shuffle_pixels(rows: int, columns: int, seed: int, severity: int) -> list[int]:
+    """Return the index of the pixel that frosted glass shows at each pixel.
+
+    Args:
+        rows: height of the reference image.
+        columns: its width; pixels are numbered row by row.
+        seed: seed of the neighbors.
+        severity: 1 to 5.
+    """
     # The first number is the standard deviation of the blur, which `glass_blur` uses.
     reach = int(GLASS[severity - 1][1])
     n_passes = int(GLASS[severity - 1][2])
@@ -421,10 +446,7 @@ def _make_glass_shift(height: int, width: int, seed: int, severity: int) -> Tens
         # as steps between indices of the flattened image
         to_neighbor = (jumps[..., 0] * columns + jumps[..., 1]).flatten().tolist()
         _take_over_origins(origins, to_neighbor, rows, columns, reach)
-    shift = _compute_shifts(torch.tensor(origins), columns)
-    shift = shift.view(1, 2, rows, columns).float()
-    # Shifts are repeated, not interpolated, so that pixels stay scattered.
-    return images.to_image(F.interpolate(shift, (height, width), mode="nearest-exact"))
+    return origins
 
 
 def _take_over_origins(
@@ -484,12 +506,8 @@ def _make_elastic_shift(height: int, width: int, seed: int, severity: int) -> Te
     # (3, 2) random shifts of three points, which determine an affine map
     corners = (torch.rand(3, 2, generator=source) * 2.0 - 1.0) * corner_shift
     noise = torch.rand(rows, columns, 2, generator=source) * 2.0 - 1.0
-    waves = ndimage.gaussian_filter(
-        noise.numpy(),
-        (wrinkle_width, wrinkle_width, 0.0),
-        mode="reflect",
-        truncate=3.0,
-    )
+    widths = (wrinkle_width, wrinkle_width, 0.0)
+    waves = ndimage.gaussian_filter(noise.numpy(), widths, mode="reflect", truncate=3.0)
     shear = _make_shear(rows, columns, corners)
     shift = torch.from_numpy(waves) * wrinkle_height + shear
     # `elastic` converts reference pixels to pixels of the image.
@@ -592,24 +610,36 @@ def make_fractal_noise(side: int, decay: float, source: torch.Generator) -> Tens
     while grid.shape[0] < side:
         size = grid.shape[0]
         noise = (torch.rand(3, size, size, generator=source) * 2.0 - 1.0) * height
-        # neighbors of each point, which wrap around the edges of the torus
-        right = grid.roll(-1, dims=1)
-        below = grid.roll(-1, dims=0)
-        lower_right = right.roll(-1, dims=0)
-        # diamond step: the centers of the cells, from their four corners
-        center = (grid + right + below + lower_right) / 4.0 + noise[0]
-        center_above = center.roll(1, dims=0)
-        center_left = center.roll(1, dims=1)
-        finer = torch.empty(2 * size, 2 * size)
-        finer[::2, ::2] = grid
-        finer[1::2, 1::2] = center
-        # square step: the centers of the edges, from two old points and two centers
-        finer[::2, 1::2] = (grid + right + center + center_above) / 4.0 + noise[1]
-        finer[1::2, ::2] = (grid + below + center + center_left) / 4.0 + noise[2]
-        grid = finer
+        grid = _refine_grid(grid, noise)
         height = height / decay**2
     grid = grid - grid.min()
     return grid / grid.max()
+
+
+def _refine_grid(grid: Tensor, noise: Tensor) -> Tensor:
+    """Return a grid (n, n) on a torus with twice the points, by midpoint displacement.
+
+    Args:
+        grid: (n, n) heights.
+        noise: (3, n, n) noise of the new points: those in the centers of cells, and
+            those on their horizontal and vertical edges.
+    """
+    size = grid.shape[0]
+    # neighbors of each point, which wrap around the edges of the torus
+    right = grid.roll(-1, dims=1)
+    below = grid.roll(-1, dims=0)
+    lower_right = right.roll(-1, dims=0)
+    # diamond step: the centers of the cells, from their four corners
+    center = (grid + right + below + lower_right) / 4.0 + noise[0]
+    center_above = center.roll(1, dims=0)
+    center_left = center.roll(1, dims=1)
+    finer = torch.empty(2 * size, 2 * size)
+    finer[::2, ::2] = grid
+    finer[1::2, 1::2] = center
+    # square step: the centers of the edges, from two old points and two centers
+    finer[::2, 1::2] = (grid + right + center + center_above) / 4.0 + noise[1]
+    finer[1::2, ::2] = (grid + below + center + center_left) / 4.0 + noise[2]
+    return finer
 
 
 def frost(image: Tensor, severity: Tensor, seed: int) -> Tensor:
@@ -719,12 +749,8 @@ def _make_snowfall(height: int, width: int, seed: int, severity: int) -> Tensor:
     # Each pixel is averaged with those in a direction from -135 to -45 degrees, where -90
     # is straight up. So flakes are smeared downwards, up to 45 degrees to either side.
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
-    noise = mean + spread * torch.randn(
-        math.ceil(rows / flake_size),
-        math.ceil(columns / flake_size),
-        1,
-        generator=source,
-    )
+    grid_size = (math.ceil(rows / flake_size), math.ceil(columns / flake_size), 1)
+    noise = mean + spread * torch.randn(grid_size, generator=source)
     flakes = images.resized(noise, rows, columns)
     flakes = torch.where(flakes < threshold, torch.zeros_like(flakes), flakes)
     streaks = blur_along_line(

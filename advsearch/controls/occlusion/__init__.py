@@ -210,11 +210,7 @@ class OcclusionControl(Control):
         occluder = self.choice_values["object"]
         if occluder is None:
             return
-        if not isinstance(occluder, (str, Path)) or not str(occluder).strip():
-            raise InputError(
-                f"{self.name}.object: expected the name of a bundled object or a path "
-                f"to a mesh file, got {occluder!r}"
-            )
+        _check_is_name_or_path(f"{self.name}.object", occluder)
         if "which" in self._settings:
             raise InputError(
                 f"{self.name}: object and which both state the "
@@ -227,21 +223,25 @@ class OcclusionControl(Control):
 
         They are placed out of sight; `scene_inputs` moves the one that is used.
         """
-        hidden_pose = geometry.make_hidden_pose(
-            torch.from_numpy(geometry.camera_to_world(scene))
-        ).numpy()
+        camera_pose = torch.from_numpy(geometry.camera_to_world(scene))
+        hidden_pose = geometry.make_hidden_pose(camera_pose).numpy()
         for option in self._list_options():
-            asset = _load_asset(option)
-            appearance = asset.base_color, asset.material, asset.label
-            scene = scene.with_part(
-                parts.MeshPart(
-                    self._part_name(option),
-                    asset.mesh,
-                    *appearance,
-                    to_world=hidden_pose,
-                )
-            )
+            scene = scene.with_part(self._make_occluder_part(option, hidden_pose))
         return scene
+
+    def _make_occluder_part(
+        self, option: str, pose: assets.Float64Array
+    ) -> parts.MeshPart:
+        """Return the mesh of an occluder, a part of the scene, at a pose (4, 4)."""
+        asset = _load_asset(option)
+        return parts.MeshPart(
+            self._part_name(option),
+            asset.mesh,
+            asset.base_color,
+            asset.material,
+            asset.label,
+            to_world=pose,
+        )
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -316,37 +316,95 @@ class OcclusionControl(Control):
         requested = {name: float(value.detach()) for name, value in values.items()}
         view = _ObjectView.from_scene(self.scene, earlier_inputs)
         # "distance" is a fraction of the distance from the camera to the object
-        requested_distance = requested["distance"] * view.center_distance
+        requested["distance"] *= view.center_distance
         if view.directions is None or requested["coverage"] <= 0.0:
-            return _make_hidden_placement(requested["size"], requested_distance)
+            return _make_hidden_placement(requested["size"], requested["distance"])
         mesh = _load_asset(self._select_option(values)).mesh
-        turn = geometry.make_rotation(requested["turn"], 0.0, 0.0)
-        # vertices of the turned occluder, centered on the origin, largest extent 1
-        points = mesh.vertices.astype(np.float64) @ turn.T
-        size, distance = _fit_occluder(
-            points, requested["size"], requested_distance, view.nearest_distance
-        )
-        occluder_silhouette = silhouettes.rasterise_silhouette(
-            _to_facing_camera(points, size, distance), mesh.faces
-        )
-        if occluder_silhouette is None:
-            return _make_hidden_placement(size, distance)
-        passage = silhouettes.Passage(
-            target_directions=view.directions,
-            occluder_silhouette=occluder_silhouette,
-            axes=silhouettes.compute_center_axes(view.directions),
-            direction=requested["direction"],
-        )
-        angle = _find_covering_angle(view, passage, requested["coverage"])
-        # less than requested if the occluder is too small
-        hidden_fraction = float(passage.compute_coverage(np.array([angle]))[0])
-        return Placement(
-            axes=passage.axes,
-            angle=angle,
-            size=size,
-            distance=distance,
-            hidden_fraction=hidden_fraction,
-            is_out_of_sight=False,
+        return _find_occluder_placement(mesh, requested, view, view.directions)
+
+
+def _find_occluder_placement(
+    mesh: assets.Mesh,
+    requested: Mapping[str, float],
+    view: _ObjectView,
+    directions: assets.Float64Array,
+) -> Placement:
+    """Return the placement at which an occluder hides a fraction of the object.
+
+    It is out of sight if the occluder has no silhouette.
+
+    Args:
+        mesh: mesh of the occluder.
+        requested: values of the control, by parameter; the distance is that from the
+            camera, in object sizes.
+        view: the object as the camera sees it.
+        directions: (N, 3) directions in which the object is visible.
+    """
+    points = _turn_vertices(mesh, requested["turn"])
+    size, distance = _fit_occluder(
+        points, requested["size"], requested["distance"], view.nearest_distance
+    )
+    placement = _make_hidden_placement(size, distance)
+    points_facing_camera = _to_facing_camera(points, size, distance)
+    silhouette = silhouettes.rasterise_silhouette(points_facing_camera, mesh.faces)
+    if silhouette is None:
+        return placement
+    passage = _make_passage(directions, silhouette, requested["direction"])
+    angle = _find_covering_angle(view, passage, requested["coverage"])
+    return _move_into_view(placement, passage, angle)
+
+
+def _turn_vertices(mesh: assets.Mesh, degrees: float) -> assets.Float64Array:
+    """Return the vertices (V, 3) of an occluder after a turn about its vertical axis.
+
+    They are centered on the origin, and their largest extent is 1.
+    """
+    turn = geometry.make_rotation(degrees, 0.0, 0.0)
+    turned: assets.Float64Array = mesh.vertices.astype(np.float64) @ turn.T
+    return turned
+
+
+def _make_passage(
+    directions: assets.Float64Array,
+    silhouette: silhouettes.Silhouette,
+    direction: float,
+) -> silhouettes.Passage:
+    """Return the passage of an occluder past the object.
+
+    Args:
+        directions: (N, 3) directions in which the object is visible.
+        silhouette: silhouette of the occluder, straight ahead of a camera.
+        direction: side that it comes from, degrees.
+    """
+    return silhouettes.Passage(
+        target_directions=directions,
+        occluder_silhouette=silhouette,
+        axes=silhouettes.compute_center_axes(directions),
+        direction=direction,
+    )
+
+
+def _move_into_view(
+    placement: Placement, passage: silhouettes.Passage, angle: float
+) -> Placement:
+    """Return the placement of an occluder at an angle, radians, on its passage."""
+    # less than requested if the occluder is too small
+    hidden_fraction = float(passage.compute_coverage(np.array([angle]))[0])
+    return replace(
+        placement,
+        axes=passage.axes,
+        angle=angle,
+        hidden_fraction=hidden_fraction,
+        is_out_of_sight=False,
+    )
+
+
+def _check_is_name_or_path(label: str, occluder: object) -> None:
+    """Raise InputError if an occluder is no name of an object and no path."""
+    if not isinstance(occluder, (str, Path)) or not str(occluder).strip():
+        raise InputError(
+            f"{label}: expected the name of a bundled object or a path "
+            f"to a mesh file, got {occluder!r}"
         )
 
 
@@ -423,34 +481,67 @@ class _ObjectView:
                 object, or changed the lens.
         """
         points = _object_in_camera(scene, earlier_inputs)
-        faces = scene.object.mesh.faces
-        model = scene.camera_model
-        if model is not None:
-            if "camera.lens" in earlier_inputs:
-                model = model.with_intrinsics(
-                    earlier_inputs["camera.lens"].detach().cpu()
-                )
-            directions_of_image = _spread_directions(
-                model, (0.0, 1.0), (0.0, 1.0), silhouettes.DIRECTION_GRID
-            )
-            # `rim` may have further directions than those at the edge. For a distorted
-            # image it has all, as the edge is not computed.
-            rim = directions_of_image
-            directions = _directions_through_lens(model, points, faces)
-        else:
-            frame = _image_frame(scene, earlier_inputs)
-            silhouette = silhouettes.rasterise_silhouette(points, faces, frame)
-            directions_of_image = silhouettes.spread_directions(frame)
-            rim = frame.corners()
-            directions = None if silhouette is None else silhouette.list_directions()
-        center = (points.min(axis=0) + points.max(axis=0)) / 2.0
-        return _ObjectView(
-            directions=directions,
-            directions_of_image=directions_of_image,
-            rim=rim,
-            nearest_distance=float(np.linalg.norm(points, axis=1).min()),
-            center_distance=float(np.linalg.norm(center)),
+        if scene.camera_model is not None:
+            return _view_through_lens(scene, scene.camera_model, points, earlier_inputs)
+        frame = _image_frame(scene, earlier_inputs)
+        silhouette = silhouettes.rasterise_silhouette(
+            points, scene.object.mesh.faces, frame
         )
+        return _make_object_view(
+            points,
+            directions=None if silhouette is None else silhouette.list_directions(),
+            directions_of_image=silhouettes.spread_directions(frame),
+            rim=frame.corners(),
+        )
+
+
+def _view_through_lens(
+    scene: SceneDescription,
+    model: geometry.CameraModel,
+    points: assets.Float64Array,
+    earlier_inputs: Mapping[str, Tensor],
+) -> _ObjectView:
+    """Compute how a camera with a lens model sees a scene's object.
+
+    Args:
+        scene: the scene.
+        model: its camera model.
+        points: (V, 3) vertices of the object in camera coordinates.
+        earlier_inputs: inputs of earlier controls, which may have changed the lens.
+    """
+    if "camera.lens" in earlier_inputs:
+        model = model.with_intrinsics(earlier_inputs["camera.lens"].detach().cpu())
+    directions_of_image = _spread_directions(
+        model, across=(0.0, 1.0), down=(0.0, 1.0), count=silhouettes.DIRECTION_GRID
+    )
+    return _make_object_view(
+        points,
+        directions=_directions_through_lens(model, points, scene.object.mesh.faces),
+        directions_of_image=directions_of_image,
+        # `rim` may have further directions than those at the edge. For a distorted
+        # image it has all, as the edge is not computed.
+        rim=directions_of_image,
+    )
+
+
+def _make_object_view(
+    points: assets.Float64Array,
+    directions: assets.Float64Array | None,
+    directions_of_image: assets.Float64Array,
+    rim: assets.Float64Array,
+) -> _ObjectView:
+    """Return the view of an object by its vertices (V, 3) in camera coordinates.
+
+    The other arguments are fields of `_ObjectView`.
+    """
+    center = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    return _ObjectView(
+        directions=directions,
+        directions_of_image=directions_of_image,
+        rim=rim,
+        nearest_distance=float(np.linalg.norm(points, axis=1).min()),
+        center_distance=float(np.linalg.norm(center)),
+    )
 
 
 def _object_in_camera(
@@ -463,12 +554,10 @@ def _object_in_camera(
         earlier_inputs: inputs of earlier controls: the poses of camera and object, and
             offsets (V, 3) of the vertices. Those of the scene replace missing ones.
     """
-    camera = (
-        geometry.get_camera_pose(scene, earlier_inputs).detach().double().cpu().numpy()
-    )
-    pose = _get_array(
-        earlier_inputs, "object.to_world", geometry.compute_object_to_world(scene)
-    )
+    camera_pose = geometry.get_camera_pose(scene, earlier_inputs)
+    camera = camera_pose.detach().double().cpu().numpy()
+    object_pose = geometry.compute_object_to_world(scene)
+    pose = _get_array(earlier_inputs, "object.to_world", object_pose)
     offsets = _get_array(earlier_inputs, "object.offsets", np.zeros(3))
     vertices = scene.object.mesh.vertices.astype(np.float64) + offsets
     in_world = vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -562,17 +651,26 @@ def _spread_directions(
         down: upper and lower bound of the part, as fractions of the height.
         count: number of rows, and of columns, of the grid.
     """
-    row, column = np.divmod(np.arange(count * count), count)
-    index = np.arange(count * count)
-    # 1 / g and 1 / g^2 of the plastic number g (Roberts 2018)
-    x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
-    y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
-    x = across[0] + x_in_cells / count * (across[1] - across[0])
-    y = down[0] + y_in_cells / count * (down[1] - down[0])
+    x_fraction, y_fraction = _spread_over_cells(count)
+    x = across[0] + x_fraction * (across[1] - across[0])
+    y = down[0] + y_fraction * (down[1] - down[0])
     directions, inside = model.compute_rays(torch.from_numpy(np.stack([x, y], axis=1)))
     # from y downwards to y upwards
     visible = directions[inside > 0.0].numpy() * (1.0, -1.0, 1.0)
     return np.asarray(visible / np.linalg.norm(visible, axis=1, keepdims=True))
+
+
+def _spread_over_cells(count: int) -> tuple[assets.Float64Array, assets.Float64Array]:
+    """Return x and y (count * count,), from 0 to 1, of a point in each cell of a grid.
+
+    Positions in the cells are from a low-discrepancy sequence (Roberts 2018): multiples
+    of 1 / g and 1 / g^2 modulo 1, where g is the plastic number.
+    """
+    index = np.arange(count * count)
+    row, column = np.divmod(index, count)
+    x_in_cells = column + (0.5 + 0.7548777 * index) % 1.0
+    y_in_cells = row + (0.5 + 0.5698403 * index) % 1.0
+    return x_in_cells / count, y_in_cells / count
 
 
 def _get_array(
@@ -614,15 +712,26 @@ def _fit_occluder(
     max_steps = 200  # 0.95 to the 200th is 1 / 28,000: by then any occluder fits
     for _ in range(max_steps):
         min_distance = MIN_CAMERA_DISTANCE + size * to_front
-        # Pythagoras: the edge of the cylinder's back is `limit` away from the camera.
-        squared_back_distance = limit * limit - (size * radius) ** 2
-        max_distance = 0.0
-        if squared_back_distance > 0.0:
-            max_distance = math.sqrt(squared_back_distance) - size * to_back
+        max_distance = _find_max_distance(limit, size * radius, size * to_back)
         if max_distance >= min_distance:
             break
         size *= 0.95
     return size, min(max(distance, min_distance), max_distance)
+
+
+def _find_max_distance(limit: float, radius: float, to_back: float) -> float:
+    """Return the largest distance of a cylinder from the camera, 0 if it does not fit.
+
+    Args:
+        limit: largest distance of any of its points from the camera.
+        radius: radius of the cylinder, whose axis points to the camera.
+        to_back: distance from its center to its back.
+    """
+    # Pythagoras: the edge of the cylinder's back is `limit` away from the camera.
+    squared_back_distance = limit * limit - radius**2
+    if squared_back_distance > 0.0:
+        return math.sqrt(squared_back_distance) - to_back
+    return 0.0
 
 
 def _to_facing_camera(

@@ -76,24 +76,34 @@ class Silhouette:
                 all of the same shape. They need not have length 1.
         """
         height, width = self.mask.shape
-        window = self.window
-        # The limit only avoids a division by 0: `is_inside` excludes directions that do
-        # not point forwards.
-        depth = np.maximum(forwards, geometry.MIN_DEPTH)
-        column = np.floor(
-            (x / depth - window.left) / (window.right - window.left) * width
-        )
-        row = np.floor((y / depth - window.low) / (window.high - window.low) * height)
-        is_inside = (
-            (forwards > geometry.MIN_DEPTH)
-            & (column >= 0)
-            & (column < width)
-            & (row >= 0)
-            & (row < height)
-        )
+        x_fraction, y_fraction = self._find_position_in_window(x, y, forwards)
+        column = np.floor(x_fraction * width)
+        row = np.floor(y_fraction * height)
+        is_column_inside = (column >= 0) & (column < width)
+        is_row_inside = (row >= 0) & (row < height)
+        is_inside = (forwards > geometry.MIN_DEPTH) & is_column_inside & is_row_inside
         column = np.where(is_inside, column, 0).astype(np.int64)
         row = np.where(is_inside, row, 0).astype(np.int64)
         return np.asarray(is_inside & self.mask[row, column])
+
+    def _find_position_in_window(
+        self,
+        x: assets.Float64Array,
+        y: assets.Float64Array,
+        forwards: assets.Float64Array,
+    ) -> tuple[assets.Float64Array, assets.Float64Array]:
+        """Return x and y of directions in the window, from 0 (left, below) to 1.
+
+        The arguments are those of `contains`. Directions behind the camera get numbers
+        without a meaning.
+        """
+        window = self.window
+        # The limit only avoids a division by 0: `contains` excludes directions that do not
+        # point forwards.
+        depth = np.maximum(forwards, geometry.MIN_DEPTH)
+        x_fraction = (x / depth - window.left) / (window.right - window.left)
+        y_fraction = (y / depth - window.low) / (window.high - window.low)
+        return x_fraction, y_fraction
 
 
 def rasterise_silhouette(
@@ -117,23 +127,47 @@ def rasterise_silhouette(
     window = _find_window(tangents, frame)
     if window is None:
         return None
+    mask = _rasterise_tangents(tangents, window)
+    return Silhouette(mask, window) if mask.any() else None
+
+
+def _rasterise_tangents(
+    tangents: assets.Float64Array, window: geometry.Frame
+) -> NDArray[np.bool_]:
+    """Return which pixels (h, w) of a window are covered by triangles.
+
+    The longer side has `RASTER` pixels.
+
+    Args:
+        tangents: (F, 3, 2) corners of the triangles, in tangents.
+        window: bounds of the pixels, in tangents.
+    """
     window_width = window.right - window.left
     window_height = window.high - window.low
-    pixel = max(window_width, window_height) / RASTER
-    width = max(1, math.ceil(window_width / pixel))
-    height = max(1, math.ceil(window_height / pixel))
+    height, width = _compute_raster_shape(window_height, window_width)
     # In the coordinates of `rasterize_triangles`, pixel centers are at whole numbers. So
     # the corner of the window, which is the corner of a pixel, is at -0.5.
-    in_pixels = (tangents - (window.left, window.low)) * (
-        width / window_width,
-        height / window_height,
-    ) - 0.5
+    pixels_per_tangent = (width / window_width, height / window_height)
+    in_pixels = (tangents - (window.left, window.low)) * pixels_per_tangent - 0.5
     _face, row, column, _weights = images.rasterize_triangles(
         in_pixels, (height, width)
     )
     mask = np.zeros((height, width), dtype=np.bool_)
     mask[row, column] = True
-    return Silhouette(mask, window) if mask.any() else None
+    return mask
+
+
+def _compute_raster_shape(height: float, width: float) -> tuple[int, int]:
+    """Return the rows and columns of a raster whose longer side has `RASTER` pixels.
+
+    Args:
+        height: height of the raster, in tangents.
+        width: width of the raster, in tangents.
+    """
+    pixel = max(width, height) / RASTER
+    rows = max(1, math.ceil(height / pixel))
+    columns = max(1, math.ceil(width / pixel))
+    return rows, columns
 
 
 def _find_window(
@@ -198,16 +232,29 @@ class Passage:
             # the occluder: the target moves inwards.
             new_outwards = outwards * math.cos(angle) - forward * math.sin(angle)
             new_forward = outwards * math.sin(angle) + forward * math.cos(angle)
-            # back to the axes right and up
-            new_right = (
-                math.cos(direction) * new_outwards - math.sin(direction) * sideways
+            fraction = self._compute_hidden_fraction(
+                new_outwards, sideways, new_forward
             )
-            new_up = math.sin(direction) * new_outwards + math.cos(direction) * sideways
-            is_hidden = self.occluder_silhouette.contains(
-                new_right, new_up, new_forward
-            )
-            fractions.append(float(is_hidden.mean()))
+            fractions.append(fraction)
         return np.array(fractions)
+
+    def _compute_hidden_fraction(
+        self,
+        outwards: assets.Float64Array,
+        sideways: assets.Float64Array,
+        forward: assets.Float64Array,
+    ) -> float:
+        """Return the fraction of the target's directions that the silhouette covers.
+
+        The arguments are components (N,) of the directions for a camera that looks at
+        the occluder.
+        """
+        direction = math.radians(self.direction)
+        # back to the axes right and up
+        right = math.cos(direction) * outwards - math.sin(direction) * sideways
+        up = math.sin(direction) * outwards + math.cos(direction) * sideways
+        is_hidden = self.occluder_silhouette.contains(right, up, forward)
+        return float(is_hidden.mean())
 
     def find_angle(self, fraction: float, outside: float) -> float:
         """Find the largest angle, in radians, at which a fraction is hidden.
@@ -231,8 +278,20 @@ class Passage:
         is_enough_outside = first == 0
         if is_enough_outside:
             return float(angles[0])
-        outer_angle = float(angles[first - 1])  # hides too little
-        inner_angle = float(angles[first])  # hides enough
+        return self._bisect_angle(
+            fraction, float(angles[first - 1]), float(angles[first])
+        )
+
+    def _bisect_angle(
+        self, fraction: float, outer_angle: float, inner_angle: float
+    ) -> float:
+        """Return the angle, in radians, from which on a fraction is hidden.
+
+        Args:
+            fraction: fraction of the target that should be hidden.
+            outer_angle: angle at which too little is hidden.
+            inner_angle: angle at which enough is hidden.
+        """
         for _ in range(N_BISECTIONS):
             middle = 0.5 * (outer_angle + inner_angle)
             if float(self.compute_coverage(np.array([middle]))[0]) >= fraction:
@@ -288,15 +347,7 @@ def find_angle_outside(
         direction: side that the occluder comes from, in degrees: 0 is the right, 90 the
             top.
     """
-    # Largest angle between the occluder's center and a corner of the window around it.
-    # The center is straight ahead, so that a corner's third component is the cosine.
-    corners = cover.window.corners()
-    occluder_radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
-    # largest angle between the target's center and the edge of the image
-    target_center = axes[2]
-    image_radius = float(np.arccos(np.clip(rim @ target_center, -1.0, 1.0)).max())
-    # a little beyond the edge (0.02 is about a degree), but not behind the camera
-    max_angle = min(image_radius + occluder_radius + 0.02, 0.9 * math.pi)
+    max_angle = _find_max_angle(rim, cover, target_center=axes[2])
     # twice as dense as `find_angle` scans a smaller range
     angles = np.linspace(max_angle, 0.0, 2 * N_SCAN_ANGLES)
     # The target is here the full image: the fraction of it that is covered.
@@ -307,6 +358,23 @@ def find_angle_outside(
         return float(angles[0])
     last_outside = max(int(indices_inside[0]) - 1, 0)
     return float(angles[last_outside])
+
+
+def _find_max_angle(
+    rim: assets.Float64Array, cover: Silhouette, target_center: assets.Float64Array
+) -> float:
+    """Return an angle in radians at which an occluder is surely outside of the image.
+
+    It is that between the centers of occluder and target (3,), as seen from the camera.
+    """
+    # Largest angle between the occluder's center and a corner of the window around it.
+    # The center is straight ahead, so that a corner's third component is the cosine.
+    corners = cover.window.corners()
+    occluder_radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
+    # largest angle between the target's center and the edge of the image
+    image_radius = float(np.arccos(np.clip(rim @ target_center, -1.0, 1.0)).max())
+    # a little beyond the edge (0.02 is about a degree), but not behind the camera
+    return min(image_radius + occluder_radius + 0.02, 0.9 * math.pi)
 
 
 def _unit(vectors: assets.Float64Array) -> assets.Float64Array:

@@ -295,11 +295,7 @@ class PathControl(Control):
             InputError: choices contradict each other or the files.
         """
         names = _split_paths(self.choice_values["path"])
-        if len(set(names)) < len(names) or len(names) > MAX_PATHS:
-            raise InputError(
-                f"{self.name}.path: expected at most {MAX_PATHS} "
-                f"different paths, got {', '.join(names)}"
-            )
+        self._check_path_names(names)
         self._check_object_at()
         self._paths: tuple[MovementByMover, ...] = tuple(map(self._read_path, names))
         self._movers = {mover for movements in self._paths for mover in movements}
@@ -309,14 +305,24 @@ class PathControl(Control):
         self._files = [
             movement for movement in all_movements if isinstance(movement, Waypoints)
         ]
-        self._check_choices_fit_paths(
-            names, are_all_files=len(self._files) == len(all_movements)
-        )
+        are_all_files = len(self._files) == len(all_movements)
+        self._check_choices_fit_paths(names, are_all_files=are_all_files)
+        self._set_duration()
+
+    def _set_duration(self) -> None:
+        """Set `seconds`: the duration of the longest file, or the choice without files."""
         if self._files:
-            self.choice_values["seconds"] = max(
-                float(movement.times[-1]) for movement in self._files
-            )
+            durations = [float(movement.times[-1]) for movement in self._files]
+            self.choice_values["seconds"] = max(durations)
         self.seconds = float(self.choice_values["seconds"])
+
+    def _check_path_names(self, names: Sequence[str]) -> None:
+        """Raise InputError if there are too many paths, or one is there twice."""
+        if len(set(names)) < len(names) or len(names) > MAX_PATHS:
+            raise InputError(
+                f"{self.name}.path: expected at most {MAX_PATHS} "
+                f"different paths, got {', '.join(names)}"
+            )
 
     def _check_choices_fit_paths(
         self, names: Sequence[str], *, are_all_files: bool
@@ -328,13 +334,7 @@ class PathControl(Control):
             are_all_files: whether every movement is from a file, and none is a named
                 one such as "orbit".
         """
-        # "approach+orbit" moves both the camera and the object, "orbit" what `moves` states
-        has_single_mover = any(MOVER_SEPARATOR not in name for name in names)
-        if "moves" in self._settings and not has_single_mover:
-            raise InputError(
-                f"{self.name}: {names[0]} states the movements of both the camera and "
-                "the object; leave moves out"
-            )
+        self._check_moves_is_used(names)
         # Without `path` in the settings of this control, another setting of the run may
         # still add one. `prepare` checks that.
         if "path" in self._settings:
@@ -343,6 +343,20 @@ class PathControl(Control):
             self._check_not_set("seconds")
         if are_all_files:
             self._check_not_set("reach")
+
+    def _check_moves_is_used(self, names: Sequence[str]) -> None:
+        """Raise InputError if `moves` is set, but each path states what it moves.
+
+        Args:
+            names: names of the paths, e.g. "orbit" or "drive.csv".
+        """
+        # "approach+orbit" moves both the camera and the object, "orbit" what `moves` states
+        has_single_mover = any(MOVER_SEPARATOR not in name for name in names)
+        if "moves" in self._settings and not has_single_mover:
+            raise InputError(
+                f"{self.name}: {names[0]} states the movements of both the camera and "
+                "the object; leave moves out"
+            )
 
     def _check_not_set(self, setting: str) -> None:
         """Raise InputError if a choice is set that the files of the paths state."""
@@ -360,20 +374,8 @@ class PathControl(Control):
                 object, as the choice `moves` states; or the camera's and the object's
                 movement with a "+" between them, e.g. "approach+orbit".
         """
-        names = [name]
-        halves = name.split(MOVER_SEPARATOR)
-        # The name of a single file may have a "+", too: then the halves are no paths.
-        if len(halves) == 2 and all(map(_is_path, halves)):
-            names = halves
+        names = self._split_movers(name)
         is_single = len(names) == 1
-        if is_single and not _is_path(name):
-            raise InputError(
-                f"{self.name}.path: expected {', '.join(PATHS)}, a "
-                f"{' or '.join(PATH_ENDINGS)} file, or two of them as "
-                f"in {APPROACH}{MOVER_SEPARATOR}{ORBIT}, the camera's and the "
-                "object's, got "
-                f"{name!r}"
-            )
         # `MOVERS` has the order of the names: the camera, then the object
         movers = [str(self.choice_values["moves"])] if is_single else MOVERS
         movements: dict[str, Movement] = {}
@@ -384,6 +386,26 @@ class PathControl(Control):
                 # A file for the camera may have the object's movement too.
                 movements |= self._read_file(Path(path_name), mover, is_single)
         return movements
+
+    def _split_movers(self, name: str) -> list[str]:
+        """Return the name of a single movement, or the camera's and the object's.
+
+        Raises:
+            InputError: the name is no path.
+        """
+        halves = name.split(MOVER_SEPARATOR)
+        # The name of a single file may have a "+", too: then the halves are no paths.
+        if len(halves) == 2 and all(map(_is_path, halves)):
+            return halves
+        if not _is_path(name):
+            raise InputError(
+                f"{self.name}.path: expected {', '.join(PATHS)}, a "
+                f"{' or '.join(PATH_ENDINGS)} file, or two of them as "
+                f"in {APPROACH}{MOVER_SEPARATOR}{ORBIT}, the camera's and the "
+                "object's, got "
+                f"{name!r}"
+            )
+        return [name]
 
     def _check_trajectory_choices(self) -> None:
         """Check that choices such as `axes` and `up` are set only with a trajectory.
@@ -459,27 +481,13 @@ class PathControl(Control):
         times = self._find_times(trajectory, assumed)
         check_times(path, times)
         positions, rotations = self._orient(path, trajectory, assumed)
-        notes = list(trajectory.notes)
-        if assumed:
-            notes.append(_describe_assumptions(path, trajectory.format, assumed))
-        quaternions = None
-        if rotations is not None:
-            tilt = measure_tilt(rotations)
-            if tilt > MAX_TILT:
-                notes.append(
-                    f"{path}: the upward direction of its pictures is {tilt:.0f} "
-                    "degrees from the vertical, on average; another `axes` or "
-                    "`up` may be right."
-                )
-            quaternions = torch.from_numpy(
-                align_quaternions(rotations.as_quat()).astype(np.float32)
-            )
+        notes = _list_trajectory_notes(path, trajectory, assumed, rotations)
         return Waypoints(
             torch.from_numpy(times.astype(np.float32)),
             torch.from_numpy(positions.astype(np.float32)),
             targets=None,
             headings=None,
-            rotations=quaternions,
+            rotations=None if rotations is None else _to_quaternions(rotations),
             has_times=trajectory.format is not PoseFormat.KITTI,
             is_trajectory=True,
             notes=tuple(notes),
@@ -501,10 +509,10 @@ class PathControl(Control):
         if trajectory.times is not None:
             return trajectory.times
         count = len(trajectory.positions)
-        seconds = (count - 1) / KITTI_RATE
         if "seconds" in self._settings:
             seconds = float(self.choice_values["seconds"])
         else:
+            seconds = (count - 1) / KITTI_RATE
             assumed["seconds"] = (
                 f"{KITTI_RATE:g} poses a second, {_format_rounded(seconds)} in all"
             )
@@ -534,24 +542,34 @@ class PathControl(Control):
         axes = str(self.choice_values["axes"] or OPTICAL)
         up = str(self.choice_values["up"] or trajectory.default_up)
         origin = self.choice_values["object_at"] or (0.0, 0.0, 0.0)
-        if trajectory.rotations is None and axes == NO_AXES:
+        has_rotations = trajectory.rotations is not None
+        if not has_rotations and axes == NO_AXES:
             raise InputError(
                 f"{self.name}: axes: {path} has no rotations; leave it out"
             )
-        if self.choice_values["axes"] is None and trajectory.rotations is not None:
+        assumed |= self._list_assumptions(axes, up, has_rotations=has_rotations)
+        positions, rotations = trajectory.orient(axes, up, origin)
+        _check_positions(path, positions)
+        return positions, rotations
+
+    def _list_assumptions(
+        self, axes: str, up: str, *, has_rotations: bool
+    ) -> dict[str, str]:
+        """Return the defaults that are used of `axes`, `up` and `object_at`, as texts.
+
+        Args:
+            axes: the axes of the poses.
+            up: the upward axis of the world.
+            has_rotations: whether the axes have an effect.
+        """
+        assumed = {}
+        if self.choice_values["axes"] is None and has_rotations:
             assumed["axes"] = f"{axes} ({AXES_DESCRIPTIONS[axes]})"
         if self.choice_values["up"] is None:
             assumed["up"] = up
         if self.choice_values["object_at"] is None:
             assumed["object_at"] = "[0, 0, 0]"
-        positions, rotations = trajectory.orient(axes, up, origin)
-        if np.abs(positions).max() > MAX_DISTANCE:
-            raise errors.FileFormatError(
-                f"{path}: expected positions within {MAX_DISTANCE:g} of the object, "
-                "got larger ones; set object_at to the object's position in the file's "
-                "world"
-            )
-        return positions, rotations
+        return assumed
 
     def get_parameter_spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         """Return the spec of a parameter.
@@ -591,16 +609,20 @@ class PathControl(Control):
         if CAMERA in self._movers:
             self._check_camera_is_free(scene)
         self._check_trajectory_choices()
-        control_in_scene = self.with_scene(scene)
-        names = _split_paths(self.choice_values["path"])
-        for name, movements in zip(names, self._paths, strict=True):
-            if CAMERA in movements:
-                control_in_scene._check_camera_off_target(name, movements)
+        self._check_cameras_off_target(scene)
         notes = self._list_notes()
         if not notes:
             return scene
         remarks = tuple(dict.fromkeys((*scene.remarks, *notes)))
         return replace(scene, remarks=remarks)
+
+    def _check_cameras_off_target(self, scene: SceneDescription) -> None:
+        """Check on each path that the camera is never at the point it looks at."""
+        control_in_scene = self.with_scene(scene)
+        names = _split_paths(self.choice_values["path"])
+        for name, movements in zip(names, self._paths, strict=True):
+            if CAMERA in movements:
+                control_in_scene._check_camera_off_target(name, movements)
 
     def _check_camera_is_free(self, scene: SceneDescription) -> None:
         """Raise InputError if the scene's camera or photograph fixes the camera's pose.
@@ -614,6 +636,10 @@ class PathControl(Control):
                 f"camera {scene.camera!r}; set moves=object, or set the camera to "
                 "'orbit'"
             )
+        self._check_has_no_photograph(scene)
+
+    def _check_has_no_photograph(self, scene: SceneDescription) -> None:
+        """Raise InputError if the scene is rendered into a photograph."""
         photograph = scene.backdrop_photograph
         if photograph is not None:
             raise InputError(
@@ -655,32 +681,39 @@ class PathControl(Control):
         Raises:
             InputError: the camera is at that point at some time.
         """
-        waypoint_times = [
-            movement.times
-            for movement in movements.values()
-            if isinstance(movement, Waypoints)
-        ]
-        even_times = torch.linspace(0.0, self.seconds, N_CHECKED_TIMES)
-        times = torch.cat([even_times, *waypoint_times]).unique()  # (n,) ascending
+        times = self._list_checked_times(movements)
         start = get_start_poses(self.scene, times.device)
         shift, _ = self._shift_object(movements, start, times)
         position, target = self._position_camera(movements, start, times, shift)
-        # (n, 3), also if nothing moves, when there is a single vector for all times
         to_target = (target - position).expand(len(times), 3).double()
         # For each step from one time to the next: the fraction of the step at which the
         # distance is smallest, and that distance; (n - 1,) each.
         fraction, distance = _find_closest_to_origin(to_target)
         if float(distance.min()) < MIN_TARGET_DISTANCE:
             index = int(distance.argmin())
-            collision_time = float(
-                torch.lerp(times[index], times[index + 1], fraction[index].float())
-            )
-            raise InputError(
-                f"`controls` {self.name}: {name}: {collision_time:.4g} s after its "
-                "start the camera is at the point that it looks at, so that it has no "
-                "direction; move the path away from that point, or state another point "
-                "to look at (look_x, look_y, look_z)"
-            )
+            fraction_of_step = fraction[index].float()
+            time = torch.lerp(times[index], times[index + 1], fraction_of_step)
+            raise self._make_collision_error(name, float(time))
+
+    def _list_checked_times(self, movements: MovementByMover) -> Tensor:
+        """Return times (n,) on a path, ascending, those of waypoints included."""
+        waypoint_times = [
+            movement.times
+            for movement in movements.values()
+            if isinstance(movement, Waypoints)
+        ]
+        even_times = torch.linspace(0.0, self.seconds, N_CHECKED_TIMES)
+        times: Tensor = torch.cat([even_times, *waypoint_times]).unique()
+        return times
+
+    def _make_collision_error(self, name: str, collision_time: float) -> InputError:
+        """Return the error of a camera that has no direction at a time in seconds."""
+        return InputError(
+            f"`controls` {self.name}: {name}: {collision_time:.4g} s after its "
+            "start the camera is at the point that it looks at, so that it has no "
+            "direction; move the path away from that point, or state another point "
+            "to look at (look_x, look_y, look_z)"
+        )
 
     def resolve_parameter(self, parameter: Parameter) -> Parameter:
         """Return the parameter for a scene: its range, and the time of the clean scene.
@@ -694,23 +727,27 @@ class PathControl(Control):
         """
         if parameter.name == Control.PATH_PARAMETER:
             return parameter
+        # `Parameter.ORBIT` are the estimators for a moving camera, not the movement.
+        estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
+        return replace(
+            parameter,
+            default=self._clean_time,
+            search=(0.0, self.seconds),
+            estimators=estimators,
+        )
+
+    @property
+    def _clean_time(self) -> float:
+        """The time, in seconds, at which the first path is as the scene describes it."""
         # The first movement of the first path decides. An orbit is an exception: it is
         # closed, so that both its start and its end are as in the scene. Then the second
         # movement decides, if there is one. (A movement is a name, or waypoints.)
         movement, *other_movements = self._paths[0].values()
         if other_movements and movement == ORBIT:
             movement = other_movements[0]
-        clean_time = 0.0  # for waypoints from a file
         if isinstance(movement, str):
-            clean_time = CLEAN_TIME_FRACTION.get(movement, 0.0) * self.seconds
-        # `Parameter.ORBIT` are the estimators for a moving camera, not the movement.
-        estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
-        return replace(
-            parameter,
-            default=clean_time,
-            search=(0.0, self.seconds),
-            estimators=estimators,
-        )
+            return CLEAN_TIME_FRACTION.get(movement, 0.0) * self.seconds
+        return 0.0  # for waypoints from a file
 
     def scene_inputs(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -728,20 +765,31 @@ class PathControl(Control):
         shift, heading = self._shift_object(movements, start, time)
         inputs = {}
         if CAMERA in self._movers:
-            position, target = self._position_camera(movements, start, time, shift)
-            roll = self.scene.get_number("camera.roll")
-            # None on a path on which only the object moves
-            movement = movements.get(CAMERA)
-            if isinstance(movement, Waypoints) and movement.rotations is not None:
-                pose = make_camera_pose(
-                    position, movement.interpolate_rotation(time), roll
-                )
-            else:
-                pose = make_look_at_pose(position, target, roll)
+            pose = self._compute_camera_pose(movements, start, time, shift)
             inputs["camera.to_world"] = pose
         if OBJECT in self._movers:
             inputs["object.to_world"] = make_object_pose(start, shift, heading)
         return inputs
+
+    def _compute_camera_pose(
+        self,
+        movements: MovementByMover,
+        start: StartPoses,
+        time: Tensor,
+        shift: Tensor,
+    ) -> Tensor:
+        """Return the pose (4, 4) of the camera at a time () in seconds.
+
+        The arguments are those of `_position_camera`.
+        """
+        position, target = self._position_camera(movements, start, time, shift)
+        roll = self.scene.get_number("camera.roll")
+        # None on a path on which only the object moves
+        movement = movements.get(CAMERA)
+        if isinstance(movement, Waypoints) and movement.rotations is not None:
+            rotation = movement.interpolate_rotation(time)
+            return make_camera_pose(position, rotation, roll)
+        return make_look_at_pose(position, target, roll)
 
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
@@ -810,29 +858,48 @@ class PathControl(Control):
             The camera's position and the point that it looks at, (..., 3) each, in
             object sizes.
         """
-        # columns of the pose: the camera's x axis points to the left, y up, z ahead
-        left, _, forward, scene_position = scene_start.camera[:3].unbind(dim=1)
         center = scene_start.center
         movement = movements.get(CAMERA)
         if movement is None:  # it keeps its direction, even if the object moves
+            # the columns of the pose: three axes, and the position
+            scene_position = scene_start.camera[:3].unbind(dim=1)[3]
             return scene_position, center
         if isinstance(movement, Waypoints):
             return self._camera_on_waypoints(movement, center, time, shift)
-        distance = (scene_position - center).norm()
-        reach = float(self.choice_values["reach"])
         progress = (time / self.seconds).clamp(0.0, 1.0)
-        if movement == APPROACH:
-            ahead = _level_direction(forward)
-            # It begins at `reach` times the distance at which it ends.
-            to_go = (1.0 - progress)[..., None]  # (..., 1), from 1 to 0
-            position = scene_position - ahead * distance * (reach - 1.0) * to_go
-        elif movement == PASS:
-            # (..., 1): 1 at the beginning, 0 at the position in the scene, -1 at the end
-            to_the_left = (1.0 - 2.0 * progress)[..., None]
-            position = scene_position + left * distance * reach * to_the_left
-        else:  # an orbit
-            position = center + _turn_about_vertical(scene_position - center, progress)
+        position = self._camera_on_named_path(movement, scene_start, progress)
         return position, center + shift
+
+    def _camera_on_named_path(
+        self, movement: str, scene_start: StartPoses, progress: Tensor
+    ) -> Tensor:
+        """Return the position (..., 3) of the camera on a named path, object sizes.
+
+        Args:
+            movement: one of `PATHS`.
+            scene_start: poses in the scene as it was described.
+            progress: (...,) fraction of the path, 0 to 1.
+        """
+        # columns of the pose: the camera's x axis points to the left, y up, z ahead
+        left, _, forward, scene_position = scene_start.camera[:3].unbind(dim=1)
+        from_center = scene_position - scene_start.center
+        if movement == ORBIT:
+            return scene_start.center + _turn_about_vertical(from_center, progress)
+        distance: Tensor = from_center.norm()
+        reach = float(self.choice_values["reach"])
+        if movement == APPROACH:
+            # It begins at `reach` times the distance at which it ends.
+            to_go: Tensor = (1.0 - progress)[..., None]  # (..., 1), from 1 to 0
+            distance_to_go = (
+                _level_direction(forward) * distance * (reach - 1.0) * to_go
+            )
+            approach_position: Tensor = scene_position - distance_to_go
+            return approach_position
+        # On "pass", (..., 1): 1 at the beginning, 0 at the position in the scene, -1 at
+        # the end.
+        to_the_left: Tensor = (1.0 - 2.0 * progress)[..., None]
+        position: Tensor = scene_position + left * distance * reach * to_the_left
+        return position
 
     def _camera_on_waypoints(
         self, waypoints: Waypoints, center: Tensor, time: Tensor, shift: Tensor
@@ -854,21 +921,16 @@ class PathControl(Control):
         """
         # Waypoints of the camera, and targets, are relative to the object's position in
         # the scene, wherever the object has moved.
-        position = (
-            center
-            + waypoints.interpolate(time, waypoints.positions)
-            / self.scene.size_in_metres
-        )
+        offset = waypoints.interpolate(time, waypoints.positions)
+        position = center + offset / self.scene.size_in_metres
         if waypoints.rotations is not None:
             rotation = waypoints.interpolate_rotation(time)  # (..., 3, 3)
             forward = rotation[..., :, 2]  # the third column
             return position, position + forward
         if waypoints.targets is None:
             return position, center + shift
-        target = (
-            waypoints.interpolate(time, waypoints.targets) / self.scene.size_in_metres
-        )
-        return position, center + target
+        target = waypoints.interpolate(time, waypoints.targets)
+        return position, center + target / self.scene.size_in_metres
 
     def _shift_object(
         self, movements: MovementByMover, scene_start: StartPoses, time: Tensor
@@ -889,34 +951,62 @@ class PathControl(Control):
             The shift (..., 3) in object sizes, and the turn (...,) in degrees.
         """
         camera = scene_start.camera
-        # columns of the pose: the camera's x axis points to the left, y up, z ahead
-        left, _, forward, position = camera[:3].unbind(dim=1)
         movement = movements.get(OBJECT)
-        no_shift = camera.new_zeros(3)
         no_turn = camera.new_zeros(())
         if movement is None:
-            return no_shift, no_turn
+            return camera.new_zeros(3), no_turn
         if isinstance(movement, Waypoints):
-            # The positions of an object's waypoints are relative to its position in the
-            # scene.
-            shift = movement.interpolate(time, movement.positions)
-            shift = shift / self.scene.size_in_metres
-            if movement.headings is None:
-                return shift, no_turn
-            return shift, movement.interpolate(time, movement.headings)
+            return self._shift_on_waypoints(movement, time, no_turn)
         progress = (time / self.seconds).clamp(0.0, 1.0)
         if movement == ORBIT:
-            return no_shift, 360.0 * progress
+            return camera.new_zeros(3), 360.0 * progress
+        return self._object_on_line(movement, scene_start, progress), no_turn
+
+    def _shift_on_waypoints(
+        self, waypoints: Waypoints, time: Tensor, no_turn: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return how far waypoints shift and turn the object.
+
+        Args:
+            waypoints: waypoints of the object, in metres.
+            time: (...,) seconds.
+            no_turn: () 0 degrees, for waypoints without headings.
+
+        Returns:
+            The shift (..., 3) in object sizes, and the turn (...,) in degrees.
+        """
+        # The positions of an object's waypoints are relative to its position in the
+        # scene.
+        shift = waypoints.interpolate(time, waypoints.positions)
+        shift = shift / self.scene.size_in_metres
+        if waypoints.headings is None:
+            return shift, no_turn
+        return shift, waypoints.interpolate(time, waypoints.headings)
+
+    def _object_on_line(
+        self, movement: str, scene_start: StartPoses, progress: Tensor
+    ) -> Tensor:
+        """Return the shift (..., 3) of the object on a straight line, object sizes.
+
+        Args:
+            movement: "approach" or "pass".
+            scene_start: poses in the scene as it was described.
+            progress: (...,) fraction of the path, 0 to 1.
+        """
+        # columns of the pose: the camera's x axis points to the left, y up, z ahead
+        left, _, forward, position = scene_start.camera[:3].unbind(dim=1)
         reach = float(self.choice_values["reach"])
-        distance = (position - scene_start.center).norm()
+        distance: Tensor = (position - scene_start.center).norm()
         if movement == APPROACH:
             # It begins at `reach` times the distance from the camera at which it ends.
-            to_go = distance * (reach - 1.0) * (1.0 - progress)
-            return _level_direction(forward) * to_go[..., None], no_turn
+            to_go: Tensor = distance * (reach - 1.0) * (1.0 - progress)
+            approach_shift: Tensor = _level_direction(forward) * to_go[..., None]
+            return approach_shift
         # On "pass" it is to the right of its position in the scene at first (over 0),
         # then to the left (under 0).
-        to_right = distance * reach * (1.0 - 2.0 * progress)
-        return _level_direction(-left) * to_right[..., None], no_turn
+        to_right: Tensor = distance * reach * (1.0 - 2.0 * progress)
+        pass_shift: Tensor = _level_direction(-left) * to_right[..., None]
+        return pass_shift
 
 
 @geometry.cache_per_scene
@@ -1017,6 +1107,56 @@ def _roll_camera(
     return geometry.make_affine(axes, position)
 
 
+def _list_trajectory_notes(
+    path: Path,
+    trajectory: Trajectory,
+    assumed: Mapping[str, str],
+    rotations: Rotation | None,
+) -> list[str]:
+    """List the notes on a trajectory: how it was read, what was assumed, and its tilt.
+
+    Args:
+        path: the file.
+        trajectory: what was read from it.
+        assumed: defaults of choices that the user left out, by name.
+        rotations: rotations of the camera; None if it looks at the object.
+    """
+    notes = list(trajectory.notes)
+    if assumed:
+        notes.append(_describe_assumptions(path, trajectory.format, assumed))
+    if rotations is not None:
+        notes += _warn_of_tilt(path, rotations)
+    return notes
+
+
+def _warn_of_tilt(path: Path, rotations: Rotation) -> list[str]:
+    """Return a warning if a camera seems to be tilted, or none."""
+    tilt = measure_tilt(rotations)
+    if tilt > MAX_TILT:
+        return [
+            f"{path}: the upward direction of its pictures is {tilt:.0f} "
+            "degrees from the vertical, on average; another `axes` or "
+            "`up` may be right."
+        ]
+    return []
+
+
+def _to_quaternions(rotations: Rotation) -> Tensor:
+    """Return rotations as quaternions (n, 4) x, y, z, w, neighbors with similar signs."""
+    quaternions = align_quaternions(rotations.as_quat())
+    return torch.from_numpy(quaternions.astype(np.float32))
+
+
+def _check_positions(path: Path, positions: assets.Float64Array) -> None:
+    """Raise FileFormatError if a position (n, 3) is too far from the object."""
+    if np.abs(positions).max() > MAX_DISTANCE:
+        raise errors.FileFormatError(
+            f"{path}: expected positions within {MAX_DISTANCE:g} of the object, "
+            "got larger ones; set object_at to the object's position in the file's "
+            "world"
+        )
+
+
 def measure_tilt(rotations: Rotation) -> float:
     """Return the angle between a camera's upward direction and the vertical, degrees.
 
@@ -1100,16 +1240,9 @@ def unwrap_headings(
     Returns:
         The headings (n,), and a note for the user; None if nothing was changed.
     """
-    low = float(degrees.min())
-    high = float(degrees.max())
     # steps for which the other direction is shorter
     jumps = np.nonzero(np.abs(np.diff(degrees)) > 180.0)[0]
-    has_usual_bounds = (0.0 <= low and high <= 360.0) or (
-        -180.0 <= low and high <= 180.0
-    )
-    # Both 0 and 360 in one file are a full turn that is meant.
-    has_full_turn = high - low >= 360.0
-    if not len(jumps) or has_full_turn or not has_usual_bounds:
+    if not len(jumps) or not _is_within_turn(degrees):
         return degrees, None
     # headings before and after the first such step, for the note
     first = f"{degrees[jumps[0]]:g}"
@@ -1119,6 +1252,18 @@ def unwrap_headings(
         "longer one, add a waypoint between them"
     )
     return np.asarray(np.unwrap(degrees, period=360.0)), note
+
+
+def _is_within_turn(degrees: assets.Float64Array) -> bool:
+    """Return whether headings (n,) are in usual bounds, and less than a turn apart."""
+    low = float(degrees.min())
+    high = float(degrees.max())
+    has_usual_bounds = (0.0 <= low and high <= 360.0) or (
+        -180.0 <= low and high <= 180.0
+    )
+    # Both 0 and 360 in one file are a full turn that is meant.
+    has_full_turn = high - low >= 360.0
+    return has_usual_bounds and not has_full_turn
 
 
 def _describe_assumptions(
@@ -1212,32 +1357,49 @@ def read_waypoints(
     times = column.pop(TIME_COLUMN)
     times = times - times[0]
     check_times(path, times)
-    # A comparison with NaN is false, so that NaN is rejected as well.
-    if not all(np.abs(values).max() <= MAX_DISTANCE for values in column.values()):
-        raise errors.FileFormatError(
-            f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones or NaN"
-        )
+    _check_number_sizes(path, column)
     notes = _unwrap_heading_columns(path, column)
-
     seconds = torch.from_numpy(times.astype(np.float32))
-    positions = _stack_columns(column, POSITION_COLUMNS)
-    assert positions is not None  # `_check_header` requires them
-    # "heading" is only in a file for the object; in one for the camera, the object's is
-    # "object_heading".
-    waypoints = {
-        mover: Waypoints(
-            seconds,
-            positions,
-            targets=_stack_columns(column, TARGET_COLUMNS),
-            headings=_stack_columns(column, (HEADING_COLUMN,)),
-            notes=notes.get(HEADING_COLUMN, ()),
-        )
-    }
+    heading_notes = notes.get(HEADING_COLUMN, ())
+    waypoints = {mover: _make_waypoints(column, seconds, heading_notes)}
     object_notes = notes.get(OBJECT_HEADING_COLUMN, ())
     object_waypoints = _make_object_waypoints(column, seconds, object_notes)
     if object_waypoints is not None:
         waypoints[OBJECT] = object_waypoints
     return waypoints
+
+
+def _check_number_sizes(path: Path, column: Mapping[str, assets.Float64Array]) -> None:
+    """Raise FileFormatError for a number that is too large, or NaN."""
+    # A comparison with NaN is false, so that NaN is rejected as well.
+    if not all(np.abs(values).max() <= MAX_DISTANCE for values in column.values()):
+        raise errors.FileFormatError(
+            f"{path}: expected numbers within {MAX_DISTANCE:g}, got larger ones or NaN"
+        )
+
+
+def _make_waypoints(
+    column: Mapping[str, assets.Float64Array], seconds: Tensor, notes: tuple[str, ...]
+) -> Waypoints:
+    """Return the movement along the columns x, y and z of a table.
+
+    "heading" is only in a file for the object; in one for the camera, the object's is
+    "object_heading".
+
+    Args:
+        column: columns (n,) by name.
+        seconds: (n,) times.
+        notes: notes on the headings.
+    """
+    positions = _stack_columns(column, POSITION_COLUMNS)
+    assert positions is not None  # `_check_header` requires them
+    return Waypoints(
+        seconds,
+        positions,
+        targets=_stack_columns(column, TARGET_COLUMNS),
+        headings=_stack_columns(column, (HEADING_COLUMN,)),
+        notes=notes,
+    )
 
 
 def _make_object_waypoints(
@@ -1287,6 +1449,19 @@ def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> N
         FileFormatError: a column is missing, unknown or there twice.
     """
     required = (TIME_COLUMN, *POSITION_COLUMNS)
+    if not _has_valid_columns(header, required, optional):
+        raise errors.FileFormatError(
+            f"{path}: expected columns {', '.join(required)}, and perhaps "
+            f"{', '.join(optional)}, got "
+            f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or "
+            "KITTI"
+        )
+
+
+def _has_valid_columns(
+    header: Sequence[str], required: Sequence[str], optional: Sequence[str]
+) -> bool:
+    """Return whether no column is missing, unknown or there twice."""
     names = set(header)
     is_missing = not set(required) <= names
     has_duplicates = len(names) < len(header)
@@ -1296,13 +1471,7 @@ def _check_header(path: Path, header: list[str], optional: tuple[str, ...]) -> N
         0 < len(names.intersection(group)) < len(group)
         for group in (TARGET_COLUMNS, OBJECT_SHIFT_COLUMNS)
     )
-    if is_missing or has_duplicates or is_unknown or is_incomplete:
-        raise errors.FileFormatError(
-            f"{path}: expected columns {', '.join(required)}, and perhaps "
-            f"{', '.join(optional)}, got "
-            f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or "
-            "KITTI"
-        )
+    return not (is_missing or has_duplicates or is_unknown or is_incomplete)
 
 
 def _parse_numbers(

@@ -12,7 +12,7 @@ world.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -145,8 +145,7 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
             quaternions do not have the length 1, matrices are no rotations, or the
             columns of the table are unknown.
     """
-    lines = [line.strip() for line in text.splitlines()]
-    lines = [line for line in lines if line]
+    lines = _list_filled_lines(text)
     first_row = next((index for index, line in enumerate(lines) if _is_row(line)), None)
     if first_row is None:
         return None
@@ -154,22 +153,42 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     candidates = [_split(line.lstrip("#").strip()) for line in lines[:first_row]]
     # `_find_columns` is empty for a line that does not name a trajectory's columns
     headers = [names for names in candidates if _find_columns(names)]
-    if not headers:
-        is_waypoint_table = any(WAYPOINT_COLUMNS <= set(names) for names in candidates)
-        # Between commas, a line before the numbers is a header of another kind of table.
-        # Without commas it may be a comment, as files of TUM have them.
-        has_unknown_header = has_commas and bool(candidates)
-        if is_waypoint_table or has_unknown_header:
-            return None
+    if not headers and _is_other_table(candidates, has_commas):
+        return None
     # without comments between the rows
     rows = [_split(line) for line in lines[first_row:] if not line.startswith("#")]
+    _check_row_count(path, rows)
+    if headers:
+        return _read_named_columns(path, headers[-1], rows, has_commas)
+    return _read_unnamed_columns(path, rows, has_commas)
+
+
+def _list_filled_lines(text: str) -> list[str]:
+    """Return the lines of a text that are not blank, without space around them."""
+    lines = [line.strip() for line in text.splitlines()]
+    return [line for line in lines if line]
+
+
+def _is_other_table(candidates: Sequence[Sequence[str]], has_commas: bool) -> bool:
+    """Return whether lines before the first row are headers of another kind of table.
+
+    Args:
+        candidates: cells of each line, none of which names a trajectory's columns.
+        has_commas: whether commas separate the columns.
+    """
+    is_waypoint_table = any(WAYPOINT_COLUMNS <= set(names) for names in candidates)
+    # Between commas, a line before the numbers is a header of another kind of table.
+    # Without commas it may be a comment, as files of TUM have them.
+    has_unknown_header = has_commas and bool(candidates)
+    return is_waypoint_table or has_unknown_header
+
+
+def _check_row_count(path: Path, rows: Sequence[Sequence[str]]) -> None:
+    """Raise FileFormatError if a trajectory has too many rows."""
     if len(rows) > MAX_ROWS:
         raise errors.FileFormatError(
             f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}"
         )
-    if headers:
-        return _read_named_columns(path, headers[-1], rows, has_commas)
-    return _read_unnamed_columns(path, rows, has_commas)
 
 
 def _read_unnamed_columns(
@@ -186,27 +205,36 @@ def _read_unnamed_columns(
         FileFormatError: it has commas, or another number of columns.
     """
     if has_commas:
-        raise errors.FileFormatError(
-            f"{path}: expected a first line that names the columns, got numbers; add "
-            "time,x,y,z, or the line of EuRoC's "
-            "files: #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w "
-            "[],q_RS_x [],q_RS_y [],q_RS_z []"
-        )
+        raise _make_header_error(path)
     count = len(rows[0])
     if count == 8:
-        return _read_named_columns(
-            path, ["timestamp", "tx", "ty", "tz", *QUATERNION], rows, False
-        )
+        names = ["timestamp", "tx", "ty", "tz", *QUATERNION]
+        return _read_named_columns(path, names, rows, False)
     if count == 12:
         return _read_kitti(path, rows)
+    raise _make_column_count_error(path, count)
+
+
+def _make_column_count_error(path: Path, count: int) -> errors.FileFormatError:
+    """Return the error for a table of poses without a header, with `count` columns."""
     hint = ""
     # a matrix of 12 or 16 numbers after the index of an image
     if count in (13, 17):
         hint = " (KITTI-360's first column is the index of a picture; leave it out)"
-    raise errors.FileFormatError(
+    return errors.FileFormatError(
         f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, "
         "or 12 as KITTI's poses, got "
         f"{count}{hint}"
+    )
+
+
+def _make_header_error(path: Path) -> errors.FileFormatError:
+    """Return the error for a table with commas, but without names of columns."""
+    return errors.FileFormatError(
+        f"{path}: expected a first line that names the columns, got numbers; add "
+        "time,x,y,z, or the line of EuRoC's "
+        "files: #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w "
+        "[],q_RS_x [],q_RS_y [],q_RS_z []"
     )
 
 
@@ -256,14 +284,24 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
         if column in columns:
             return {}
         columns[column] = index
-    has_quaternion = set(QUATERNION) <= set(columns)
+    return columns if _are_columns_of_trajectory(columns.keys(), names) else {}
+
+
+def _are_columns_of_trajectory(columns: Set[str], names: Sequence[str]) -> bool:
+    """Return whether all columns of a trajectory are in a table, which has no others.
+
+    Args:
+        columns: standard names of the columns.
+        names: names in the file.
+    """
+    has_quaternion = set(QUATERNION) <= columns
     has_any_component = not set(QUATERNION).isdisjoint(columns)
     has_part_of_quaternion = has_any_component and not has_quaternion
-    if has_part_of_quaternion or not {"time", *POSITION} <= set(columns):
-        return {}
+    if has_part_of_quaternion or not {"time", *POSITION} <= columns:
+        return False
     # A table of waypoints has no quaternion, but the same names for time and position.
     is_waypoint_table = not has_quaternion and WAYPOINT_COLUMNS <= set(names)
-    return {} if is_waypoint_table else columns
+    return not is_waypoint_table
 
 
 def _read_table(
@@ -275,17 +313,22 @@ def _read_table(
         FileFormatError: a row has another length, or a cell is no finite number.
     """
     for row in rows:
-        if len(row) != count or not all(map(reading.is_number, row)):
-            raise errors.FileFormatError(
-                f"{path}: expected {count} numbers in each row, got "
-                f"{reading.format_name(' '.join(row))}"
-            )
+        _check_row(path, row, count)
     table: assets.Float64Array = np.array(rows, dtype=object).astype(np.float64)
     if not np.isfinite(table).all():
         raise errors.FileFormatError(
             f"{path}: expected finite numbers, got infinity or NaN"
         )
     return table
+
+
+def _check_row(path: Path, row: Sequence[str], count: int) -> None:
+    """Raise FileFormatError if a row has another length, or a cell is no number."""
+    if len(row) != count or not all(map(reading.is_number, row)):
+        raise errors.FileFormatError(
+            f"{path}: expected {count} numbers in each row, got "
+            f"{reading.format_name(' '.join(row))}"
+        )
 
 
 def _read_named_columns(
@@ -304,9 +347,7 @@ def _read_named_columns(
     """
     columns = _find_columns(names)
     table = _read_table(path, rows, len(names))
-    used_indices = set(columns.values())
-    unread = [name for index, name in enumerate(names) if index not in used_indices]
-    notes = [f"{path}: not read: {reading.join_names(unread)}."] if unread else []
+    notes = _list_unread_columns(path, names, columns)
     times = table[:, columns["time"]]
     time_name = names[columns["time"]]
     unit = _find_time_unit(path, time_name, times, notes)  # may add to `notes`
@@ -314,13 +355,27 @@ def _read_named_columns(
     # be rounded.
     times = (times - times[0]) * UNITS[unit]
     positions = table[:, [columns[name] for name in POSITION]]
-    rotations = None
-    if "qw" in columns:
-        quaternions = table[:, [columns[name] for name in QUATERNION]]
-        _check_quaternions(path, quaternions)
-        rotations = Rotation.from_quat(quaternions)
+    rotations = _read_rotations(path, table, columns) if "qw" in columns else None
     pose_format = PoseFormat.EUROC if has_commas else PoseFormat.TUM
     return Trajectory(pose_format, times, positions, rotations, tuple(notes))
+
+
+def _list_unread_columns(
+    path: Path, names: Sequence[str], columns: Mapping[str, int]
+) -> list[str]:
+    """Return a note on columns of a file that are left out, or none."""
+    used_indices = set(columns.values())
+    unread = [name for index, name in enumerate(names) if index not in used_indices]
+    return [f"{path}: not read: {reading.join_names(unread)}."] if unread else []
+
+
+def _read_rotations(
+    path: Path, table: assets.Float64Array, columns: Mapping[str, int]
+) -> Rotation:
+    """Return the rotations in a table, whose columns have indices by name."""
+    quaternions = table[:, [columns[name] for name in QUATERNION]]
+    _check_quaternions(path, quaternions)
+    return Rotation.from_quat(quaternions)
 
 
 def _find_time_unit(
@@ -342,13 +397,7 @@ def _find_time_unit(
     """
     stated = UNIT.search(name)
     if stated:
-        unit = stated[1].strip()
-        if unit not in UNITS:
-            raise errors.FileFormatError(
-                f"{path}: expected times in {', '.join(UNITS)}, got "
-                f"{reading.format_name(unit)}; correct the first line"
-            )
-        return unit
+        return _check_time_unit(path, stated[1].strip())
     # The unit of a time since 1970 follows from its size: nanoseconds are the largest
     # numbers.
     for min_time, unit in UNIT_BY_SIZE:
@@ -359,6 +408,16 @@ def _find_time_unit(
             )
             return unit
     return "s"
+
+
+def _check_time_unit(path: Path, unit: str) -> str:
+    """Return a unit that the first line of a file states; raise if it is unknown."""
+    if unit not in UNITS:
+        raise errors.FileFormatError(
+            f"{path}: expected times in {', '.join(UNITS)}, got "
+            f"{reading.format_name(unit)}; correct the first line"
+        )
+    return unit
 
 
 def _check_quaternions(path: Path, quaternions: assets.Float64Array) -> None:
@@ -381,6 +440,19 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
     """
     poses = _read_table(path, rows, 12).reshape(-1, 3, 4)
     matrices = poses[:, :, :3]
+    _check_matrices(path, matrices)
+    rotations = Rotation.from_matrix(matrices)
+    return Trajectory(
+        PoseFormat.KITTI,
+        times=None,
+        positions=poses[:, :, 3],
+        rotations=rotations,
+        notes=(),
+    )
+
+
+def _check_matrices(path: Path, matrices: assets.Float64Array) -> None:
+    """Raise FileFormatError if one of the matrices (n, 3, 3) is no rotation."""
     # A rotation times its transpose is the identity. The same is true for a reflection,
     # but that has a negative determinant.
     products = matrices @ matrices.transpose(0, 2, 1)
@@ -392,11 +464,3 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
             "(3 "
             "rows of 4), got another map"
         )
-    rotations = Rotation.from_matrix(matrices)
-    return Trajectory(
-        PoseFormat.KITTI,
-        times=None,
-        positions=poses[:, :, 3],
-        rotations=rotations,
-        notes=(),
-    )

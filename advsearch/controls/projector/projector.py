@@ -229,6 +229,10 @@ class ProjectorControl(PictureControl):
         # as a string, since settings are stored as JSON
         self._settings["picture"] = str(picture)
         self.choice_values["picture"] = str(picture)
+        self._check_fits_picture()
+
+    def _check_fits_picture(self) -> None:
+        """Raise InputError if a choice for searched texels is set besides a picture."""
         conflicting = [
             setting
             for setting in ("pattern", "epsilon", "norm", "resolution", "aspect")
@@ -272,28 +276,37 @@ class ProjectorControl(PictureControl):
         the start, at most `MAX_DEFAULT_FOV`. A remark is added if the scene's
         brightness has no unit, as lumens can't be compared with it then.
         """
-        picture = self.read_picture()
-        if picture is None:
-            rows = int(self.choice_values["resolution"])
-            # An image has at least two texels along each side.
-            columns = max(2, round(rows * self.choice_values["aspect"]))
-        else:
-            rows, columns = picture.shape[:2]
+        rows, columns = self._find_sides()
         fov = self.choice_values["fov"]
         if fov is None:
             fov = self._compute_covering_fov(scene, aspect=columns / rows)
         part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
+        scene = replace(scene, remarks=(*scene.remarks, *self._list_unit_notes(scene)))
+        return scene.with_part(part)
+
+    def _list_unit_notes(self, scene: SceneDescription) -> list[str]:
+        """List the note that the brightness of a scene's environment has no unit."""
         # With candelas per unit of radiance, light in the scene can be converted to lux.
         has_unit = (
             scene.environment is not None and scene.environment.candelas is not None
         )
-        if not has_unit and "ambient" not in self.specs:
-            note = (
-                "The environment's brightness has no unit: its light is taken as "
-                f"{DEFAULT_AMBIENT_LUX:g} lux, unless {self.name}.ambient is set."
-            )
-            scene = replace(scene, remarks=(*scene.remarks, note))
-        return scene.with_part(part)
+        if has_unit or "ambient" in self.specs:
+            return []
+        return [
+            "The environment's brightness has no unit: its light is taken as "
+            f"{DEFAULT_AMBIENT_LUX:g} lux, unless {self.name}.ambient is set."
+        ]
+
+    def _find_sides(self) -> tuple[int, int]:
+        """Return the rows and columns of texels of the projected image."""
+        picture = self.read_picture()
+        if picture is not None:
+            rows, columns = picture.shape[:2]
+            return rows, columns
+        rows = int(self.choice_values["resolution"])
+        # An image has at least two texels along each side.
+        columns = max(2, round(rows * self.choice_values["aspect"]))
+        return rows, columns
 
     def _compute_covering_fov(self, scene: SceneDescription, aspect: float) -> float:
         """Return the angle of the image's width at which it just covers the object.
@@ -320,10 +333,6 @@ class ProjectorControl(PictureControl):
         camera, and another azimuth, by `DEFAULT_CAMERA_ANGLE`.
         """
         parameter = super().resolve_parameter(parameter)
-        scene = self.scene
-        camera_position = geometry.camera_to_world(scene)[:3, 3]
-        camera_offset = camera_position - geometry.compute_center(scene)
-        camera_distance = float(np.linalg.norm(camera_offset))
         match parameter.name:
             case "pattern":
                 grey = START_GREY if self.choice_values["start"] == "grey" else 0.0
@@ -333,20 +342,30 @@ class ProjectorControl(PictureControl):
             case "lumens":
                 lumens = min(DEFAULT_LUMENS, self._compute_max_lumens())
                 return replace(parameter, default=lumens)
-            case "azimuth":
-                azimuth = math.degrees(math.atan2(camera_offset[1], camera_offset[0]))
-                return replace(parameter, default=azimuth + DEFAULT_CAMERA_ANGLE)
-            case "elevation":
-                elevation = math.degrees(math.asin(camera_offset[2] / camera_distance))
-                return replace(parameter, default=min(max(elevation, -89.0), 89.0))
-            case "distance":
-                has_metres = scene.object.size_in_metres is not None
-                return replace(
-                    parameter,
-                    default=camera_distance * scene.size_in_metres,
-                    unit="metres" if has_metres else "object sizes",
-                )
+            case "azimuth" | "elevation" | "distance":
+                return self._resolve_position(parameter)
         return parameter
+
+    def _resolve_position(self, parameter: Parameter) -> Parameter:
+        """Return a parameter of the position with its default, near the camera."""
+        scene = self.scene
+        camera_position = geometry.camera_to_world(scene)[:3, 3]
+        camera_offset = camera_position - geometry.compute_center(scene)
+        camera_distance = float(np.linalg.norm(camera_offset))
+        x, y, z = camera_offset
+        if parameter.name == "azimuth":
+            azimuth = math.degrees(math.atan2(y, x))
+            return replace(parameter, default=azimuth + DEFAULT_CAMERA_ANGLE)
+        if parameter.name == "elevation":
+            elevation = math.degrees(math.asin(z / camera_distance))
+            # within the bounds of the parameter
+            return replace(parameter, default=min(max(elevation, -89.0), 89.0))
+        has_metres = scene.object.size_in_metres is not None
+        return replace(
+            parameter,
+            default=camera_distance * scene.size_in_metres,
+            unit="metres" if has_metres else "object sizes",
+        )
 
     def _compute_ambient_lux(self) -> float:
         """Return the illuminance by the environment, lux.
@@ -397,17 +416,20 @@ class ProjectorControl(PictureControl):
         )
         self._picture = self.read_picture()
         super().bind_parameters()
+        self.flashes = self._find_max_flicker()
+
+    def _find_max_flicker(self) -> float:
+        """Return the largest number of flashes per second."""
         flicker = next(
             slot.parameter_spec
             for slot in self.parameter_slots
             if slot.parameter.name == "flicker"
         )
         if isinstance(flicker, Range):
-            self.flashes = flicker.high
-        else:
-            # 0 Hz if the user did not set it
-            rates = self.list_allowed_values("flicker", 0.0)
-            self.flashes = max(map(float, rates))
+            return flicker.high
+        # 0 Hz if the user did not set it
+        rates = self.list_allowed_values("flicker", 0.0)
+        return max(map(float, rates))
 
     def read_picture(self) -> Tensor | None:
         """Return the image (h, w, 3) sRGB of the `picture` file, or None.
@@ -467,16 +489,29 @@ class ProjectorControl(PictureControl):
         The light is 0 while a flickering projector is off. It is in the scene's unit of
         radiance, at a distance of one scene unit from the projector.
         """
+        pose = self._compute_pose_from_values(values)
+        light = self.compute_projected_image(values)
+        if self._flashes_off(values):
+            light = 0.0 * light  # still depends on the pattern, for its derivative
+        white = self._compute_white_radiance(values)
+        return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
+
+    def _compute_pose_from_values(self, values: Values) -> Tensor:
+        """Return the pose (4, 4) of the projector, a copy without derivatives."""
         pose = make_projector_pose(
             self.scene,
             float(values["azimuth"].detach()),
             float(values["elevation"].detach()),
             float(values["distance"].detach()),
         )
-        pose = pose.to(values["distance"], copy=True)
-        light = self.compute_projected_image(values)
-        if self._flashes_off(values):
-            light = 0.0 * light  # still depends on the pattern, for its derivative
+        return pose.to(values["distance"], copy=True)
+
+    def _compute_white_radiance(self, values: Values) -> Tensor:
+        """Return the radiance () of a white texel, in the scene's unit.
+
+        The projector's input is the radiance of a white diffuse screen at a distance of
+        one scene unit, which is the irradiance over pi.
+        """
         distance_in_units = values["distance"].detach() / self.scene.size_in_metres
         # The irradiance of a white texel at a distance of one scene unit. It is that at the
         # object (the ratio to the ambient light times `metered_irradiance`) times the
@@ -486,10 +521,7 @@ class ProjectorControl(PictureControl):
             * distance_in_units**2
             * self.scene.metered_irradiance
         )
-        # The projector's input is the radiance of a white diffuse screen at that distance,
-        # which is the irradiance over pi.
-        white = white_irradiance / math.pi
-        return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
+        return white_irradiance / math.pi
 
     def _flashes_off(self, values: Values) -> bool:
         """Return whether the light is off at this moment of its flicker."""
@@ -528,16 +560,13 @@ class ProjectorControl(PictureControl):
         The brightness is in lux, and relative to the ambient light; the mean is a
         fraction of white.
         """
+        white_lux = float(self._compute_white_lux(values))
+        ratio = float(self._compute_ambient_ratio(values))
+        mean = float(color.srgb_to_linear(values["pattern"]).mean())
         return {
-            "white": Value(value=float(self._compute_white_lux(values)), unit="lux"),
-            "beside_ambient": Value(
-                value=float(self._compute_ambient_ratio(values)),
-                unit="times the ambient light",
-            ),
-            "mean": Value(
-                value=float(color.srgb_to_linear(values["pattern"]).mean()),
-                unit="of white",
-            ),
+            "white": Value(value=white_lux, unit="lux"),
+            "beside_ambient": Value(value=ratio, unit="times the ambient light"),
+            "mean": Value(value=mean, unit="of white"),
         }
 
     def make_artifact_images(
@@ -563,10 +592,7 @@ def blur_light(light: Tensor, blur: Tensor) -> Tensor:
     if not sigma and not blur.requires_grad:
         return light
     radius = math.ceil(3.0 * sigma) + 1
-    offsets = torch.arange(-radius, radius + 1).to(blur)
-    # at least 0.1 texels, which is invisible: the derivative is undefined at 0
-    kernel = torch.exp(-0.5 * (offsets / blur.clamp_min(0.1)) ** 2)
-    kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
+    kernel = _make_blur_kernel(radius, blur)
     blurred_rows = functional.conv2d(
         images.to_planes(light), kernel, padding=(0, radius), groups=3
     )
@@ -574,6 +600,17 @@ def blur_light(light: Tensor, blur: Tensor) -> Tensor:
         blurred_rows, kernel.transpose(2, 3), padding=(radius, 0), groups=3
     )
     return images.to_image(blurred)
+
+
+def _make_blur_kernel(radius: int, blur: Tensor) -> Tensor:
+    """Return a Gaussian kernel (3, 1, 1, 2 radius + 1) for three channels.
+
+    `blur` () is its standard deviation in texels.
+    """
+    offsets = torch.arange(-radius, radius + 1).to(blur)
+    # at least 0.1 texels, which is invisible: the derivative is undefined at 0
+    kernel = torch.exp(-0.5 * (offsets / blur.clamp_min(0.1)) ** 2)
+    return (kernel / kernel.sum()).expand(3, 1, 1, -1)
 
 
 @geometry.cache_per_scene

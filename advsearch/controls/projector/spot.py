@@ -149,19 +149,21 @@ class SpotControl(ProjectorControl):
         """
         if parameter.name != "lumens":
             return super().resolve_parameter(parameter)
+        max_lumens = self._find_max_lumens()
+        default = 0.0
+        if self.has_requested_range and not self.is_searched("lumens"):
+            default = max_lumens
+        return replace(parameter, search=(0.0, max_lumens), default=default)
+
+    def _find_max_lumens(self) -> float:
+        """Return the upper bound of the range in which lumens are searched."""
         # The spot is a Gaussian: standard deviation in metres, and integral in squared
         # metres if its peak is 1.
         std = DEFAULT_WIDTH / WIDTH_PER_DEVIATION * self.scene.size_in_metres
         effective_area = 2.0 * math.pi * std**2
         ambient_lux = float(self.get_clean_value("ambient"))
-        max_lumens = min(
-            DEFAULT_LUMENS,
-            MAX_AMBIENT_FACTOR * ambient_lux * effective_area,
-        )
-        default = 0.0
-        if self.has_requested_range and not self.is_searched("lumens"):
-            default = max_lumens
-        return replace(parameter, search=(0.0, max_lumens), default=default)
+        max_bright_lumens = MAX_AMBIENT_FACTOR * ambient_lux * effective_area
+        return min(DEFAULT_LUMENS, max_bright_lumens)
 
     def get_value_without_control(self, parameter: Parameter) -> float | str:
         return 0.0  # only that of the lumens is used (`strength_parameter`)
@@ -173,21 +175,15 @@ class SpotControl(ProjectorControl):
         projector's direction. The spot is a Gaussian, scaled so that its total light
         does not depend on the width.
         """
-        # half the width of the projector's square image in that plane, object sizes
+        # half the width of the projector's square image in the plane through the
+        # object's center, object sizes
         half_width = (
             math.tan(math.radians(self.projector_part.fov) / 2.0)
             * values["distance"].detach()
             / self.scene.size_in_metres
         )
-        rows, columns = self.projector_part.sides
-        # Positions of the texels' centers in that plane. Rows go downwards, but `y` goes
-        # upwards.
-        right = _compute_texel_centers(columns).to(half_width) * half_width
-        down = _compute_texel_centers(rows).to(half_width) * half_width
+        squared_distance = self._compute_squared_distance(values, half_width)
         std = values["width"] / WIDTH_PER_DEVIATION
-        x_offset = right[None] - values["x"]
-        y_offset = -down[:, None] - values["y"]
-        squared_distance = x_offset**2 + y_offset**2
         gaussian = torch.exp(-0.5 * squared_distance / std**2)
         # The Gaussian is scaled so that the mean of the image is about 1.
         image_area = (2.0 * half_width) ** 2
@@ -195,20 +191,30 @@ class SpotControl(ProjectorControl):
         spot = gaussian * image_area / integral
         return spot[..., None] * color.combine_channels(values)
 
+    def _compute_squared_distance(self, values: Values, half_width: Tensor) -> Tensor:
+        """Return the squared distance (h, w) of each texel from the spot's center.
+
+        `half_width` () is half the width of the image, in object sizes.
+        """
+        rows, columns = self.projector_part.sides
+        # Positions of the texels' centers in the plane of the image. Rows go downwards,
+        # but `y` goes upwards.
+        right = _compute_texel_centers(columns).to(half_width) * half_width
+        down = _compute_texel_centers(rows).to(half_width) * half_width
+        x_offset = right[None] - values["x"]
+        y_offset = -down[:, None] - values["y"]
+        return x_offset**2 + y_offset**2
+
     def compute_measurements(
         self, values: Values, earlier_inputs: Mapping[str, Tensor]
     ) -> dict[str, Value]:
         """Return the brightness of the brightest point of the spot."""
         brightest = float(self.compute_projected_image(values).detach().max())
+        lux = brightest * float(self._compute_white_lux(values))
+        ratio = brightest * float(self._compute_ambient_ratio(values))
         return {
-            "lux": Value(
-                value=float(brightest * float(self._compute_white_lux(values))),
-                unit="lux, where it is brightest",
-            ),
-            "beside_ambient": Value(
-                value=float(brightest * float(self._compute_ambient_ratio(values))),
-                unit="times the ambient light",
-            ),
+            "lux": Value(value=lux, unit="lux, where it is brightest"),
+            "beside_ambient": Value(value=ratio, unit="times the ambient light"),
         }
 
 

@@ -87,17 +87,15 @@ def warp(image: Tensor, offsets: Tensor) -> Tensor:
     rows, columns = torch.meshgrid(
         torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"
     )
-    positions = torch.stack([columns, rows], dim=-1).to(image.device) + offsets.to(
-        image.device
-    )
+    centers = torch.stack([columns, rows], dim=-1).to(image.device)
+    positions = centers + offsets.to(image.device)
     # grid_sample wants positions in [-1, 1]
     scale = torch.tensor([2.0 / width, 2.0 / height], device=image.device)
-    grid = positions * scale - 1.0
-    return to_image(
-        F.grid_sample(
-            to_planes(image), grid[None], padding_mode="reflection", align_corners=False
-        )
+    grid = (positions * scale - 1.0)[None]
+    warped = F.grid_sample(
+        to_planes(image), grid, padding_mode="reflection", align_corners=False
     )
+    return to_image(warped)
 
 
 def resized(
@@ -106,10 +104,10 @@ def resized(
     """Resize an (h, w, C) field to (height, width, C), bilinearly; differentiable."""
     if field.shape[:2] == (height, width):
         return field
-    size = (height, width)
+    planes = to_planes(field)
     stack = F.interpolate(
-        to_planes(field),
-        size,
+        planes,
+        (height, width),
         mode="bilinear",
         antialias=antialias,
         align_corners=False,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import statistics
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -50,14 +50,16 @@ def find_interior_point(renderer: Renderer, fraction: float = 0.12) -> Tensor:
         is_large = group.size > MAX_SMALL_GROUP
         if has_derivative and not is_large and not group.periodic:
             u[coordinates] = u[coordinates].clamp(fraction, 1.0 - fraction)
-        if has_derivative and is_large:
-            values = u[coordinates]
-            starts_at_bounds = bool(((values == 0.0) | (values == 1.0)).all())
-            if starts_at_bounds:
-                u[coordinates] = 0.5
+        if has_derivative and is_large and _is_at_bounds(u[coordinates]):
+            u[coordinates] = 0.5
         if group.periodic:
             u[coordinates] = (u[coordinates] + PERIODIC_OFFSET).remainder(1.0)
     return u
+
+
+def _is_at_bounds(values: Tensor) -> bool:
+    """Return whether all coordinates (n,) are 0 or 1."""
+    return bool(((values == 0.0) | (values == 1.0)).all())
 
 
 def restrict_plan(
@@ -129,30 +131,27 @@ class Bench:
         Returns:
             Gradients (repeats, d), zero where the plan has no derivative, and seconds.
         """
-        slices = [
-            group.coordinates for group in plan.groups if group.estimator != "none"
-        ]
-        sizes = [coordinates.stop - coordinates.start for coordinates in slices]
+        slices = _list_slices(plan)
         gradients = torch.zeros(repeats, len(self.u))
         seconds = []
         for index in range(repeats):
-            measure = partial(self._measure_gradient, plan, stream, index)
-            if label is None:
-                measurement = measure()
-            else:
-                # measured, or read from the store
-                measurement = self.store(f"{label} gradient {index}", measure)
-            # `_measure_gradient` writes the derivatives of all groups, one group after
-            # the other, as float32 in base64. `frombuffer` needs writable memory.
-            buffer = bytearray(base64.b64decode(measurement["numbers"]))
-            derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
-            for coordinates, values in zip(slices, derivatives, strict=True):
-                gradients[index, coordinates] = values
+            measurement = self._load_measurement(plan, stream, index, label)
+            _copy_derivatives(measurement["numbers"], slices, gradients[index])
             seconds.append(measurement["seconds"])
             # For gradients that are not stored, the caller reports the progress.
             if label is not None:
                 self.tick(self.spp)
         return gradients, statistics.median(seconds)
+
+    def _load_measurement(
+        self, plan: GradientPlan, stream: str, index: int, label: str | None
+    ) -> dict[str, Any]:
+        """Return a gradient as `_measure_gradient` does, or from the store by a label."""
+        measure = partial(self._measure_gradient, plan, stream, index)
+        if label is None:
+            return measure()
+        measurement: dict[str, Any] = self.store(f"{label} gradient {index}", measure)
+        return measurement
 
     def _measure_gradient(
         self, plan: GradientPlan, stream: str, index: int
@@ -163,16 +162,32 @@ class Bench:
         group.
         """
         started = time.perf_counter()
-        gradient = self.compute_gradient(
-            plan, seeds.derive_seed(self.seed, stream, index)
-        )
-        derivatives = torch.cat(
-            [
-                gradient[group.coordinates]
-                for group in plan.groups
-                if group.estimator != "none"
-            ]
-        )
+        noise_seed = seeds.derive_seed(self.seed, stream, index)
+        gradient = self.compute_gradient(plan, noise_seed)
+        slices = _list_slices(plan)
+        derivatives = torch.cat([gradient[coordinates] for coordinates in slices])
         float32_bytes = derivatives.to(torch.float32).numpy().tobytes()
         numbers = base64.b64encode(float32_bytes).decode("ascii")
         return {"seconds": time.perf_counter() - started, "numbers": numbers}
+
+
+def _list_slices(plan: GradientPlan) -> list[slice]:
+    """Return the coordinates of each group with an estimator."""
+    return [group.coordinates for group in plan.groups if group.estimator != "none"]
+
+
+def _copy_derivatives(numbers: str, slices: Sequence[slice], gradient: Tensor) -> None:
+    """Copy the derivatives of `Bench._measure_gradient` into a gradient (d,).
+
+    Args:
+        numbers: derivatives of all groups, one group after the other, as float32 in
+            base64.
+        slices: coordinates of each group.
+        gradient: gradient that is changed.
+    """
+    sizes = [coordinates.stop - coordinates.start for coordinates in slices]
+    # `frombuffer` needs writable memory
+    buffer = bytearray(base64.b64decode(numbers))
+    derivatives = torch.frombuffer(buffer, dtype=torch.float32).split(sizes)
+    for coordinates, values in zip(slices, derivatives, strict=True):
+        gradient[coordinates] = values

@@ -121,29 +121,36 @@ def make_smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     columns = torch.linspace(-1.0, 1.0, width)[None, :, None]
     weights = torch.zeros(height, width, 3)
     for _ in range(N_WAVES):
-        # each has a number for every channel, uniform in [-1, 1]
-        x_frequency, y_frequency, phase, amplitude = (
-            torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4)
-        )
-        # rows and columns run from -1 to 1: a frequency of 1 is one wave over the image
-        weights += amplitude * torch.cos(
-            math.pi
-            * (
-                MAX_FREQUENCY * x_frequency * columns
-                + MAX_FREQUENCY * y_frequency * rows
-                + phase
-            )
-        )
+        weights += _make_wave(rows, columns, generator)
     hann_window = (
         torch.cos(0.5 * math.pi * rows).square()
         * torch.cos(0.5 * math.pi * columns).square()
     )
     weights *= hann_window / (height * width)
+    return partial(_sum_weighted, weights)
 
-    def loss(image: Tensor) -> Tensor:
-        return (image * weights).sum()
 
-    return loss
+def _make_wave(rows: Tensor, columns: Tensor, generator: torch.Generator) -> Tensor:
+    """Return a random wave (h, w, 3), another one in each channel.
+
+    Args:
+        rows: (h, 1, 1) vertical position, -1 to 1.
+        columns: (1, w, 1) horizontal position, -1 to 1.
+        generator: generator of random numbers; it advances.
+    """
+    # each has a number for every channel, uniform in [-1, 1]
+    x_frequency, y_frequency, phase, amplitude = (
+        torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4)
+    )
+    # rows and columns run from -1 to 1: a frequency of 1 is one wave over the image
+    x_periods = MAX_FREQUENCY * x_frequency * columns
+    y_periods = MAX_FREQUENCY * y_frequency * rows
+    return amplitude * torch.cos(math.pi * (x_periods + y_periods + phase))
+
+
+def _sum_weighted(weights: Tensor, image: Tensor) -> Tensor:
+    """Return the sum of an image (h, w, 3) times weights of that shape."""
+    return (image * weights).sum()
 
 
 def _rate_estimate(
@@ -259,16 +266,22 @@ def list_attempts(group: Group) -> list[tuple[str, float]]:
     ]
     if not difference_estimators:
         return attempts
-    difference_estimator = difference_estimators[0]
-    steps = {group.step}
+    other_factors = _list_other_factors(group.step)
+    return attempts + [(difference_estimators[0], factor) for factor in other_factors]
+
+
+def _list_other_factors(planned_step: float) -> list[float]:
+    """List the factors but 1 that give different steps, within the allowed range."""
+    factors = []
+    steps = {planned_step}
     _, max_step = STEP_RANGE
     for factor in FACTORS[1:]:  # the first factor is 1
         # several factors may give the largest step, which is tried once
-        step = min(factor * group.step, max_step)
+        step = min(factor * planned_step, max_step)
         if step not in steps:
             steps.add(step)
-            attempts.append((difference_estimator, factor))
-    return attempts
+            factors.append(factor)
+    return factors
 
 
 def find_probes(bench: Bench) -> list[Probe]:
@@ -360,21 +373,45 @@ def measure_reference(
             _measure_pair(bench, probe, factor, number) for number in range(min_repeats)
         ]
         reference = _extrapolate(pairs, factor)
-        max_error = MAX_REFERENCE_ERROR * abs(reference.value)
-        if _compute_standard_error(pairs) <= max_error:
+        if _compute_standard_error(pairs) <= _find_max_error(reference):
             return reference
         pairs_of_factor[factor] = pairs
         references[factor] = reference
     best = min(references, key=lambda factor: references[factor].noise)
-    reference = references[best]
-    pairs = pairs_of_factor[best]
+    return _add_seeds(
+        bench, probe, references[best], pairs_of_factor[best], max_repeats
+    )
+
+
+def _add_seeds(
+    bench: Bench,
+    probe: Probe,
+    reference: Reference,
+    pairs: list[DifferencePair],
+    max_repeats: int,
+) -> Reference:
+    """Return a reference with more seeds, until it is accurate or has the most.
+
+    Args:
+        bench: bench of the renderer.
+        probe: direction along which the derivative is taken.
+        reference: the reference so far.
+        pairs: its pairs of differences; new ones are added.
+        max_repeats: largest number of seeds.
+    """
+    factor = reference.factor
     while (
-        _compute_standard_error(pairs) > MAX_REFERENCE_ERROR * abs(reference.value)
+        _compute_standard_error(pairs) > _find_max_error(reference)
         and len(pairs) < max_repeats
     ):
-        pairs.append(_measure_pair(bench, probe, best, len(pairs)))
-        reference = _extrapolate(pairs, best)
+        pairs.append(_measure_pair(bench, probe, factor, len(pairs)))
+        reference = _extrapolate(pairs, factor)
     return reference
+
+
+def _find_max_error(reference: Reference) -> float:
+    """Return the largest standard error at which a reference is accurate enough."""
+    return MAX_REFERENCE_ERROR * abs(reference.value)
 
 
 class DifferencePair(NamedTuple):
@@ -459,12 +496,15 @@ def _compute_difference(bench: Bench, probe: Probe, step: float, seed: int) -> f
         if changes_single_coordinate:
             # less than two steps if one of them was clipped at a bound of the range
             width = float((above - below) @ probe.direction)
-    with torch.no_grad():
-        loss_above, loss_below = (
-            float(bench.loss(bench.renderer(u, seed, bench.spp)))
-            for u in (above, below)
-        )
+    loss_above = _compute_loss_at(bench, above, seed)
+    loss_below = _compute_loss_at(bench, below, seed)
     return (loss_above - loss_below) / width
+
+
+def _compute_loss_at(bench: Bench, u: Tensor, seed: int) -> float:
+    """Return the loss of the rendered image of u (d,)."""
+    with torch.no_grad():
+        return float(bench.loss(bench.renderer(u, seed, bench.spp)))
 
 
 def measure_estimates(
@@ -487,19 +527,33 @@ def measure_estimates(
     # name of the stream of seeds
     stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
     gradients, seconds = bench.compute_gradients(plan, stream, repeats)
-    estimates = []
-    for probe in probes:
-        derivatives = [float(gradient @ probe.direction) for gradient in gradients]
-        estimate = GradientEstimate(
-            estimator,
-            value=statistics.fmean(derivatives),
-            noise=statistics.stdev(derivatives),  # of a single gradient
-            repeats=repeats,
-            seconds=seconds,  # of a gradient, which is shared by all probes
-            factor=factor,
-        )
-        estimates.append(estimate)
-    return estimates
+    return [
+        _estimate_along_probe(gradients, probe, estimator, seconds, factor)
+        for probe in probes
+    ]
+
+
+def _estimate_along_probe(
+    gradients: Tensor, probe: Probe, estimator: str, seconds: float, factor: float
+) -> GradientEstimate:
+    """Return the estimate along a probe from gradients (repeats, d).
+
+    Args:
+        gradients: gradients by one estimator.
+        probe: the probe.
+        estimator: name of the estimator.
+        seconds: median time of a gradient, which is shared by all probes.
+        factor: factor on the planned step of differences.
+    """
+    derivatives = [float(gradient @ probe.direction) for gradient in gradients]
+    return GradientEstimate(
+        estimator,
+        value=statistics.fmean(derivatives),
+        noise=statistics.stdev(derivatives),  # of a single gradient
+        repeats=len(gradients),
+        seconds=seconds,
+        factor=factor,
+    )
 
 
 def measure_derivatives(
@@ -535,29 +589,33 @@ def measure_derivatives(
         measure_reference, repeats=reference_repeats, factors=reference_factors
     )
     # probes of one control follow one another
-    for control, control_probes in groupby(
-        find_probes(bench), lambda probe: probe.group.control
-    ):
+    probes_by_control = groupby(find_probes(bench), lambda probe: probe.group.control)
+    for control, control_probes in probes_by_control:
         probes = list(control_probes)
         stage(f"references for {control}", len(probes))
         references = {
             probe.name: _load_reference(bench, probe, reference_spp, measure)
             for probe in probes
         }
-        # One gradient gives the derivatives along all probes with equal estimators. The
-        # key is (estimators that are valid, planned estimator).
-        probe_sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
-        for probe in probes:
-            estimators = (probe.group.valid, probe.group.estimator)
-            probe_sets.setdefault(estimators, []).append(probe)
-        n_tries = sum(
-            len(list_tries(members[0].group)) for members in probe_sets.values()
-        )
+        probe_sets = _group_by_estimators(probes)
+        n_tries = sum(len(list_tries(members[0].group)) for members in probe_sets)
         stage(f"gradients for {control}", n_tries)
-        for members in probe_sets.values():
+        for members in probe_sets:
             # all groups of a set have the same estimators, so the first one suffices
             tries = list_tries(members[0].group)
             yield from _try_estimators(bench, members, references, tries, repeats)
+
+
+def _group_by_estimators(probes: Sequence[Probe]) -> list[list[Probe]]:
+    """Return sets of probes with equal estimators, those that are valid and the planned.
+
+    One gradient gives the derivatives along all probes of a set.
+    """
+    probe_sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}
+    for probe in probes:
+        estimators = (probe.group.valid, probe.group.estimator)
+        probe_sets.setdefault(estimators, []).append(probe)
+    return list(probe_sets.values())
 
 
 def _load_reference(
@@ -604,35 +662,52 @@ def _try_estimators(
         repeats: number of gradients with the factor 1, and with any other factor.
     """
     ok_names: set[str] = set()
-    all_references = list(references.values())
     planned_repeats, other_repeats = repeats
     for estimator, factor in tries:
-        if factor == 1.0:
-            tried_probes = list(probes)
-            count = planned_repeats
-        else:
-            tried_probes = [probe for probe in probes if probe.name not in ok_names]
-            count = other_repeats
+        is_planned = factor == 1.0
+        tried_probes = [
+            probe for probe in probes if is_planned or probe.name not in ok_names
+        ]
         if not tried_probes:  # all are ok, and only other factors follow
             break
-        probe_names = ",".join(probe.name for probe in tried_probes)
-        # measured now, or by an earlier run; as JSON
-        stored_estimates = bench.store(
-            f"{estimator} x {factor:g} {probe_names}",
-            partial(_estimates_as_json, bench, estimator, tried_probes, count, factor),
-        )
-        for probe, estimate in zip(tried_probes, stored_estimates, strict=True):
-            row = compare_with_reference(
-                GradientEstimate(**estimate),
-                references[probe.name],
-                others=all_references,
-                probe=probe,
-                spp=bench.spp,
-            )
+        count = planned_repeats if is_planned else other_repeats
+        estimates = _load_estimates(bench, estimator, tried_probes, count, factor)
+        rows = _rate_estimates(bench, tried_probes, estimates, references)
+        for probe, row in zip(tried_probes, rows, strict=True):
             if row.status == "ok":
                 ok_names.add(probe.name)
             yield row
         bench.tick(bench.spp)  # for the progress
+
+
+def _rate_estimates(
+    bench: Bench,
+    probes: Sequence[Probe],
+    estimates: Sequence[GradientEstimate],
+    references: Mapping[str, Reference],
+) -> Iterator[Measured]:
+    """Yield the errors of one estimate along each probe; see `_try_estimators`."""
+    all_references = list(references.values())
+    for probe, estimate in zip(probes, estimates, strict=True):
+        yield compare_with_reference(
+            estimate,
+            references[probe.name],
+            others=all_references,
+            probe=probe,
+            spp=bench.spp,
+        )
+
+
+def _load_estimates(
+    bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
+) -> list[GradientEstimate]:
+    """Return the estimates of `measure_estimates`, measured now or by an earlier run."""
+    probe_names = ",".join(probe.name for probe in probes)
+    stored_estimates = bench.store(
+        f"{estimator} x {factor:g} {probe_names}",
+        partial(_estimates_as_json, bench, estimator, probes, repeats, factor),
+    )
+    return [GradientEstimate(**estimate) for estimate in stored_estimates]
 
 
 def _estimates_as_json(

@@ -14,7 +14,7 @@ import itertools
 import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -121,18 +121,22 @@ def list_contested(
     Returns:
         The sets, each with its estimators.
     """
-    open_groups = []
-    for group in plan.groups:
-        if group.is_forced or not group.valid:
-            continue
-        preferred, *_ = group.valid  # in the order of preference
-        if with_all or preferred == "adjoint":
-            open_groups.append(group)
+    open_groups = [
+        group for group in plan.groups if _is_worth_comparing(group, with_all=with_all)
+    ]
     return [
         (groups, estimators)
         for groups, estimators in list_comparable_sets(open_groups)
         if len(estimators) > 1
     ]
+
+
+def _is_worth_comparing(group: Group, *, with_all: bool) -> bool:
+    """Return whether estimators are compared for a group; see `list_contested`."""
+    if group.is_forced or not group.valid:
+        return False
+    preferred, *_ = group.valid  # in the order of preference
+    return with_all or preferred == "adjoint"
 
 
 REPEATS = 3  # gradients that are computed with each estimator or setting
@@ -177,17 +181,19 @@ def choose_estimators(
         )
         best = min(scores, key=lambda name: scores[name])
         reason = _explain_scores(scores, best, bench.spp, count_renders)
-        group_by_name = {
-            group.name: replace(
-                group, estimator=best, reason=reason, estimator_costs=scores
-            )
+        chosen_groups = [
+            replace(group, estimator=best, reason=reason, estimator_costs=scores)
             for group in groups
-        }
-        plan = replace(
-            plan,
-            groups=tuple(group_by_name.get(group.name, group) for group in plan.groups),
-        )
+        ]
+        plan = _replace_groups(plan, chosen_groups)
     return plan
+
+
+def _replace_groups(plan: GradientPlan, new_groups: Sequence[Group]) -> GradientPlan:
+    """Return the plan with some groups replaced by new ones of the same names."""
+    group_by_name = {group.name: group for group in new_groups}
+    groups = tuple(group_by_name.get(group.name, group) for group in plan.groups)
+    return replace(plan, groups=groups)
 
 
 def _count_renders(plan: GradientPlan, estimator: str) -> float:
@@ -216,10 +222,8 @@ def _score_estimators(
     number of renders if `counts_renders` is set.
     """
     group_names = {group.name for group in groups}
-    # by estimator
-    gradients_of = dict[str, Tensor]()
-    cost_of = dict[str, float]()
-    variance_of = dict[str, float]()
+    gradients_of_estimator = dict[str, Tensor]()
+    cost_of_estimator = dict[str, float]()
     for estimator in estimators:
         single_plan = restrict_plan(plan, group_names, estimator)
         gradients, seconds = bench.compute_gradients(
@@ -231,17 +235,14 @@ def _score_estimators(
         cost = seconds
         if counts_renders:
             cost = _count_renders(single_plan, estimator)
-        residual = gradients - gradients.mean(dim=0)  # (repeats, d)
-        gradients_of[estimator] = gradients
-        cost_of[estimator] = cost
-        # sum of the variances of all elements
-        variance_of[estimator] = float(residual.square().sum() / max(1, repeats - 1))
-    errors = _compute_squared_errors(gradients_of, variance_of, repeats)
-    return {name: error * cost_of[name] for name, error in errors.items()}
+        gradients_of_estimator[estimator] = gradients
+        cost_of_estimator[estimator] = cost
+    errors = _compute_squared_errors(gradients_of_estimator, repeats)
+    return {name: error * cost_of_estimator[name] for name, error in errors.items()}
 
 
 def _compute_squared_errors(
-    gradients_of: Mapping[str, Tensor], variance_of: Mapping[str, float], repeats: int
+    gradients_of: Mapping[str, Tensor], repeats: int
 ) -> dict[str, float]:
     """Return the mean squared error of the gradients of each estimator.
 
@@ -252,21 +253,31 @@ def _compute_squared_errors(
 
     Args:
         gradients_of: (repeats, d) gradients by estimator; one takes differences.
-        variance_of: sum of the variances of all elements, by estimator.
         repeats: number of gradients of each estimator.
     """
+    variance_of = {
+        estimator: _sum_variances(gradients)
+        for estimator, gradients in gradients_of.items()
+    }
     reference = next(name for name in gradients_of if name in DIFFERENCE_ESTIMATORS)
     reference_gradient = gradients_of[reference].mean(dim=0)
     reference_variance = variance_of[reference] / repeats  # that of the mean
     errors = dict[str, float]()
     for estimator, gradients in gradients_of.items():
+        variance = variance_of[estimator]
         if estimator == reference:
-            errors[estimator] = variance_of[reference]
+            errors[estimator] = variance
             continue
         squared_distance = (gradients - reference_gradient).square().sum(dim=1).mean()
         error = float(squared_distance) - reference_variance
-        errors[estimator] = max(error, variance_of[estimator])
+        errors[estimator] = max(error, variance)
     return errors
+
+
+def _sum_variances(gradients: Tensor) -> float:
+    """Return the sum of the variances of all elements of gradients (repeats, d)."""
+    residual = gradients - gradients.mean(dim=0)
+    return float(residual.square().sum() / max(1, len(gradients) - 1))
 
 
 def _explain_scores(
@@ -288,13 +299,17 @@ def _explain_scores(
     reason = f"least squared error x {cost}, measured at {spp} samples"
     has_multiples = scores[best] > 0.0
     if has_multiples:
-        others = ", ".join(
-            f"{name} {score / scores[best]:.3g}"
-            for name, score in scores.items()
-            if name != best
-        )
-        reason += f" (others, as multiples of it: {others})"
+        reason += f" (others, as multiples of it: {_list_multiples(scores, best)})"
     return reason
+
+
+def _list_multiples(scores: Mapping[str, float], best: str) -> str:
+    """Return the scores of all estimators but the best, as multiples of its score."""
+    return ", ".join(
+        f"{name} {score / scores[best]:.3g}"
+        for name, score in scores.items()
+        if name != best
+    )
 
 
 def count_cosine_samples(
@@ -347,21 +362,38 @@ def measure_cosines(
     """
     base_plan = bench.renderer.plan
     for groups, factors in _list_controls(base_plan):
-        group_names = {group.name for group in groups}
-        is_reached = False
-        tried_plans = list[GradientPlan]()
-        for factor in factors:
-            is_fallback = factor == FACTORS[-1]
-            if is_fallback and is_reached:
-                break
-            plan = restrict_plan(base_plan.scale_steps(factor), group_names)
-            # Steps have an upper limit, so that a larger factor can give the same plan.
-            if plan in tried_plans:
-                continue
-            tried_plans.append(plan)
-            for row in _measure_cosines(bench, plan, groups, factor, counts):
-                is_reached = is_reached or row.status == "ok"
-                yield row
+        yield from _measure_cosines_of_control(
+            bench, base_plan, groups, factors, counts
+        )
+
+
+def _measure_cosines_of_control(
+    bench: Bench,
+    base_plan: GradientPlan,
+    groups: Sequence[Group],
+    factors: Sequence[float],
+    counts: Sequence[int],
+) -> Iterator[Measured]:
+    """Measure the cosines of one control with each factor on the steps of differences.
+
+    The arguments are those of `_measure_cosines`, but `base_plan` has the planned
+    steps. The last factor is only tried if no other has reached the goal.
+    """
+    group_names = {group.name for group in groups}
+    is_reached = False
+    tried_plans = list[GradientPlan]()
+    for factor in factors:
+        is_fallback = factor == FACTORS[-1]
+        if is_fallback and is_reached:
+            break
+        plan = restrict_plan(base_plan.scale_steps(factor), group_names)
+        # Steps have an upper limit, so that a larger factor can give the same plan.
+        if plan in tried_plans:
+            continue
+        tried_plans.append(plan)
+        for row in _measure_cosines(bench, plan, groups, factor, counts):
+            is_reached = is_reached or row.status == "ok"
+            yield row
 
 
 def _measure_cosines(
@@ -384,45 +416,56 @@ def _measure_cosines(
         factor: factor on the steps of differences, for the rows.
         counts: samples per pixel of working gradients, ascending.
     """
-    control = groups[0].control
-    estimators = ", ".join(dict.fromkeys(group.estimator for group in groups))
-    label = f"{control} x {factor:g}"
-    converged_spp = CONVERGED_SPP
-    converged, agreement = _converged_gradient(bench, plan, label, converged_spp)
+    label = f"{groups[0].control} x {factor:g}"
+    converged = _converged_gradient(bench, plan, label, CONVERGED_SPP)
+    was_repeated = False
     for spp in counts:
-        needs_samples = agreement < GOAL_COSINE or spp > CONVERGED_SPP
-        was_repeated = converged_spp != CONVERGED_SPP
+        needs_samples = converged.agreement < GOAL_COSINE or spp > CONVERGED_SPP
         if needs_samples and not was_repeated:
             converged_spp = CONVERGED_SPP_FACTOR * CONVERGED_SPP
-            converged, agreement = _converged_gradient(
-                bench, plan, label, converged_spp
-            )
+            converged = _converged_gradient(bench, plan, label, converged_spp)
+            was_repeated = True
         gradients, seconds = replace(bench, spp=spp).compute_gradients(
             plan, stream="working", repeats=REPEATS, label=f"{label} {spp}"
         )
-        cosine = statistics.fmean(
-            _cosine(gradient, converged) for gradient in gradients
-        )
+        cosine = _compute_mean_cosine(gradients, converged.gradient)
         yield Measured(
             quantity="gradient",
-            control=control,
-            estimator=estimators,
+            control=groups[0].control,
+            estimator=", ".join(dict.fromkeys(group.estimator for group in groups)),
             factor=factor,
             spp=spp,
             repeats=REPEATS,
             cosine=cosine,
-            reference_cosine=agreement,
+            reference_cosine=converged.agreement,
             seconds=seconds,
-            status=rate_cosine(cosine, agreement),
+            status=rate_cosine(cosine, converged.agreement),
         )
         if cosine >= GOAL_COSINE:
             break
 
 
+def _compute_mean_cosine(gradients: Tensor, converged: Tensor) -> float:
+    """Return the mean cosine of gradients (repeats, d) with a converged one (d,)."""
+    return statistics.fmean(_cosine(gradient, converged) for gradient in gradients)
+
+
+class _ConvergedGradient(NamedTuple):
+    """A converged gradient.
+
+    Attributes:
+        gradient: (d,) mean of several.
+        agreement: smallest cosine of two of them.
+    """
+
+    gradient: Tensor
+    agreement: float
+
+
 def _converged_gradient(
     bench: Bench, plan: GradientPlan, label: str, spp: int
-) -> tuple[Tensor, float]:
-    """Return the mean (d,) of converged gradients, and the smallest cosine of two."""
+) -> _ConvergedGradient:
+    """Compute a gradient with many samples per pixel."""
     gradients, _ = replace(bench, spp=spp).compute_gradients(
         plan,
         stream="converged",
@@ -437,7 +480,7 @@ def _converged_gradient(
     )
     # The cosine with a zero gradient is NaN. Then the minimum of a tensor is NaN, so
     # that the reference is unusable. Python's `min` would depend on the order.
-    return gradients.mean(dim=0), float(agreements.min())
+    return _ConvergedGradient(gradients.mean(dim=0), float(agreements.min()))
 
 
 def _cosine(gradient_a: Tensor, gradient_b: Tensor) -> float:
@@ -476,12 +519,17 @@ def choose_steps(
         rows = [(row, cosine) for row, cosine in measured if row.control == control]
         best, cosine = _choose_setting(rows)
         sample_counts.append(best.spp)
-        remark = (
-            f"cosine {cosine:.2f} with the converged gradient at {best.spp} samples "
-            f"and {best.factor:g} x the step{_describe_shortfall(best)}"
-        )
+        remark = _describe_setting(best, cosine)
         plan = _scale_steps_of_control(plan, control, best.factor, remark)
     return plan, max(sample_counts) if sample_counts else None
+
+
+def _describe_setting(row: Measured, cosine: float) -> str:
+    """Return the remark of a control about the chosen setting and its cosine."""
+    return (
+        f"cosine {cosine:.2f} with the converged gradient at {row.spp} samples "
+        f"and {row.factor:g} x the step{_describe_shortfall(row)}"
+    )
 
 
 def _scale_steps_of_control(
@@ -567,33 +615,10 @@ def measure_path_length(
     renderer = renderer.copy_with(denoiser="none")
     full_depth = renderer.scene.max_depth
     noise_seeds = [seeds.derive_seed(seed, "half", half) for half in range(2)]
-
-    def render_twice(u: Tensor, depth: int) -> list[_Rendering]:
-        """Render u (d,) with both seeds."""
-        renderings = []
-        for noise_seed in noise_seeds:
-            renderings.append(_render_with_depth(renderer, u, noise_seed, spp, depth))
-            tick()
-        return renderings
-
-    full_renderings = [render_twice(u, full_depth) for u in configurations]
-    cuts = []
-    chosen_depth = full_depth
-    for depth in range(full_depth - 1, MIN_DEPTH - 1, -1):
-        # the largest changes among all configurations
-        lost_light = 0.0
-        changed_levels = 0.0
-        for u, full in zip(configurations, full_renderings, strict=True):
-            # fraction of the light that is lost, and change of the image in levels
-            light, levels = _compare_depths(full, render_twice(u, depth))
-            lost_light = max(lost_light, light)
-            # `max` would drop NaN, of an image that is not finite
-            changed_levels = float(np.maximum(changed_levels, levels))
-        cuts.append(PathCut(depth=depth, light=lost_light, levels=changed_levels))
-        # NaN counts as too much
-        if not changed_levels <= bound:
-            break
-        chosen_depth = depth
+    trial = _DepthTrial(renderer, noise_seeds, spp, tick)
+    cuts = trial.measure_cuts(configurations, bound)
+    accepted_depths = [cut.depth for cut in cuts if cut.levels <= bound]
+    chosen_depth = min(accepted_depths, default=full_depth)
     return PathLength(
         depth=chosen_depth,
         full=full_depth,
@@ -601,6 +626,74 @@ def measure_path_length(
         configurations=len(configurations),
         reason=_explain_depth(cuts, chosen_depth, full_depth),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _DepthTrial:
+    """Renders configurations with light paths of limited length.
+
+    Attributes:
+        renderer: renders the images, without a denoiser.
+        noise_seeds: seeds of the noise; there is an image for each.
+        spp: samples per pixel.
+        tick: called after each image.
+    """
+
+    renderer: Renderer
+    noise_seeds: Sequence[int]
+    spp: int
+    tick: Callable[[], None]
+
+    def measure_cuts(
+        self, configurations: Sequence[Tensor], bound: float
+    ) -> list[PathCut]:
+        """Measure the changes by shorter and shorter paths, up to one over the bound."""
+        full_depth = self.renderer.scene.max_depth
+        full_renderings = [self.render_twice(u, full_depth) for u in configurations]
+        cuts = []
+        for depth in range(full_depth - 1, MIN_DEPTH - 1, -1):
+            cut = self.measure_cut(configurations, full_renderings, depth)
+            cuts.append(cut)
+            # NaN counts as too much
+            if not cut.levels <= bound:
+                break
+        return cuts
+
+    def render_twice(self, u: Tensor, depth: int) -> list[_Rendering]:
+        """Render u (d,) with both seeds and paths of at most `depth` segments."""
+        renderings = []
+        for noise_seed in self.noise_seeds:
+            rendering = _render_with_depth(
+                self.renderer, u, noise_seed, self.spp, depth
+            )
+            renderings.append(rendering)
+            self.tick()
+        return renderings
+
+    def measure_cut(
+        self,
+        configurations: Sequence[Tensor],
+        full_renderings: Sequence[Sequence[_Rendering]],
+        depth: int,
+    ) -> PathCut:
+        """Measure the largest change by shorter paths among configurations (d,).
+
+        Args:
+            configurations: the configurations.
+            full_renderings: images of each of them, with paths of full length.
+            depth: segments of the longest of the shorter paths.
+        """
+        # the largest changes among all configurations
+        lost_light = 0.0
+        changed_levels = 0.0
+        for u, full in zip(configurations, full_renderings, strict=True):
+            # fraction of the light that is lost, and change of the image in levels
+            shorter = self.render_twice(u, depth)
+            light, levels = _compare_depths(full, shorter)
+            lost_light = max(lost_light, light)
+            # `max` would drop NaN, of an image that is not finite
+            changed_levels = float(np.maximum(changed_levels, levels))
+        return PathCut(depth=depth, light=lost_light, levels=changed_levels)
 
 
 class _Rendering(NamedTuple):
@@ -693,12 +786,7 @@ def measure_problem_bounces(
     """
     full_configurations = [problem.make_full_configuration(problem.domain.start)]
     for index in range(N_RANDOM_CONFIGURATIONS):
-        generator = torch.Generator().manual_seed(
-            seeds.derive_seed(seed, "bounces", index)
-        )
-        u = problem.domain.sample(generator)[0]
-        condition_seed = seeds.derive_seed(seed, "conditions of bounces", index)
-        full_configurations.append(problem.make_full_configuration(u, condition_seed))
+        full_configurations.append(_sample_full_configuration(problem, seed, index))
     return measure_path_length(
         problem.renderer,
         full_configurations,
@@ -706,3 +794,11 @@ def measure_problem_bounces(
         spp=BOUNCE_SPP,
         tick=tick,
     )
+
+
+def _sample_full_configuration(problem: Problem, seed: int, index: int) -> Tensor:
+    """Return a random full configuration (d,) of a problem, by its index."""
+    generator = torch.Generator().manual_seed(seeds.derive_seed(seed, "bounces", index))
+    u = problem.domain.sample(generator)[0]
+    condition_seed = seeds.derive_seed(seed, "conditions of bounces", index)
+    return problem.make_full_configuration(u, condition_seed)
