@@ -124,7 +124,7 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         return ObjectiveSignature()
     _check_takes_output_first(function, signature)
     requests = _find_requests(signature)
-    _check_call(function, signature, requests)
+    _check_binding(function, signature, requests)
     return requests
 
 
@@ -170,7 +170,7 @@ def _list_positional(signature: inspect.Signature) -> list[str]:
     ]
 
 
-def _check_call(
+def _check_binding(
     function: Callable[..., Any],
     signature: inspect.Signature,
     requests: ObjectiveSignature,
