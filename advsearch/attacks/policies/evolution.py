@@ -495,7 +495,7 @@ class CMAES(Policy[CMAESState]):
         at a random point with twice the population, as in IPOP-CMA-ES (Auger and Hansen
         2005).
         """
-        state = self._add_evaluations(state, evaluated)
+        state = self._add_values(state, evaluated)
         if len(state.values) < len(state.points):
             return state
         state = state.tell()
@@ -505,7 +505,7 @@ class CMAES(Policy[CMAESState]):
         return state.ask()
 
     @staticmethod
-    def _add_evaluations(state: CMAESState, evaluated: Evaluated) -> CMAESState:
+    def _add_values(state: CMAESState, evaluated: Evaluated) -> CMAESState:
         """Return the state with the evaluations of the generation's next points."""
         values = [evaluation.objective for _, evaluation in evaluated]
         evaluated_points = state.points[len(state.values) :][: len(values)]
