@@ -568,7 +568,7 @@ def _explore(
         _check_proposals(proposals, max_proposals, log.domain, name)
         batch = _limit_batch(proposals, log.domain, renders_left)
         log.begin_batch(state)
-        ending = _evaluate_batch(log, batch, is_out_of_time)
+        ending = _evaluate_proposals(log, batch, is_out_of_time)
         if ending is not None:
             return ending
         state = policy.update(state, log.evaluated_batch)
@@ -576,7 +576,7 @@ def _explore(
     return Ending.BUDGET_SPENT
 
 
-def _evaluate_batch(
+def _evaluate_proposals(
     log: _Log, batch: Sequence[Proposal], is_out_of_time: IsOutOfTime
 ) -> Ending | None:
     """Evaluate a batch of proposals; return why the search ends, or None.
