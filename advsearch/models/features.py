@@ -177,11 +177,11 @@ def _find_last_layer(
     has_features = getattr(last, attribute) is not None  # an input may be a weight
     if not has_features:
         return None
-    read = partial(_read_layer, trace_calls, model.module, last, attribute)
+    read = partial(_read_layer_features, trace_calls, model.module, last, attribute)
     return read, f"{attribute} of {last.name}"
 
 
-def _read_layer(
+def _read_layer_features(
     trace_calls: Calls, network: Any, layer_call: _Call, attribute: str, batch: Tensor
 ) -> Tensor:
     """Return the features (N, F) of a batch, by running the network on it.
