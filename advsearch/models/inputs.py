@@ -106,11 +106,11 @@ def list_required_inputs(network: nn.Module) -> list[str]:
     return [
         parameter.name
         for parameter in signature.parameters.values()
-        if _is_required(parameter)
+        if is_required(parameter)
     ]
 
 
-def _is_required(parameter: inspect.Parameter) -> bool:
+def is_required(parameter: inspect.Parameter) -> bool:
     """Return whether a call has to pass a parameter."""
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     has_default = parameter.default is not inspect.Parameter.empty
