@@ -219,7 +219,7 @@ def load_network(
         FileFormatError: `weights` is missing or is not safetensors.
     """
     folder = folder or get_data_folder()
-    labels, state = _read_files(folder)
+    labels, state = _read_reference_files(folder)
     net = build(len(labels))
     try:
         net.load_state_dict(state)
@@ -232,7 +232,7 @@ def load_network(
     return net, labels
 
 
-def _read_files(folder: Path) -> tuple[tuple[str, ...], dict[str, Tensor]]:
+def _read_reference_files(folder: Path) -> tuple[tuple[str, ...], dict[str, Tensor]]:
     """Return the labels and the weights in a folder.
 
     Raises:
