@@ -155,7 +155,7 @@ def measure_processor(processor: Any, spec: str) -> Processing:
     if black.shape == process_color((0, 0, 0), PROBE_SIZES[1]).shape:
         processing["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
-    gains = _measure_gains(process_color, offset)
+    gains = _measure_channel_gains(process_color, offset)
     # 1e-12: a processor that returns a constant has no gain
     tolerance = TOLERANCE * max(float(np.abs(gains).max()), 1e-12)
     if not _predicts_grays(process_color, gains, offset, tolerance):
@@ -177,7 +177,7 @@ def _process_color(
     return _run_processor(processor, image, spec)
 
 
-def _measure_gains(process_color: Callable[[Color], Array], offset: Array) -> Array:
+def _measure_channel_gains(process_color: Callable[[Color], Array], offset: Array) -> Array:
     """Return the gains (3, 3) of input channels (columns) in output channels (rows).
 
     Args:
