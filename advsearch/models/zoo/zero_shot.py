@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -158,13 +159,7 @@ def _tokenize(
         int(network.config.text_config.max_position_embeddings),
         int(tokenizer.model_max_length),
     )
-    tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
-    for text, tokens in zip(texts, tokens_of_texts, strict=True):
-        if len(tokens) > max_tokens:
-            raise InputError(
-                f"prompt: expected texts of at most {max_tokens} tokens, got "
-                f"{len(tokens)}: {text[:80]!r}"
-            )
+    _check_text_lengths(tokenizer, texts, max_tokens)
     is_siglip = hasattr(network, "logit_bias")
     inputs = tokenizer(
         list(texts),
@@ -174,11 +169,19 @@ def _tokenize(
         return_tensors="pt",
     )
     parameters = inspect.signature(network.forward).parameters
-    return {
-        key: value.to(network.device)
-        for key, value in inputs.items()
-        if key in parameters
-    }
+    used_inputs = {key: value for key, value in inputs.items() if key in parameters}
+    return {key: value.to(network.device) for key, value in used_inputs.items()}
+
+
+def _check_text_lengths(tokenizer: Any, texts: Sequence[str], max_tokens: int) -> None:
+    """Raise InputError if one of several texts has too many tokens."""
+    tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
+    for text, tokens in zip(texts, tokens_of_texts, strict=True):
+        if len(tokens) > max_tokens:
+            raise InputError(
+                f"prompt: expected texts of at most {max_tokens} tokens, got "
+                f"{len(tokens)}: {text[:80]!r}"
+            )
 
 
 def embed_words(
@@ -195,15 +198,20 @@ def embed_words(
     embeddings_of_prompts = []
     for prompt in prompts:
         texts = [prompt.replace("{}", word) for word in words]
-        batches = []
-        for begin in range(0, len(texts), TEXT_BATCH_SIZE):
-            batch = texts[begin : begin + TEXT_BATCH_SIZE]
-            inputs = _tokenize(network, tokenizer, batch)
-            batches.append(_get_features(network.get_text_features(**inputs)))
-        embeddings = functional.normalize(torch.cat(batches), dim=-1)
-        embeddings_of_prompts.append(embeddings)
+        features = _embed_texts(network, tokenizer, texts)
+        embeddings_of_prompts.append(functional.normalize(features, dim=-1))
     mean = torch.stack(embeddings_of_prompts).mean(dim=0)
     return functional.normalize(mean, dim=-1)
+
+
+def _embed_texts(network: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
+    """Return the features (texts, D) of texts, a batch at a time."""
+    batches = []
+    for begin in range(0, len(texts), TEXT_BATCH_SIZE):
+        batch = texts[begin : begin + TEXT_BATCH_SIZE]
+        inputs = _tokenize(network, tokenizer, batch)
+        batches.append(_get_features(network.get_text_features(**inputs)))
+    return torch.cat(batches)
 
 
 def _get_features(returned: Any) -> Tensor:
@@ -326,26 +334,22 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
 
     Its network is one of `DETECTORS`.
     """
+    name = loaded.name
     names = loaded.purpose.require_names(
-        loaded.name, "finds objects by their names", "detection"
+        name, "finds objects by their names", "detection"
     )
     tokenizer = loaded.load_component("AutoTokenizer")
     words = get_spoken_names(names)
     with (
-        models.translate_errors(
-            f"model {loaded.name}: cannot read the names of `labels`"
-        ),
+        models.translate_errors(f"model {name}: cannot read the names of `labels`"),
         torch.no_grad(),
     ):
         network: Any = models.copy_sharing_weights(loaded.network).eval()
         build_detector = DETECTORS[type(network).__name__]
         run_network = build_detector(loaded, network, tokenizer, words)
-    warn_of_equal_texts(tokenizer, words, names, loaded.name)
-    return loaded.make_text_source(
-        AdaptedNetwork(network, run_network, returns_pixel_boxes=True),
-        names,
-        network.dtype,
-    )
+    warn_of_equal_texts(tokenizer, words, names, name)
+    module = AdaptedNetwork(network, run_network, returns_pixel_boxes=True)
+    return loaded.make_text_source(module, names, network.dtype)
 
 
 def _build_owl(
@@ -363,18 +367,24 @@ def _build_owl(
     embeddings = embed_words(base_model, tokenizer, words, prompts).to(network.dtype)
     base_model.text_model = None
     base_model.text_projection = None
+    return partial(_run_owl, embeddings)
 
-    def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return boxes and scores for images (N, 3, H, W)."""
-        features = network.image_embedder(pixel_values=images)[0]
-        patches = features.flatten(1, 2)
-        queries = embeddings.to(patches).expand(len(images), -1, -1)
-        # It also returns embeddings of the patches, which are not needed.
-        logits, _embeddings = network.class_predictor(patches, queries)
-        boxes = network.box_predictor(patches, features)
-        return to_pixel_corners(boxes, images), logits.sigmoid()
 
-    return run_network
+def _run_owl(embeddings: Tensor, network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Return boxes and scores of OWL-ViT for images (N, 3, H, W).
+
+    Args:
+        embeddings: (names, D) features of the names.
+        network: the network without its text encoder.
+        images: (N, 3, H, W).
+    """
+    features = network.image_embedder(pixel_values=images)[0]
+    patches = features.flatten(1, 2)
+    queries = embeddings.to(patches).expand(len(images), -1, -1)
+    # It also returns embeddings of the patches, which are not needed.
+    logits, _embeddings = network.class_predictor(patches, queries)
+    boxes = network.box_predictor(patches, features)
+    return to_pixel_corners(boxes, images), logits.sigmoid()
 
 
 def _build_grounding_dino(
@@ -390,17 +400,12 @@ def _build_grounding_dino(
         InputError: there are several prompts, the text is too long, or a name has a
             full stop in it.
     """
-    name = loaded.name
-    prompt, *other_prompts = models.get_patterns(loaded.purpose.prompts or ("{}",))
-    if other_prompts:
-        raise InputError(
-            f"prompt: model {name} reads all names in one text, in which several "
-            "prompts can't be averaged; give one, or none for the names alone"
-        )
+    prompt = _choose_prompt(loaded)
     text = ". ".join(prompt.replace("{}", word).strip().lower() for word in words) + "."
     tokens = torch.tensor(
         tokenizer(text, verbose=False)["input_ids"], device=network.device
     )
+    name = loaded.name
     max_tokens = network.config.max_text_len
     if len(tokens) > max_tokens:
         raise InputError(
@@ -416,16 +421,38 @@ def _build_grounding_dino(
             f"them, in which it finds {len(token_index)} names instead of {len(words)}; "
             "leave . and ? out of names and prompt"
         )
+    return partial(_run_grounding_dino, tokens, token_index)
 
-    def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return boxes and scores for images (N, 3, H, W)."""
-        returned = network(
-            pixel_values=images, input_ids=tokens.expand(len(images), -1)
+
+def _choose_prompt(loaded: LoadedNetwork) -> str:
+    """Return the prompt of a network that reads all names in one text.
+
+    Raises:
+        InputError: there are several.
+    """
+    prompt, *other_prompts = models.get_patterns(loaded.purpose.prompts or ("{}",))
+    if other_prompts:
+        raise InputError(
+            f"prompt: model {loaded.name} reads all names in one text, in which several "
+            "prompts can't be averaged; give one, or none for the names alone"
         )
-        name_logits = returned.logits[..., token_index].amax(dim=-1)
-        return to_pixel_corners(returned.pred_boxes, images), name_logits.sigmoid()
+    return prompt
 
-    return run_network
+
+def _run_grounding_dino(
+    tokens: Tensor, token_index: Tensor, network: Any, images: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return boxes and scores of Grounding DINO for images (N, 3, H, W).
+
+    Args:
+        tokens: (L,) tokens of the text with all names.
+        token_index: (names, longest name) indices of the tokens of each name.
+        network: the network.
+        images: (N, 3, H, W).
+    """
+    returned = network(pixel_values=images, input_ids=tokens.expand(len(images), -1))
+    name_logits = returned.logits[..., token_index].amax(dim=-1)
+    return to_pixel_corners(returned.pred_boxes, images), name_logits.sigmoid()
 
 
 def _find_token_runs(tokens: Tensor, separators: Any) -> Tensor:
