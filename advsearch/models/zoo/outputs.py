@@ -574,7 +574,7 @@ def _get_default_fields(
     fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}
     if default is None:
         return fields
-    fields |= _read_transforms(default.transforms())
+    fields |= _read_default_transforms(default.transforms())
     labels = tuple(str(label) for label in default.meta.get("categories", ()))
     # The user's weights may have other classes than the default weights.
     fits_classes = classifier is None or _count_classes(classifier) == len(labels)
@@ -583,7 +583,7 @@ def _get_default_fields(
     return fields
 
 
-def _read_transforms(transforms: Any) -> dict[str, Any]:
+def _read_default_transforms(transforms: Any) -> dict[str, Any]:
     """Return size, mean and standard deviation that transforms of torchvision state."""
     fields: dict[str, Any] = {}
     crop_size = getattr(transforms, "crop_size", None)
