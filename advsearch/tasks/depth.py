@@ -498,7 +498,7 @@ class Depth(Task):
         """
         kind = self._get_kind(depth_map)
         (values,) = depth_map.values()  # the only map
-        values = _resize_map(values, (truth.mask.shape[0], truth.mask.shape[1]))
+        values = _resize_depth_map(values, (truth.mask.shape[0], truth.mask.shape[1]))
         if kind == METRIC:
             return values * self._find_metric_scale(truth), False
         z = truth.z_depth.to(values.device)
@@ -671,7 +671,7 @@ class Depth(Task):
         return tasks.Mark("disparity", true=False, mask=right_mask, map=disparity)
 
 
-def _resize_map(values: Tensor, size: tuple[int, int]) -> Tensor:
+def _resize_depth_map(values: Tensor, size: tuple[int, int]) -> Tensor:
     """Return a map (h, w) at a size (height, width)."""
     if values.shape == size:
         return values
