@@ -94,9 +94,8 @@ class Rig(tasks.JointTask):
                 "task rig: expected a rig, got one camera; set `camera=rig.yaml`"
             )
         # The task of an image does not depend on the number of cameras.
-        part = self.image_task.on(
-            replace(model, cameras=1), target=target, minimise=minimise
-        )
+        image_model = replace(model, cameras=1)
+        part = self.image_task.on(image_model, target=target, minimise=minimise)
         if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
             raise InputError(
                 f"task rig: task {part.name} judges one output for all pictures; use a "
@@ -169,10 +168,8 @@ class Rig(tasks.JointTask):
         """
         rows = []
         for image_outputs in output:
-            values = [
-                function(image_output, image_truth)
-                for image_output, image_truth in zip(image_outputs, truth, strict=True)
-            ]
+            pairs = zip(image_outputs, truth, strict=True)
+            values = [function(*pair) for pair in pairs]
             rows.append(torch.cat(values))
         return torch.stack(rows)
 
@@ -261,9 +258,8 @@ class Rig(tasks.JointTask):
         prediction = tasks.join_predictions(
             judgement.prediction for judgement in judgements
         )
-        outcome = tasks.make_outcome_payload(
-            self._find_deciding_judgement(judgements, margin)
-        )
+        deciding = self._find_deciding_judgement(judgements, margin)
+        outcome = tasks.make_outcome_payload(deciding)
         payload = {"pictures": image_payloads, **outcome}
         return tasks.Judgement.from_margin(score, margin, prediction, payload)
 
@@ -296,13 +292,10 @@ class Rig(tasks.JointTask):
         marks_of_rigs = []
         for image_outputs in output:
             marks = self.image_task.marks(image_outputs[0], truth[0])[0]
+            # A map would be drawn next to the image, where the second image is.
+            flat_marks = [mark for mark in marks if mark.map is None]
             marks_of_rigs.append(
-                [
-                    replace(mark, mask=self._pad_to_rig(mark.mask))
-                    for mark in marks
-                    # A map would be drawn next to the image, where the second image is.
-                    if mark.map is None
-                ]
+                [replace(mark, mask=self._pad_to_rig(mark.mask)) for mark in flat_marks]
             )
         return marks_of_rigs
 
