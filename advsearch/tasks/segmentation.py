@@ -83,20 +83,15 @@ class Segmentation(tasks.ClassTask):
         Raises:
             ValueError: there are no logits of `count` images.
         """
-        if isinstance(returned, Mapping):
-            returned = returned.get("out", returned.get("logits"))
-        elif hasattr(returned, "logits"):
-            returned = returned.logits
-        elif isinstance(returned, (list, tuple)) and returned:
-            returned = returned[0]
+        logits = _find_pixel_logits(returned)
         if (
-            not isinstance(returned, Tensor)
-            or returned.ndim != 4
-            or len(returned) != count
-            or returned.shape[1] < 2  # with a single class nothing could be wrong
+            not isinstance(logits, Tensor)
+            or logits.ndim != 4
+            or len(logits) != count
+            or logits.shape[1] < 2  # with a single class nothing could be wrong
         ):
             raise ValueError(EXPECTED)
-        return returned.float()
+        return logits.float()
 
     def count_classes(self, output: Tensor) -> int:
         return output.shape[1]
@@ -126,19 +121,10 @@ class Segmentation(tasks.ClassTask):
         """
         if self.target is None:
             return super().score(output, truth)
-
-        def compute_target_shortfall(logits: Tensor, labels: tasks.Labels) -> Tensor:
-            """Compute the largest other logit minus the largest one of the target.
-
-            Like the margin of wrong classes, it is at most 0 at pixels that get the
-            requested class.
-            """
-            return -tasks.compute_target_margin(logits, labels)
-
         # At most 0 if enough pixels get a target class, and over 0 otherwise: a loss, as if
         # the target were the truth.
         target_loss = self._compute_deciding_margin(
-            output, truth, compute_target_shortfall, self.target
+            output, truth, _compute_target_shortfall, self.target
         )
         return -target_loss
 
@@ -230,17 +216,16 @@ class Segmentation(tasks.ClassTask):
         counts = class_of_pixel.bincount(minlength=n_classes)
         counts[list(self.background_classes)] = 0
         top_counts, top_classes = counts.topk(min(count, n_classes))
-        predictions = tuple(
+        ranked = zip(top_classes.tolist(), top_counts.tolist(), strict=True)
+        predictions = [
             tasks.Prediction(
-                self.get_class_name(class_id), class_id, class_count / n_pixels
+                self.get_class_name(class_id), class_id, n_class / n_pixels
             )
-            for class_id, class_count in zip(
-                top_classes.tolist(), top_counts.tolist(), strict=True
-            )
-            if class_count
-        )
+            for class_id, n_class in ranked
+            if n_class
+        ]
         if predictions:
-            return predictions
+            return tuple(predictions)
         has_any_number = len(class_of_pixel) > 0
         label = "nothing" if has_any_number else tasks.NOT_A_NUMBER
         return (tasks.Prediction(label),)
@@ -250,41 +235,50 @@ class Segmentation(tasks.ClassTask):
     ) -> list[tasks.PredictionWithPayload]:
         """Return the prediction about the object in each image, and a payload.
 
-        The prediction is the class of most of its pixels (`_describe_object`). The
-        payload has the outcome, the fraction of the object's pixels that are right, the
-        fraction of them with each class, and the intersection over union.
-
         Args:
             output: logits (N, classes, h, w).
             truth: truth of the scene.
             margins: margin of each image; at least 0 if it is right.
         """
-        results: list[tasks.PredictionWithPayload] = []
-        mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
-        for logits, margin in zip(output, margins, strict=True):
-            # (P, classes) of the object's pixels, from a batch with this image only
-            batch = logits[None]
-            pixels = self._select_object_logits(batch, truth)
-            if pixels is None:
-                results.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
-                continue
-            # (h, w) which pixels of the full image have a right class
-            is_right_class = self._find_right_pixels(logits, truth)
-            accuracy = float(is_right_class[mask].float().mean())
-            iou = float((is_right_class & mask).sum() / (is_right_class | mask).sum())
-            counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
-            prediction, outcome = self._describe_object(
-                counts, truth, accuracy, is_right=margin >= 0.0
-            )
-            fraction_by_class = self._compute_class_fractions(counts, len(pixels))
-            payload: tasks.JsonValue = {
-                tasks.OUTCOME: outcome.value,
-                "accuracy": round(accuracy, 4),
-                "iou": round(iou, 4),
-                "pixels": fraction_by_class,
-            }
-            results.append((prediction, payload))
-        return results
+        return [
+            self._describe_image(logits, truth, is_right=margin >= 0.0)
+            for logits, margin in zip(output, margins, strict=True)
+        ]
+
+    def _describe_image(
+        self, logits: Tensor, truth: SegmentationTruth, *, is_right: bool
+    ) -> tasks.PredictionWithPayload:
+        """Return the prediction about the object in an image, and a payload.
+
+        The prediction is the class of most of its pixels (`_describe_object`). The
+        payload has the outcome, the fraction of the object's pixels that are right, the
+        fraction of them with each class, and the intersection over union.
+
+        Args:
+            logits: (classes, h, w).
+            truth: truth of the scene.
+            is_right: whether enough of the object's pixels are right.
+        """
+        # (P, classes) of the object's pixels, from a batch with this image only
+        pixels = self._select_object_logits(logits[None], truth)
+        if pixels is None:
+            return tasks.Prediction(tasks.OUT_OF_VIEW), None
+        mask = truth.resize_mask((logits.shape[1], logits.shape[2])).to(logits.device)
+        # (h, w) which pixels of the full image have a right class
+        is_right_class = self._find_right_pixels(logits, truth)
+        accuracy = float(is_right_class[mask].float().mean())
+        iou = float((is_right_class & mask).sum() / (is_right_class | mask).sum())
+        counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
+        prediction, outcome = self._describe_object(
+            counts, truth, accuracy, is_right=is_right
+        )
+        payload: tasks.JsonValue = {
+            tasks.OUTCOME: outcome.value,
+            "accuracy": round(accuracy, 4),
+            "iou": round(iou, 4),
+            "pixels": self._compute_class_fractions(counts, len(pixels)),
+        }
+        return prediction, payload
 
     def _compute_class_fractions(
         self, counts: Tensor, n_pixels: int
@@ -324,16 +318,11 @@ class Segmentation(tasks.ClassTask):
                 the probability of the prediction.
             is_right: whether enough of them are right.
         """
-        is_right_class = torch.zeros_like(counts, dtype=torch.bool)
-        is_right_class[list(truth.labels)] = True
         # right classes if the object is right, otherwise wrong classes
-        is_candidate = is_right_class if is_right else ~is_right_class
-        # Other classes come last with a count of -1, even after classes without pixels.
-        top_class = int(counts.masked_fill(~is_candidate, -1).argmax())
+        top_class = _find_top_class(counts, truth.labels, is_right=is_right)
         if is_right or top_class not in self.background_classes:
-            prediction = tasks.Prediction(
-                self.get_class_name(top_class), top_class, accuracy
-            )
+            class_name = self.get_class_name(top_class)
+            prediction = tasks.Prediction(class_name, top_class, accuracy)
             outcome = tasks.Outcome.FOUND if is_right else tasks.Outcome.WRONG_CLASS
             return prediction, outcome
         name = self.get_class_name(truth.labels[0])
@@ -369,6 +358,41 @@ class Segmentation(tasks.ClassTask):
             ]
             for logits in output.detach()
         ]
+
+
+def _find_pixel_logits(returned: Any) -> Any:
+    """Find the logits in what a network returned; anything else if there are none."""
+    if isinstance(returned, Mapping):
+        return returned.get("out", returned.get("logits"))
+    if hasattr(returned, "logits"):
+        return returned.logits
+    if isinstance(returned, (list, tuple)) and returned:
+        return returned[0]
+    return returned
+
+
+def _compute_target_shortfall(logits: Tensor, labels: tasks.Labels) -> Tensor:
+    """Compute the largest other logit minus the largest one of the target, (P,).
+
+    Like the margin of wrong classes, it is at most 0 at pixels that get the requested
+    class.
+    """
+    return -tasks.compute_target_margin(logits, labels)
+
+
+def _find_top_class(counts: Tensor, labels: tasks.Labels, *, is_right: bool) -> int:
+    """Return the most frequent class of pixels, among the right ones or the wrong ones.
+
+    Args:
+        counts: number of pixels with each class, (classes,).
+        labels: indices of the right classes.
+        is_right: whether to look among the right classes.
+    """
+    is_right_class = torch.zeros_like(counts, dtype=torch.bool)
+    is_right_class[list(labels)] = True
+    is_candidate = is_right_class if is_right else ~is_right_class
+    # Other classes come last with a count of -1, even after classes without pixels.
+    return int(counts.masked_fill(~is_candidate, -1).argmax())
 
 
 def _make_hidden_value(output: Tensor) -> Tensor:
