@@ -209,17 +209,13 @@ class EnsembleTask(JointTask):
                 f"model: expected {len(self.parts)}, one for each task, got {n_models}"
             )
         # `parts` are the tasks as the user set them, `tasks` those for their models.
-        tasks = tuple(
-            part.on(
-                network,
-                target=target if self._takes_label(part) else None,
-                minimise=minimise,
-            )
-            for part, network in zip(self.parts, models, strict=True)
-        )
+        tasks = []
+        for part, part_model in zip(self.parts, models, strict=True):
+            part_target = target if self._takes_label(part) else None
+            tasks.append(part.on(part_model, target=part_target, minimise=minimise))
         targets = None if target is None else tuple(task.target for task in tasks)
         return replace(
-            self, models=models, tasks=tasks, target=targets, minimise=minimise
+            self, models=models, tasks=tuple(tasks), target=targets, minimise=minimise
         )
 
     def with_objective(self, objective: str) -> EnsembleTask:
@@ -348,22 +344,33 @@ class EnsembleTask(JointTask):
         for index, (task, model_output, task_truth) in enumerate(
             self._by_task(output, truth)
         ):
-            model = self.models[index]
             model_marks = task.marks(model_output, task_truth)
             for image_marks, marks in zip(marks_of_images, model_marks, strict=True):
-                # Boxes and masks of the truth are taken from the first model only.
-                is_first_model = index == 0
-                image_marks += [
-                    mark
-                    for mark in marks
-                    if mark.true and (is_first_model or mark.map is not None)
-                ]
-                image_marks += [
-                    replace(mark, text=f"{model.name}: {mark.text}")
-                    for mark in marks
-                    if not mark.true
-                ]
+                image_marks += self._select_marks(marks, index)
         return marks_of_images
+
+    def _select_marks(self, marks: Sequence[Mark], index: int) -> list[Mark]:
+        """Return those marks of a model on an image that are drawn, the truth first.
+
+        Boxes and masks of the truth are those of the first model only.
+
+        Args:
+            marks: marks of the task of the model.
+            index: index of the model.
+        """
+        is_first_model = index == 0
+        true_marks = [
+            mark
+            for mark in marks
+            if mark.true and (is_first_model or mark.map is not None)
+        ]
+        model_name = self.models[index].name
+        predicted_marks = [
+            replace(mark, text=f"{model_name}: {mark.text}")
+            for mark in marks
+            if not mark.true
+        ]
+        return true_marks + predicted_marks
 
     def _by_task(
         self, output: Sequence[Outputs], truth: Truths
@@ -457,22 +464,9 @@ class EachThingTask(JointTask):
         ]
         results: list[PredictionWithPayload] = []
         for image_judgements in zip(*judgements_of_things, strict=True):
-            by_name: dict[str, Judgement] = dict(
-                zip(truth, image_judgements, strict=True)
-            )
+            by_name = dict(zip(truth, image_judgements, strict=True))
             worst = _find_worst_thing(by_name)
-            worst_payload = by_name[worst].payload
-            payload: dict[str, JsonValue] = {
-                **(worst_payload if isinstance(worst_payload, dict) else {}),
-                "worst": worst,
-                "mean_margin": mean(
-                    [judgement.margin for judgement in image_judgements]
-                ),
-                "things": {
-                    name: _summarize_thing(judgement)
-                    for name, judgement in by_name.items()
-                },
-            }
+            payload = _make_thing_payload(by_name, worst)
             results.append((by_name[worst].prediction, payload))
         return results
 
@@ -504,6 +498,27 @@ def _find_worst_thing(judgements: Mapping[str, Judgement]) -> str:
         if not judgement.prediction.is_out_of_view
     ]
     return min(visible or judgements, key=lambda name: judgements[name].margin)
+
+
+def _make_thing_payload(
+    judgements: Mapping[str, Judgement], worst: str
+) -> dict[str, JsonValue]:
+    """Return the payload of an image, from the judgement of each thing by name.
+
+    Args:
+        judgements: judgement of each thing.
+        worst: name of the worst visible thing, whose payload is included.
+    """
+    worst_payload = judgements[worst].payload
+    margins = [judgement.margin for judgement in judgements.values()]
+    return {
+        **(worst_payload if isinstance(worst_payload, dict) else {}),
+        "worst": worst,
+        "mean_margin": mean(margins),
+        "things": {
+            name: _summarize_thing(judgement) for name, judgement in judgements.items()
+        },
+    }
 
 
 def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:
