@@ -342,7 +342,6 @@ def run_trials(
         raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
-    done: list[Judgement] = []
     queries = [
         Query(
             u,
@@ -354,6 +353,22 @@ def run_trials(
         )
         for number in range(first_index + n_done, first_index + trials)
     ]
+    return _judge_queries(evaluate, queries, is_decided)
+
+
+def _judge_queries(
+    evaluate: Evaluate,
+    queries: Sequence[Query],
+    is_decided: Callable[[Sequence[Judgement]], bool] | None,
+) -> tuple[Judgement, ...]:
+    """Return the judgements of queries, until no more are needed.
+
+    Args:
+        evaluate: renders the queries and yields their evaluations, one by one.
+        queries: queries of the trials.
+        is_decided: whether no more trials follow, by those so far; None for never.
+    """
+    done: list[Judgement] = []
     for evaluation in evaluate(queries):
         done.append(evaluation.required_judgement)
         # Leaving the loop means that the remaining queries are not evaluated.

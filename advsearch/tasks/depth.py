@@ -83,6 +83,11 @@ class DepthTruth:
         return bool(self.mask.any())
 
     @cached_property
+    def object_distance(self) -> float:
+        """The geometric mean of the z-depth of the object's pixels, which are visible."""
+        return float(self.z_depth[self.mask].double().log().mean().exp())
+
+    @cached_property
     def outside_object(self) -> Tensor:
         """The pixels outside the object at a finite distance, (H, W) bool."""
         return self.z_depth.isfinite() & ~self.mask
@@ -570,10 +575,6 @@ class Depth(Task):
     ) -> list[tasks.PredictionWithPayload]:
         """Return whether the object's distance is right in each image, and a payload.
 
-        The payload has the true and the predicted distance (geometric means over the
-        object's pixels), the mean factor of an error in either direction, the remaining
-        fraction of the relief, and the pixels on which scale and shift were fitted.
-
         Args:
             output: maps of N images.
             truth: truth of the scene.
@@ -581,29 +582,39 @@ class Depth(Task):
         """
         if not truth.is_visible:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
-        results: list[tasks.PredictionWithPayload] = []
-        # a geometric mean, like that of the factors
-        distance = float(truth.z_depth[truth.mask].double().log().mean().exp())
-        for depth_map, margin in zip(output, margins, strict=True):
-            log_factors = self._compute_log_factors(depth_map, truth)
-            mean_log_factor = float(log_factors.mean())
-            relief = float(self._compute_relief_fraction(log_factors, truth))
-            payload: dict[str, tasks.JsonValue] = {
-                "distance": round(distance, 4),
-                # the predicted distance
-                "judged": round(distance * math.exp(mean_log_factor), 4),
-                "factor": round(math.exp(float(log_factors.abs().mean())), 4),
-                "relief": round(relief, 4),
-            }
-            if self._get_kind(depth_map) != METRIC:
-                has_scale = truth.determines_scale
-                fitted = "beside the object" if has_scale else "in the whole picture"
-                payload["fitted"] = fitted
-            label = AS_FAR
-            if margin < 0.0:
-                label = self._choose_error_label(mean_log_factor, relief)
-            results.append((tasks.Prediction(label), payload))
-        return results
+        return [
+            self._describe_map(depth_map, truth, is_right=not margin < 0.0)
+            for depth_map, margin in zip(output, margins, strict=True)
+        ]
+
+    def _describe_map(
+        self, depth_map: DepthMap, truth: DepthTruth, *, is_right: bool
+    ) -> tasks.PredictionWithPayload:
+        """Return whether the object's distance is right in an image, and a payload.
+
+        The payload has the true and the predicted distance (geometric means over the
+        object's pixels), the mean factor of an error in either direction, the remaining
+        fraction of the relief, and the pixels on which scale and shift were fitted.
+        """
+        log_factors = self._compute_log_factors(depth_map, truth)
+        mean_log_factor = float(log_factors.mean())
+        relief = float(self._compute_relief_fraction(log_factors, truth))
+        distance = truth.object_distance
+        payload: dict[str, tasks.JsonValue] = {
+            "distance": round(distance, 4),
+            # the predicted distance
+            "judged": round(distance * math.exp(mean_log_factor), 4),
+            "factor": round(math.exp(float(log_factors.abs().mean())), 4),
+            "relief": round(relief, 4),
+        }
+        if self._get_kind(depth_map) != METRIC:
+            has_scale = truth.determines_scale
+            fitted = "beside the object" if has_scale else "in the whole picture"
+            payload["fitted"] = fitted
+        label = AS_FAR
+        if not is_right:
+            label = self._choose_error_label(mean_log_factor, relief)
+        return tasks.Prediction(label), payload
 
     def _choose_error_label(self, mean_log_factor: float, relief: float) -> str:
         """Return the label of a wrong distance.

@@ -242,15 +242,15 @@ class Detection(ClassTask):
         )
         return task._infer_format(output)
 
-    def _is_format_declared(self, model: Model) -> Any:
+    def _is_format_declared(self, model: Model) -> bool:
         """Return whether the network declares the format of its boxes by an attribute.
 
         Options of the user take precedence.
         """
-        has_format_options = bool(self.boxes or self.unit)
-        return not has_format_options and getattr(
-            model.module, DECLARED_FORMAT_ATTRIBUTE, False
-        )
+        if self.boxes or self.unit:
+            return False
+        is_declared: bool = getattr(model.module, DECLARED_FORMAT_ATTRIBUTE, False)
+        return is_declared
 
     @property
     def calibrates(self) -> bool:

@@ -1049,17 +1049,14 @@ def _infer_pair_order(
     if not any(map(len, pairs_of_images)):
         return ""
     columns = torch.cat(pairs_of_images).unbind(dim=1)
-    max_classes = math.inf if classes is None else classes
-    are_classes = [_may_be_classes(column, max_classes) for column in columns]
-    are_scores = [_may_be_scores(column) for column in columns]
-    fits_scores_first = are_scores[0] and are_classes[1]
-    fits_labels_first = are_scores[1] and are_classes[0]
-    if fits_scores_first and fits_labels_first:
+    orders = _find_fitting_orders(columns, classes)
+    if len(orders) > 1:
         # Numbers such as 0 and 1 may be scores or classes.
         return _find_falling_order(pairs_of_images)
-    if fits_scores_first or fits_labels_first:
-        return SCORES_FIRST if fits_scores_first else LABELS_FIRST
-    order = _infer_order_without_labels(columns, classes) if all(are_scores) else ""
+    if orders:
+        return orders[0]
+    are_scores = all(map(_may_be_scores, columns))
+    order = _infer_order_without_labels(columns, classes) if are_scores else ""
     if order:
         return order
     if classes is not None:
@@ -1070,6 +1067,23 @@ def _infer_pair_order(
         "expected for each box a score in [0, 1] and the index of a "
         "class, got other numbers"
     )
+
+
+def _find_fitting_orders(columns: Sequence[Tensor], classes: int | None) -> list[str]:
+    """Return those of `ORDERS` in which two columns of numbers can be read.
+
+    Args:
+        columns: two columns (K,) of numbers of boxes.
+        classes: number of classes; None if it is unknown.
+    """
+    first, second = columns
+    max_classes = math.inf if classes is None else classes
+    orders = []
+    if _may_be_scores(first) and _may_be_classes(second, max_classes):
+        orders.append(SCORES_FIRST)
+    if _may_be_scores(second) and _may_be_classes(first, max_classes):
+        orders.append(LABELS_FIRST)
+    return orders
 
 
 def _find_falling_order(pairs_of_images: Sequence[Tensor]) -> str:

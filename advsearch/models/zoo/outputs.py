@@ -100,6 +100,11 @@ def make_feature_source(
             f"prompt: task {TASK} compares pictures and reads no text; "
             "leave `prompt` out"
         )
+    return _make_comparing_source(loaded)
+
+
+def _make_comparing_source(loaded: LoadedNetwork) -> models.Source:
+    """Return the source of a network without its head, for the task of features."""
     network = loaded.network
     config = network.config
     # the network without a head: features are its output
