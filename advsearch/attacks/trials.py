@@ -355,14 +355,18 @@ def _climb_ladder(
             break
         if not may_settle(rung, count):  # but a later look may
             continue
-        seeds = [derive_seed(seed, "sample count", number) for number in range(count)]
-        below = margins_of_rungs[rung - 1]
-        _render_missing(below, margins, ladder[rung - 1], seeds)
+        seeds = _derive_look_seeds(seed, count)
+        for index in (rung - 1, rung):
+            _render_missing(margins_of_rungs[index], margins, ladder[index], seeds)
         at_rung = margins_of_rungs[rung]
-        _render_missing(at_rung, margins, ladder[rung], seeds)
-        if _is_settled(at_rung, below, n_looks, trials):
+        if _is_settled(at_rung, margins_of_rungs[rung - 1], n_looks, trials):
             break
     return [margins_of_rung for margins_of_rung in margins_of_rungs if margins_of_rung]
+
+
+def _derive_look_seeds(seed: int, count: int) -> list[int]:
+    """Return the seeds of the first renders at a rung, the same at all rungs."""
+    return [derive_seed(seed, "sample count", number) for number in range(count)]
 
 
 def _is_settled(
@@ -630,9 +634,7 @@ def choose_rate_spp(
     table = list[Rung]()
     # Nothing settles at the rung with index 0, which has none below.
     highest_rung = 1
-    seeds = [
-        derive_seed(seed, "sample count", number) for number in range(N_CONDITIONS)
-    ]
+    seeds = _derive_look_seeds(seed, N_CONDITIONS)
     for name, render in margins.items():
         rungs = _climb_until_settled(name, render, seeds, ladder)
         table += rungs

@@ -372,11 +372,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     """
     target, weights = split_weights(spec)
     check_import(target)
-    module_name, _, attribute = target.partition(":")
-    module = _import_module(module_name, spec, libraries)
-    value = _get_attribute(module, attribute, module_name)
-    if not isinstance(value, (nn.Module, Model)):  # a function or a class
-        value = _call_factory(value, spec)
+    value = _build_value(target, spec, libraries)
     if isinstance(value, Model):
         if weights is not None:
             raise ModelError(
@@ -392,6 +388,22 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     if weights is not None:
         load_weights(value, weights, target)
     return make_source(value, spec)
+
+
+def _build_value(target: str, spec: str, libraries: Iterable[str]) -> Any:
+    """Return the attribute of a module, or what it returns if it is called.
+
+    Args:
+        target: ``package.module:callable``.
+        spec: what the user wrote, for messages.
+        libraries: names of model sources.
+    """
+    module_name, _, attribute = target.partition(":")
+    module = _import_module(module_name, spec, libraries)
+    value = _get_attribute(module, attribute, module_name)
+    if isinstance(value, (nn.Module, Model)):
+        return value
+    return _call_factory(value, spec)  # a function or a class
 
 
 def _get_attribute(module: ModuleType, attribute: str, module_name: str) -> Any:

@@ -524,14 +524,7 @@ def _load_state(value: Any) -> dict[str, Numbers]:
         value = _read_state_file(Path(value).expanduser())
     if not value:
         return {}
-    has_names = isinstance(value, Mapping) and all(
-        isinstance(name, str) and name for name in value
-    )
-    if not has_names:
-        raise InputError(
-            f"task command: state: expected numbers by name, such as {{speed: 1.5}}, "
-            f"or a JSON file, got {value!r:.80}"
-        )
+    _check_state_names(value)
     state = {
         name: _parse_numbers(f"state {name:.40}", numbers)
         for name, numbers in value.items()
@@ -541,6 +534,18 @@ def _load_state(value: Any) -> dict[str, Numbers]:
             f"task command: state: expected at most {MAX_NUMBERS:,} numbers in total"
         )
     return state
+
+
+def _check_state_names(value: Any) -> None:
+    """Raise InputError if a state is no mapping from names."""
+    has_names = isinstance(value, Mapping) and all(
+        isinstance(name, str) and name for name in value
+    )
+    if not has_names:
+        raise InputError(
+            f"task command: state: expected numbers by name, such as {{speed: 1.5}}, "
+            f"or a JSON file, got {value!r:.80}"
+        )
 
 
 def _read_state_file(path: Path) -> Any:

@@ -186,24 +186,42 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
 
     predictions, channels = _split_off_maps(returned)
     if _may_be_grid(predictions, count):
-        map_channels = torch.tensor(sorted(channels), dtype=torch.long)
-        # rows of a box, a score, a class and mask coefficients
-        has_mask_rows = _has_mask_rows(predictions, channels)
-        if _is_grid(predictions, order, has_mask_rows=has_mask_rows):
-            return [
-                {"grid": grid.float(), "map_channels": map_channels}
-                for grid in predictions
-            ]
-        if has_mask_rows:
-            # The mask coefficients after the first six columns are not read.
-            rows = read_detections(predictions[..., :6], count, order)
-            return [{**detections, "map_channels": map_channels} for detections in rows]
+        detections_of_images = _read_tensor(predictions, channels, order)
+        if detections_of_images is not None:
+            return detections_of_images
     # If the user states the order of a YOLO head, the output should have been a grid.
     is_head_stated = "objectness" in order_names or "channels" in order_names
     if is_head_stated:
         raise ValueError(EXPECTED)
     components_of_images = _split_images(predictions, count, order_names)
     return [_check_detections(components) for components in components_of_images]
+
+
+def _read_tensor(
+    predictions: Tensor, channels: Collection[int], order: str
+) -> list[Detections] | None:
+    """Read a single tensor (N, A, B) as YOLO grids, or as rows with mask coefficients.
+
+    Args:
+        predictions: (N, A, B).
+        channels: numbers of channels of feature maps that came with it.
+        order: order that the user stated, or "".
+
+    Returns:
+        The detections of each image; None if it is neither.
+    """
+    map_channels = torch.tensor(sorted(channels), dtype=torch.long)
+    # rows of a box, a score, a class and mask coefficients
+    has_mask_rows = _has_mask_rows(predictions, channels)
+    if _is_grid(predictions, order, has_mask_rows=has_mask_rows):
+        return [
+            {"grid": grid.float(), "map_channels": map_channels} for grid in predictions
+        ]
+    if not has_mask_rows:
+        return None
+    # The mask coefficients after the first six columns are not read.
+    rows = read_detections(predictions[..., :6], len(predictions), order)
+    return [{**detections, "map_channels": map_channels} for detections in rows]
 
 
 def _may_be_grid(predictions: Any, count: int) -> bool:
@@ -308,7 +326,17 @@ def _split_images(
     )
     if has_rows_of_all_images:
         return _split_batch_rows(returned, count, order_names)
-    batch = _find_components(returned, order_names)
+    return _split_components(_find_components(returned, order_names), count)
+
+
+def _split_components(
+    batch: Mapping[str, Tensor], count: int
+) -> list[dict[str, Tensor]]:
+    """Split the components of a batch, whose first axis is the image, by image.
+
+    Raises:
+        ValueError: they are not those of `count` images.
+    """
     if batch["boxes"].ndim == 2 and count == 1:
         # The network has dropped the batch dimension, which is added again.
         batch = {name: component[None] for name, component in batch.items()}
@@ -893,17 +921,14 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
         has_objectness = order.startswith(OBJECTNESS_HEAD)
         scores = pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
         return _check_detections({"boxes": detections["boxes"], "scores": scores})
-    first, second = pairs.unbind(dim=1)
-    if order == SCORES_FIRST:
-        identified = {"scores": first, "labels": second}
-    else:
-        identified = {"scores": second, "labels": first}
-    other_components = {
+    components = {
         name: value
         for name, value in detections.items()
         if name not in ("score_or_label", "map_channels")
     }
-    return _check_detections({**other_components, **identified})
+    names = ("scores", "labels") if order == SCORES_FIRST else ("labels", "scores")
+    components.update(zip(names, pairs.unbind(dim=1), strict=True))
+    return _check_detections(components)
 
 
 def _check_no_values(detections: Detections) -> None:
@@ -1183,18 +1208,11 @@ def find_head_orders(
     problem = ""
     for name in _list_orders_of_size(returned.shape, map_channels, classes, order):
         _, scores = split_grid(returned, classes, name, multiply_objectness=False)
-        scores = scores.detach()
-        is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
-        # scores that are not finite make an output broken, in any order
-        fits = not bool((is_outside & scores.isfinite()).any())
-        is_only_last_outside = not bool(is_outside[:, :-1].any())
-        if fits:
+        new_problem = _describe_misread_scores(scores.detach(), name)
+        if not new_problem:
             orders.append(name)
-        elif name == _OBB_LIKE_ORDER and is_only_last_outside:
-            # The last channel is no score but an angle.
-            problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
-        elif not problem:
-            problem = _describe_score_range(scores, name)
+        elif not problem or new_problem == _ANGLE_PROBLEM:
+            problem = new_problem
     if not order:
         _check_no_angle(orders, classes)
     if orders:
@@ -1204,8 +1222,26 @@ def find_head_orders(
     raise _make_channel_error((returned.shape[0], returned.shape[1]), classes)
 
 
-def _describe_score_range(scores: Tensor, order: str) -> str:
-    """Describe scores that are outside [0, 1] if an output is read in an order."""
+_ANGLE_PROBLEM = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
+
+
+def _describe_misread_scores(scores: Tensor, order: str) -> str:
+    """Describe scores that are outside [0, 1] if an output is read in an order.
+
+    The text is empty if none is. Scores that are not finite make an output broken, in
+    any order.
+
+    Args:
+        scores: scores that are read in this order; the last axis is that of classes.
+        order: the order.
+    """
+    is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
+    if not bool((is_outside & scores.isfinite()).any()):
+        return ""
+    is_only_last_outside = not bool(is_outside[:, :-1].any())
+    if order == _OBB_LIKE_ORDER and is_only_last_outside:
+        # The last channel is no score but an angle.
+        return _ANGLE_PROBLEM
     return (
         f"scores from {float(scores.min()):.3g} to "
         f"{float(scores.max()):.3g} if it is read as '{order}'; "

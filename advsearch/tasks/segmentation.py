@@ -272,13 +272,12 @@ class Segmentation(tasks.ClassTask):
         prediction, outcome = self._describe_object(
             counts, truth, accuracy, is_right=is_right
         )
-        payload: tasks.JsonValue = {
+        return prediction, {
             tasks.OUTCOME: outcome.value,
             "accuracy": round(accuracy, 4),
             "iou": round(iou, 4),
             "pixels": self._compute_class_fractions(counts, len(pixels)),
         }
-        return prediction, payload
 
     def _compute_class_fractions(
         self, counts: Tensor, n_pixels: int

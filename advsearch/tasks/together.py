@@ -464,7 +464,9 @@ class EachThingTask(JointTask):
         ]
         results: list[PredictionWithPayload] = []
         for image_judgements in zip(*judgements_of_things, strict=True):
-            by_name = dict(zip(truth, image_judgements, strict=True))
+            by_name: dict[str, Judgement] = dict(
+                zip(truth, image_judgements, strict=True)
+            )
             worst = _find_worst_thing(by_name)
             payload = _make_thing_payload(by_name, worst)
             results.append((by_name[worst].prediction, payload))

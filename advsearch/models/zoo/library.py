@@ -177,7 +177,9 @@ def _process_color(
     return _run_processor(processor, image, spec)
 
 
-def _measure_channel_gains(process_color: Callable[[Color], Array], offset: Array) -> Array:
+def _measure_channel_gains(
+    process_color: Callable[[Color], Array], offset: Array
+) -> Array:
     """Return the gains (3, 3) of input channels (columns) in output channels (rows).
 
     Args:
@@ -286,8 +288,8 @@ def _wrap_processor(
     call = partial(_call_processor, process)
     # A processor without a fixed size takes any.
     default_size = (PROBE_SIZES[0], PROBE_SIZES[0])
-    height, width = processing.get("input_size", default_size)
-    levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    size = processing.get("input_size", default_size)
+    levels = np.random.default_rng(0).integers(0, 256, (*size, 3), np.uint8)
     expected = _run_processor(process, levels, spec)
     image = torch.from_numpy(levels).float() / 255.0
     try:
@@ -298,12 +300,11 @@ def _wrap_processor(
             spec, processor, f"{what}, and {problem}"
         ) from error
     if not has_gradient or not _is_as_expected(output, expected):
-        raise _make_processor_error(
-            spec,
-            processor,
-            f"{what}, and returns other values for floating-point images than for 8-bit "
-            "images, or no gradient",
+        problem = (
+            "returns other values for floating-point images than for 8-bit images, or "
+            "no gradient"
         )
+        raise _make_processor_error(spec, processor, f"{what}, and {problem}")
     return Processing(processor=call, **processing)
 
 
