@@ -64,10 +64,10 @@ class ClassTask(Task):
                 task reads.
         """
         self._check_output_kind(model)
-        labels = model.labels
-        named = model.named
-        # The labels of a classifier were checked when it was loaded.
-        if not self.reads_logits:
+        if self.reads_logits:  # a classifier, whose labels were checked when loaded
+            labels = model.labels
+            named = model.named
+        else:
             labels, named = self._get_model_labels(model)
         target_classes = None
         if target is not None:

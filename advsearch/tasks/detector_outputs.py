@@ -85,6 +85,7 @@ the scores instead of objectness before them.
 """
 
 _UNREAD = "which are not read"  # end of messages about outputs of other kinds
+_ANGLE_PROBLEM = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
 
 NAMES = {
     "boxes": (
@@ -1220,9 +1221,6 @@ def find_head_orders(
     if problem:
         raise ValueError(f"it has {problem}")
     raise _make_channel_error((returned.shape[0], returned.shape[1]), classes)
-
-
-_ANGLE_PROBLEM = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
 
 
 def _describe_misread_scores(scores: Tensor, order: str) -> str:
