@@ -776,7 +776,7 @@ def _shorten(
     """
     shrink_to = partial(_shrink_to_length, domain, u, length)
     low = max(bracket.largest_failing_scale, SMALLEST_SCALE * length)
-    bisection = _LengthBisection.begin(low, length, likely, shrink_to)
+    bisection = _LengthBisection.start_between(low, length, likely, shrink_to)
     bracket = replace(bracket, u=u)
     while not bisection.is_done:
         shorter_u = shrink_to(bisection.trial_length)
@@ -826,7 +826,7 @@ class _LengthBisection:
     max_step_factor: float
 
     @classmethod
-    def begin(
+    def start_between(
         cls,
         low: float,
         high: float,

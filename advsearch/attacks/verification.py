@@ -444,7 +444,7 @@ def verify(
     u = domain.project(u)
     groups = _Groups(rule, looks, spp, curtailed, list(clean))
     run = partial(run_trials, evaluate, spp=spp, seed=seed, first_index=first_index)
-    groups.run(
+    groups.run_until_verdict(
         run_clean=partial(run, domain.start, kind=control_kind),
         run_adversarial=partial(run, u, kind=kind, n_images=n_images),
     )
@@ -493,7 +493,7 @@ class _Groups:
         """Whether there are as many trials as were requested, and no look before."""
         return not self.has_several_looks and len(self.trials) == self.looks[0]
 
-    def run(
+    def run_until_verdict(
         self,
         run_clean: Callable[..., Iterable[Judgement]],
         run_adversarial: Callable[..., Iterable[Judgement]],

@@ -49,7 +49,7 @@ class Family(NamedTuple):
     loader: str | None
     source: Callable[[LoadedNetwork], models.Source]
 
-    def has(self, architecture: str, network: Any) -> bool:
+    def includes(self, architecture: str, network: Any) -> bool:
         """Return whether an architecture belongs to the family.
 
         Args:
@@ -238,7 +238,7 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
         ModelError: it belongs to no family.
     """
     for family in NETWORKS:
-        if family.has(architecture, network):
+        if family.includes(architecture, network):
             return family
     raise errors.ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has "
