@@ -403,16 +403,21 @@ def make_class_mask(
     n_classes = logits.shape[1]
     if isinstance(labels, Tensor):
         labels = tuple(dict.fromkeys(labels.flatten().tolist()))
-    if not labels or not all(0 <= label < n_classes for label in labels):
-        raise InputError(
-            f"{setting}: expected class indices from 0 to {n_classes - 1}, "
-            f"got {tuple(labels)}"
-        )
+    _check_class_indices(labels, n_classes, setting)
     is_member = torch.zeros(n_classes, dtype=torch.bool, device=logits.device)
     is_member[list(labels)] = True
     if bool(is_member.all()):
         raise _make_all_classes_error(setting, n_classes)
     return is_member
+
+
+def _check_class_indices(labels: Labels, n_classes: int, setting: str) -> None:
+    """Raise InputError if a label set is empty, or an index is out of range."""
+    if not labels or not all(0 <= label < n_classes for label in labels):
+        raise InputError(
+            f"{setting}: expected class indices from 0 to {n_classes - 1}, "
+            f"got {tuple(labels)}"
+        )
 
 
 def _make_all_classes_error(setting: str, n_classes: int) -> InputError:

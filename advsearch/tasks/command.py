@@ -371,17 +371,25 @@ class Command(Task):
             # a loss of at most 0: within the envelope of the target
             reaches_target = (self.loss(output, self.target) <= 0.0).tolist()
         deviations = self._compute_deviation(output, clean_action)
-        labels = []
-        for is_reached, margin, deviation in zip(
-            reaches_target, margins, deviations, strict=True
-        ):
-            if is_reached:
-                labels.append(REACHED)
-            elif margin >= 0.0:
-                labels.append(INSIDE)
-            else:
-                labels.append(self._make_outside_label(deviation))
-        return labels
+        rows = zip(reaches_target, margins, deviations, strict=True)
+        return [
+            self._choose_label(margin, deviation, is_reached=is_reached)
+            for is_reached, margin, deviation in rows
+        ]
+
+    def _choose_label(
+        self, margin: float, deviation: Tensor, *, is_reached: bool
+    ) -> str:
+        """Return the label of an action.
+
+        Args:
+            margin: below 0 if it is outside its envelope.
+            deviation: deviation of each of its elements, (A,).
+            is_reached: whether it is within the envelope of the target.
+        """
+        if is_reached:
+            return REACHED
+        return INSIDE if margin >= 0.0 else self._make_outside_label(deviation)
 
     def _make_outside_label(self, deviation: Tensor) -> str:
         """Return the label of an action outside its envelope.

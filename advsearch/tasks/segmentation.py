@@ -211,24 +211,34 @@ class Segmentation(tasks.ClassTask):
         # other logit that is not finite are left out.
         is_number = (logits.isfinite() | (logits == -math.inf)).all(dim=0)
         class_of_pixel = logits[:, is_number].argmax(dim=0)
-        n_classes = len(logits)
-        n_pixels = logits[0].numel()
-        counts = class_of_pixel.bincount(minlength=n_classes)
+        counts = class_of_pixel.bincount(minlength=len(logits))
         counts[list(self.background_classes)] = 0
-        top_counts, top_classes = counts.topk(min(count, n_classes))
+        predictions = self._list_frequent_classes(counts, logits[0].numel(), count)
+        if predictions:
+            return predictions
+        has_any_number = len(class_of_pixel) > 0
+        label = "nothing" if has_any_number else tasks.NOT_A_NUMBER
+        return (tasks.Prediction(label),)
+
+    def _list_frequent_classes(
+        self, counts: Tensor, n_pixels: int, count: int
+    ) -> tuple[tasks.Prediction, ...]:
+        """Return the `count` most frequent classes that have any pixel.
+
+        Args:
+            counts: number of pixels with each class, (classes,).
+            n_pixels: number of all pixels, of which a class has a fraction.
+            count: how many; there may be fewer.
+        """
+        top_counts, top_classes = counts.topk(min(count, len(counts)))
         ranked = zip(top_classes.tolist(), top_counts.tolist(), strict=True)
-        predictions = [
+        return tuple(
             tasks.Prediction(
                 self.get_class_name(class_id), class_id, n_class / n_pixels
             )
             for class_id, n_class in ranked
             if n_class
-        ]
-        if predictions:
-            return tuple(predictions)
-        has_any_number = len(class_of_pixel) > 0
-        label = "nothing" if has_any_number else tasks.NOT_A_NUMBER
-        return (tasks.Prediction(label),)
+        )
 
     def describe(
         self, output: Tensor, truth: SegmentationTruth, margins: Sequence[float]

@@ -279,9 +279,8 @@ def _check_scores(
     # cosines.
     scale = classifier.head.weight.norm(dim=-1).max()
     # With the prompt "{}" the text is used as it is.
-    embedding = scale * embed_words(network, tokenizer, [text], ["{}"])
-    bias = classifier.head.bias[0]  # the same for all names
-    computed = classifier.embed_images(noise) @ embedding.T + bias
+    embedding = embed_words(network, tokenizer, [text], ["{}"])
+    computed = _compute_score(classifier, noise, scale * embedding)
     # Scores are scaled cosines, whose rounding errors are in proportion to the scale.
     magnitude = max(float(scale), float(expected.abs().max()))
     are_equal = expected.shape == computed.shape and are_nearly_equal(
@@ -293,6 +292,14 @@ def _check_scores(
             "scaled cosine of a picture and a "
             "text; expected one such as CLIPModel or SiglipModel"
         )
+
+
+def _compute_score(
+    classifier: _CosineClassifier, image: Tensor, embedding: Tensor
+) -> Tensor:
+    """Return the score (1, 1) of an image (1, 3, H, W) for a scaled embedding (1, D)."""
+    bias = classifier.head.bias[0]  # the same for all names
+    return classifier.embed_images(image) @ embedding.T + bias
 
 
 def warn_of_equal_texts(
@@ -406,12 +413,7 @@ def _build_grounding_dino(
         tokenizer(text, verbose=False)["input_ids"], device=network.device
     )
     name = loaded.name
-    max_tokens = network.config.max_text_len
-    if len(tokens) > max_tokens:
-        raise InputError(
-            f"labels: model {name} reads a text of at most {max_tokens} tokens, and "
-            f"the names take {len(tokens)}; give fewer"
-        )
+    _check_token_count(len(tokens), network.config.max_text_len, name)
     # (names, longest name) indices of the tokens of each name. The full stop between
     # names is one of the special tokens, so that each run of other tokens is a name.
     token_index = _find_token_runs(tokens, network.model.special_tokens)
@@ -422,6 +424,15 @@ def _build_grounding_dino(
             "leave . and ? out of names and prompt"
         )
     return partial(_run_grounding_dino, tokens, token_index)
+
+
+def _check_token_count(count: int, max_tokens: int, name: str) -> None:
+    """Raise InputError if names take more tokens than a model reads."""
+    if count > max_tokens:
+        raise InputError(
+            f"labels: model {name} reads a text of at most {max_tokens} tokens, and "
+            f"the names take {count}; give fewer"
+        )
 
 
 def _choose_prompt(loaded: LoadedNetwork) -> str:
