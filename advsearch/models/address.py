@@ -23,7 +23,7 @@ import time
 import urllib.error
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import wait as futures_wait
 from contextlib import suppress
@@ -676,51 +676,41 @@ class AddressModel(models.RemoteNetwork):
             count = self._reserve(min(max_concurrent, len(pending)))
             batch = pending[:count]
             del pending[:count]
-            errors_of_requests = list[tuple[_Request, Exception]]()
-            for request, response in self._send_batch(batch, bodies):
-                if isinstance(response, dict):
-                    yield request.index, response
-                else:
-                    errors_of_requests.append((request, response))
-            # Raised only after the loop, so that no response of the batch is lost.
-            pending = self._plan_retries(errors_of_requests, len(batch)) + pending
+            retries = yield from self._send_batch(batch, bodies)
+            self._wait_for_longest(retries)
+            # twice the delay, for the case that they fail again
+            retries = [replace(request, delay=2 * request.delay) for request in retries]
+            pending = retries + pending
 
     def _send_batch(
         self, batch: Sequence[_Request], bodies: Sequence[Mapping[str, Any]]
-    ) -> Iterator[tuple[_Request, dict[str, Any] | Exception]]:
-        """Send requests at the same time; return each with its response or error."""
-        contents = [json.dumps(bodies[request.index]).encode() for request in batch]
-        responses = self._send_together(contents)
-        return zip(batch, responses, strict=True)
-
-    def _plan_retries(
-        self, failed: Sequence[tuple[_Request, Exception]], n_sent: int
-    ) -> list[_Request]:
-        """Return the requests to send again after a batch, once their delay is over.
+    ) -> Generator[tuple[int, dict[str, Any]], None, list[_Request]]:
+        """Send requests at the same time, and return those to send again.
 
         Args:
-            failed: requests of the batch that failed, with their errors.
-            n_sent: number of requests of the batch.
+            batch: the requests.
+            bodies: bodies of these and of other requests, by `_Request.index`.
+
+        Yields:
+            The index of each request that succeeded, and the response to it.
 
         Raises:
-            ModelError: another try of one of them is pointless.
+            ModelError: a request failed, and another try is pointless.
         """
-        failures = list[str]()
-        retries = list[_Request]()
+        contents = [json.dumps(bodies[request.index]).encode() for request in batch]
+        responses = self._send_together(contents)
         # `_reserve` has already counted the calls of this batch. If the connection is
         # refused in the first one, there is no server, and another try is pointless.
-        is_first_batch = self.spent["calls"] <= n_sent
-        for request, error in failed:
-            reason, retry = self._plan_retry(request, error, first=is_first_batch)
-            if retry is None:
-                failures.append(reason)
+        is_first_batch = self.spent["calls"] <= len(batch)
+        plans = list[tuple[str, _Request | None]]()
+        for request, response in zip(batch, responses, strict=True):
+            if isinstance(response, dict):
+                yield request.index, response
             else:
-                retries.append(retry)
-        if failures:
-            raise errors.ModelError(failures[0])
-        self._wait_for_longest(retries)
-        # twice the delay, for the case that they fail again
-        return [replace(request, delay=2 * request.delay) for request in retries]
+                plan = self._plan_retry(request, response, first=is_first_batch)
+                plans.append(plan)
+        # This may raise, so it follows the loop: no response of the batch is lost.
+        return _select_retries(plans)
 
     def _wait_for_longest(self, retries: Sequence[_Request]) -> None:
         """Wait for the longest delay of requests that are sent again, if there are any."""
@@ -1013,6 +1003,27 @@ class AddressModel(models.RemoteNetwork):
                 "`ask` counts tokens",
                 "none",
             )
+
+
+def _select_retries(plans: Sequence[tuple[str, _Request | None]]) -> list[_Request]:
+    """Return the requests to send again, from what is planned for those that failed.
+
+    Args:
+        plans: for each, why it failed, and the request to send next, or None.
+
+    Raises:
+        ModelError: another try of one of them is pointless; it states the reason.
+    """
+    retries = list[_Request]()
+    final_reasons = list[str]()
+    for reason, retry in plans:
+        if retry is None:
+            final_reasons.append(reason)
+        else:
+            retries.append(retry)
+    if final_reasons:
+        raise errors.ModelError(final_reasons[0])
+    return retries
 
 
 def _join_pieces(content: Any) -> Any:
