@@ -98,12 +98,11 @@ def add_candidate(
     if is_full and _sort_key(new) <= _sort_key(pool[-1]):  # no better than the worst
         return pool
     similar = _find_similar(pool, new)
-    if similar is not None:
-        if _sort_key(new) <= _sort_key(similar):
-            return pool
-        # `new` is the better of the two and replaces the other one
-        pool = tuple(candidate for candidate in pool if candidate is not similar)
-    return tuple(sorted((*pool, new), key=_sort_key, reverse=True)[:size])
+    if similar is not None and _sort_key(new) <= _sort_key(similar):
+        return pool
+    # `new` replaces a similar candidate, which is no better
+    others = [candidate for candidate in pool if candidate is not similar]
+    return tuple(sorted((*others, new), key=_sort_key, reverse=True)[:size])
 
 
 def _repeat_candidate(
@@ -296,8 +295,8 @@ def estimate_failure_rate(
     effective = _count_effective_failures(x_if_unknown_pass)
     estimate = None
     if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
-        # The mean of x_t may exceed 1 by chance, as weights do; a rate can't.
-        estimate = min(1.0, float(x_if_unknown_pass.sum()) / n_samples)
+        mean = float(x_if_unknown_pass.sum()) / n_samples
+        estimate = min(1.0, mean)  # by chance the mean may exceed 1; a rate can't
     interval = _bound_failure_rate(
         x_if_unknown_pass, x_if_unknown_fail, bounds.double()
     )
@@ -452,14 +451,14 @@ def select_diverse(
     """
     # the worst first: `argmax` below returns the first of equally far points
     order = sorted(range(len(points)), key=lambda index: -objectives[index])
-    points = points[order].double()
+    ordered_points = points[order].double()
     # (n,) distance to the nearest selected point; infinite before there is one
     nearest_distance = torch.full((len(points),), torch.inf, dtype=torch.float64)
     selected = list[int]()
     for _ in range(min(limit, len(points))):
         farthest = int(nearest_distance.argmax())
         selected.append(farthest)
-        difference = (points - points[farthest]).abs()
+        difference = (ordered_points - ordered_points[farthest]).abs()
         distance = _compute_length(difference, is_periodic, is_discrete)
         nearest_distance = torch.minimum(nearest_distance, distance)
         nearest_distance[selected] = -1.0  # below every distance: never selected again

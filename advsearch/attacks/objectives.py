@@ -266,10 +266,7 @@ class _UserObjective:
         """Return the values (N,) of the function."""
         inputs = {name: read_input(name) for name in self.signature.requested_inputs}
         count = images.shape[0]
-        labels = truth_to_labels(truth, output, count)
-        takes_images = self.signature.takes_images
-        arguments = (output, images, labels) if takes_images else (output, labels)
-        argument_copies = copy_value(arguments)
+        argument_copies = self._copy_arguments(output, images, truth)
         input_copies = copy_value(inputs)
         result = self._call_function(argument_copies, input_copies)
         is_scalar = isinstance(result, Tensor) and result.ndim == 0
@@ -282,6 +279,22 @@ class _UserObjective:
         # values without a gradient, though an argument has one, are an error
         _check_keeps_gradient(self.name, values, (images, output, *inputs.values()))
         return values
+
+    def _copy_arguments(
+        self, output: Any, images: Tensor, truth: Any
+    ) -> tuple[Any, ...]:
+        """Return copies of the arguments that the function takes by position.
+
+        Args:
+            output: output of the model for N images.
+            images: (N, H, W, 3).
+            truth: what is right for all images.
+        """
+        labels = truth_to_labels(truth, output, count=images.shape[0])
+        takes_images = self.signature.takes_images
+        arguments = (output, images, labels) if takes_images else (output, labels)
+        copies: tuple[Any, ...] = copy_value(arguments)
+        return copies
 
     def _call_function(
         self, arguments: tuple[Any, ...], inputs: Mapping[str, Any]
@@ -740,10 +753,21 @@ def get_objective(
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind = _find_kind(objective)
-    if kind is None:
-        function = wrap_objective(objective)  # type: ignore[arg-type]
-        name = get_name(objective)  # type: ignore[arg-type]
-        return _OrientedObjective(function, task, name if targeted else "")
+    if kind is not None:
+        return _make_named_objective(kind, task, features, clean)
+    function = wrap_objective(objective)  # type: ignore[arg-type]
+    name = get_name(objective)  # type: ignore[arg-type]
+    return _OrientedObjective(function, task, name if targeted else "")
+
+
+def _make_named_objective(
+    kind: ObjectiveKind, task: Task, features: ReadFeatures | None, clean: Tensor | None
+) -> Objective:
+    """Return a named objective for a task; the arguments are those of `get_objective`.
+
+    Raises:
+        InputError: the objective needs features and got none.
+    """
     if kind.of_task is not None:
         # The objective that the task itself defines has its target and direction
         # already.
@@ -752,7 +776,7 @@ def get_objective(
     if kind.of_features is not None:
         function = _make_feature_objective(kind, features, clean)
         return _OrientedObjective(function, task)
-    function = _make_output_objective(kind, targeted=targeted)
+    function = _make_output_objective(kind, targeted=task.target is not None)
     converts_output = _must_convert_outputs(task)
     return _OrientedObjective(function, task, converts_output=converts_output)
 
@@ -850,9 +874,8 @@ class _OrientedObjective:
     ) -> Tensor:
         """Return the values (N,) of the function, negated if the task minimizes."""
         labels = truth if self.task.target is None else self.task.target
-        function_output = output
-        if self.converts_output:
-            function_output = self.task.as_logits(output, labels)
+        converts = self.converts_output
+        function_output = self.task.as_logits(output, labels) if converts else output
         values = self.function(function_output, images, labels, read_input)
         # it can only be checked if the values have a gradient by the model's output
         if self.name_to_check and _has_slope_by_class(values, output):

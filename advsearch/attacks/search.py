@@ -227,8 +227,7 @@ def search(
     size = max(1, candidates)
     log = _Log(evaluate, domain, on_step, size, kind, render_seed)
     if is_out_of_time is None:
-        deadline = math.inf if seconds is None else started + seconds
-        is_out_of_time = _make_deadline_check(deadline)
+        is_out_of_time = _make_deadline_check(started, seconds)
     try:
         with reraise_lost_interrupt():
             stopped = _explore(log, policy, steps, seed, is_out_of_time)
@@ -243,8 +242,14 @@ def search(
     return _make_result(log, stopped, time.perf_counter() - started)
 
 
-def _make_deadline_check(deadline: float) -> IsOutOfTime:
-    """Return a function that says whether `time.perf_counter` has passed a deadline."""
+def _make_deadline_check(started: float, seconds: float | None) -> IsOutOfTime:
+    """Return a function that says whether a search has taken more than some seconds.
+
+    Args:
+        started: when it began, as `time.perf_counter` counts.
+        seconds: its time limit; None for no limit.
+    """
+    deadline = math.inf if seconds is None else started + seconds
     return lambda n_evaluations: time.perf_counter() >= deadline
 
 
@@ -424,14 +429,32 @@ class _Log:
             seconds = time.perf_counter() - started
             _check_evaluation(raw, proposal, self.domain)
             evaluation = raw.sanitize()
-            self._count(proposal, evaluation, phase)
-            self.records.append(self._make_record(proposal, query, evaluation, seconds))
-            self._measure_agreement(evaluation.gradient)
-            if self.on_step is not None:
-                # copies, as the callback may write into the tensors
-                self.on_step(self.records[-1], *copy_value((proposal.u, evaluation)))
+            self._record_evaluation(proposal, query, evaluation, seconds)
+            self._report_latest_record(proposal.u, evaluation)
             yield evaluation
             started = time.perf_counter()
+
+    def _record_evaluation(
+        self, proposal: Proposal, query: Query, evaluation: Evaluation, seconds: float
+    ) -> None:
+        """Count an evaluation, append its record, and compare its gradient.
+
+        Args:
+            proposal: proposal of the policy.
+            query: query that was made of the proposal.
+            evaluation: its evaluation, sanitized.
+            seconds: seconds that the evaluation took.
+        """
+        assert query.phase is not None
+        self._count(proposal, evaluation, query.phase)
+        self.records.append(self._make_record(proposal, query, evaluation, seconds))
+        self._measure_agreement(evaluation.gradient)
+
+    def _report_latest_record(self, u: Tensor, evaluation: Evaluation) -> None:
+        """Call `on_step`, if there is one, with the latest record and its evaluation."""
+        if self.on_step is not None:
+            # copies, as the callback may write into the tensors
+            self.on_step(self.records[-1], *copy_value((u, evaluation)))
 
     def _make_queries(
         self, proposals: Sequence[Proposal], seed_indices: Sequence[int], phase: Phase
@@ -443,21 +466,33 @@ class _Log:
             seed_indices: index of the seed of each proposal in the search's stream.
             phase: "search" or "ranking".
         """
+        first_record = len(self.records)
         pairs = zip(proposals, seed_indices, strict=True)
         return [
-            Query(
-                proposal.u.clone(),
-                seed=derive_seed(self.render_seed, self.kind, seed_index),
-                kind=self.kind,
-                row_index=record_index,
-                phase=phase,
-                gradient=proposal.gradient,
-                samples=proposal.samples,
-            )
-            for record_index, (proposal, seed_index) in enumerate(
-                pairs, start=len(self.records)
-            )
+            self._make_proposal_query(proposal, seed_index, record_index, phase)
+            for record_index, (proposal, seed_index) in enumerate(pairs, first_record)
         ]
+
+    def _make_proposal_query(
+        self, proposal: Proposal, seed_index: int, record_index: int, phase: Phase
+    ) -> Query:
+        """Return the query of a proposal.
+
+        Args:
+            proposal: proposal to evaluate.
+            seed_index: index of its seed in the search's stream.
+            record_index: index of the record that its evaluation will have.
+            phase: "search" or "ranking".
+        """
+        return Query(
+            proposal.u.clone(),
+            seed=derive_seed(self.render_seed, self.kind, seed_index),
+            kind=self.kind,
+            row_index=record_index,
+            phase=phase,
+            gradient=proposal.gradient,
+            samples=proposal.samples,
+        )
 
     def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
         """Count the costs of an evaluation, and update the best and the candidates.
@@ -561,12 +596,10 @@ def _explore(
     state = policy.start(log.domain, generator, steps)
     while log.renders < steps:
         renders_left = steps - log.renders
-        max_proposals = min(max_batch_size(log.domain.dim), renders_left)
-        proposals, state = policy.propose(state, max_proposals)
-        if not proposals:
+        batch, state = _propose_batch(policy, state, log.domain, renders_left, name)
+        if not batch:
             return Ending.STALLED
-        _check_proposals(proposals, max_proposals, log.domain, name)
-        batch = _limit_batch(proposals, log.domain, renders_left)
+        # the state that an interrupted search makes its result from
         log.begin_batch(state)
         ending = _evaluate_proposals(log, batch, is_out_of_time)
         if ending is not None:
@@ -574,6 +607,31 @@ def _explore(
         state = policy.update(state, log.evaluated_batch)
         log.begin_batch(state)
     return Ending.BUDGET_SPENT
+
+
+def _propose_batch(
+    policy: Policy[Any], state: Any, domain: Domain, renders_left: int, name: str
+) -> tuple[list[Proposal], Any]:
+    """Return the next proposals that the renders can pay, and the policy's new state.
+
+    There are none if the policy has nothing more to propose.
+
+    Args:
+        policy: policy that proposes.
+        state: state of the policy.
+        domain: domain of the search.
+        renders_left: number of renders that the budget has left, at least 1.
+        name: name of the policy, for messages.
+
+    Raises:
+        RuntimeError: a proposal breaks the contract of a policy, which is a bug.
+    """
+    max_proposals = min(max_batch_size(domain.dim), renders_left)
+    proposals, state = policy.propose(state, max_proposals)
+    if not proposals:
+        return [], state
+    _check_proposals(proposals, max_proposals, domain, name)
+    return _limit_batch(proposals, domain, renders_left), state
 
 
 def _evaluate_proposals(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise, product
@@ -132,18 +132,19 @@ class _MarginRenderer:
         first_render = self.n_rendered[spp]  # at this sample count
         first_query = self.n_rendered.total()  # at all sample counts
         self.n_rendered[spp] += len(seeds)
-        queries = [
-            Query(
+        queries = []
+        for offset, seed in enumerate(seeds):
+            includes_image = first_render + offset < self.n_images
+            query = Query(
                 self.u,
                 seed,
                 self.kind,
                 row_index=first_query + offset,
                 spp=spp,
                 draws_conditions=self.draws_conditions,
-                includes_image=first_render + offset < self.n_images,
+                includes_image=includes_image,
             )
-            for offset, seed in enumerate(seeds)
-        ]
+            queries.append(query)
         evaluations = self.evaluate(queries)
         return [-evaluation.required_judgement.score for evaluation in evaluations]
 
@@ -346,15 +347,7 @@ def _climb_ladder(
     """
     margins_of_rungs: list[list[float]] = [[] for _ in ladder]
     n_looks = len(look_sizes)  # at each rung
-    may_settle = partial(_may_settle, margins_of_rungs, ladder, n_looks)
-    # (index of the rung, number of renders there), in order; the first rung has no look
-    looks = list(product(range(1, len(ladder)), look_sizes))
-    for look_index, (rung, count) in enumerate(looks):
-        remaining_looks = looks[look_index:]  # including this one
-        if not any(may_settle(*look) for look in remaining_looks):
-            break
-        if not may_settle(rung, count):  # but a later look may
-            continue
+    for rung, count in _iterate_promising_looks(margins_of_rungs, ladder, look_sizes):
         seeds = _derive_look_seeds(seed, count)
         for index in (rung - 1, rung):
             _render_missing(margins_of_rungs[index], margins, ladder[index], seeds)
@@ -362,6 +355,35 @@ def _climb_ladder(
         if _is_settled(at_rung, margins_of_rungs[rung - 1], n_looks, trials):
             break
     return [margins_of_rung for margins_of_rung in margins_of_rungs if margins_of_rung]
+
+
+def _iterate_promising_looks(
+    margins_of_rungs: Sequence[list[float]],
+    ladder: Sequence[int],
+    look_sizes: Sequence[int],
+) -> Iterator[tuple[int, int]]:
+    """Yield the looks that may show that a configuration has settled.
+
+    Whether a look may show it depends on the margins at the moment when the look is
+    requested. The iteration ends when no remaining look may.
+
+    Args:
+        margins_of_rungs: margins at each rung; the caller adds new ones meanwhile.
+        ladder: samples per pixel of the rungs, ascending.
+        look_sizes: numbers of renders at a rung after which there is a look, ascending.
+
+    Yields:
+        The index of the rung, and the number of renders there.
+    """
+    n_looks = len(look_sizes)
+    may_settle = partial(_may_settle, margins_of_rungs, ladder, n_looks)
+    looks = list(product(range(1, len(ladder)), look_sizes))  # none at the first rung
+    for look_index, (rung, count) in enumerate(looks):
+        remaining_looks = looks[look_index:]  # including this one
+        if not any(may_settle(*look) for look in remaining_looks):
+            return
+        if may_settle(rung, count):
+            yield rung, count
 
 
 def _derive_look_seeds(seed: int, count: int) -> list[int]:

@@ -231,15 +231,22 @@ class VerificationRule:
             return Ending.ALREADY_WRONG
         n_needed = self.count_needed_successes(adversarial.n_trials)
         is_verified = adversarial.n_successes >= n_needed
-        is_control_right = (
+        if is_verified and self._is_control_right(clean):
+            return Ending.FOUND
+        was_claimed = search_ending is Ending.FOUND
+        return Ending.NOT_VERIFIED if was_claimed else search_ending
+
+    def _is_control_right(self, clean: TrialCounts) -> bool:
+        """Return whether enough clean trials are right.
+
+        Without a control group nothing is needed; nor if conditions vary, as trials
+        with a wrong clean prediction are left out already.
+        """
+        return (
             not self.has_control
             or self.has_varying_conditions
             or clean.n_successes >= self.count_needed_successes(clean.n_trials)
         )
-        if is_control_right and is_verified:
-            return Ending.FOUND
-        was_claimed = search_ending is Ending.FOUND
-        return Ending.NOT_VERIFIED if was_claimed else search_ending
 
 
 WORST_CASE = VerificationRule()
@@ -504,23 +511,45 @@ class _Groups:
             run_clean: runs trials of the clean configuration (`run_trials`).
             run_adversarial: runs trials of the adversarial configuration.
         """
-        ends_early = self.curtailed or self.has_several_looks
-        is_decided = self.has_failed if ends_early else None
         for look in self.looks:
             # Clean trials come first: they say which adversarial trials will count.
             # `count` is the number of trials of each group at this look.
             count = self._extend_clean_trials(run_clean, look)
-            n_done = len(self.trials)
-            self.trials += run_adversarial(
-                trials=count, n_done=n_done, is_decided=is_decided
-            )
-            is_early = count < self.looks[-1]  # whether trials may follow
-            is_success = self._is_found(count, is_early=is_early)
-            self.is_found_early = is_success and is_early
-            # `run_adversarial` stops before `count` trials if too many of them failed.
-            was_curtailed = len(self.trials) < count
-            if was_curtailed or self.has_failed(()) or is_success or not is_early:
+            self._extend_adversarial_trials(run_adversarial, count)
+            if self._has_verdict(count):
                 break
+
+    def _extend_adversarial_trials(
+        self, run_adversarial: Callable[..., Iterable[Judgement]], count: int
+    ) -> None:
+        """Run the missing ones of `count` adversarial trials.
+
+        If trials may end early, there are fewer if too many of them fail.
+
+        Args:
+            run_adversarial: runs trials of the adversarial configuration.
+            count: number of trials in all.
+        """
+        ends_early = self.curtailed or self.has_several_looks
+        is_decided = self.has_failed if ends_early else None
+        n_done = len(self.trials)
+        self.trials += run_adversarial(
+            trials=count, n_done=n_done, is_decided=is_decided
+        )
+
+    def _has_verdict(self, count: int) -> bool:
+        """Return whether no more trials follow a look; set `is_found_early`.
+
+        Args:
+            count: number of trials of each group at this look. There are fewer
+                adversarial trials if too many of them have failed.
+        """
+        is_early = count < self.looks[-1]  # whether trials may follow
+        is_success = self._is_found(count, is_early=is_early)
+        self.is_found_early = is_success and is_early
+        was_curtailed = len(self.trials) < count
+        is_lost = was_curtailed or self.has_failed(())
+        return is_lost or is_success or not is_early
 
     def has_failed(self, new_trials: Sequence[Judgement]) -> bool:
         """Return whether too many trials fail for the claim to hold at any look.
@@ -641,14 +670,10 @@ def _summarize_trials(groups: _Groups, claim: Ending, u: Tensor) -> Verification
     """
     rule = groups.rule
     outcomes = _list_outcomes(rule, groups.trials, groups.clean_trials)
-    # None marks a trial that does not count. `TrialCounts` needs at least 1, as the
-    # rate of no trials would be 0 / 0.
-    n_counted = max(1, len(outcomes) - outcomes.count(None))
-    confidence = _choose_confidence(rule, has_several_looks=groups.has_several_looks)
-    counts = TrialCounts(outcomes.count(True), n_counted, groups.spp, confidence)
+    counts = _count_adversarial(groups, outcomes)
     clean_counts = count_right(groups.clean_trials, groups.spp)
     # At an early look, the sentence states the larger number that this look needs.
-    n_needed = rule.count_needed_successes(n_counted, early=groups.is_found_early)
+    n_needed = rule.count_needed_successes(counts.n_trials, early=groups.is_found_early)
     ending = rule.decide_ending(claim, clean_counts, counts)
     return Verification(
         ending,
@@ -662,6 +687,22 @@ def _summarize_trials(groups: _Groups, claim: Ending, u: Tensor) -> Verification
         stop_reason="asked for" if groups.is_complete else "decided",
         trial_successes=outcomes,
     )
+
+
+def _count_adversarial(groups: _Groups, outcomes: Sequence[bool | None]) -> TrialCounts:
+    """Return the counts of adversarial successes among the trials that count.
+
+    Args:
+        groups: trials of both groups.
+        outcomes: for each adversarial trial, whether it is a success; None if it does
+            not count.
+    """
+    # `TrialCounts` needs at least 1, as the rate of no trials would be 0 / 0.
+    n_counted = max(1, len(outcomes) - outcomes.count(None))
+    confidence = _choose_confidence(
+        groups.rule, has_several_looks=groups.has_several_looks
+    )
+    return TrialCounts(outcomes.count(True), n_counted, groups.spp, confidence)
 
 
 def _explain_ending(

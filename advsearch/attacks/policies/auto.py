@@ -289,17 +289,16 @@ class Auto(Policy[AutoState]):
         no_points = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)
         observations = Observations(box, no_points)
+        state = AutoState(domain, observations, plan, seed=0, screen=no_points)
         if box.count == 0:
-            ascent = _make_pgd(domain).start(domain, generator, steps)
             # the ascent draws a seed of its own
-            return AutoState(
-                domain, observations, plan, seed=0, screen=no_points, ascent=ascent
-            )
+            ascent = _make_pgd(domain).start(domain, generator, steps)
+            return replace(state, ascent=ascent)
         seed = draw_seed(generator)
         with limit_to_single_thread():
             # one render less: that of the initial point, which comes first
             screen = box.sample_screen(seed, max(0, plan.screen - 1))
-        return AutoState(domain, observations, plan, seed, screen)
+        return replace(state, seed=seed, screen=screen)
 
     def propose(
         self, state: AutoState, n: int

@@ -302,13 +302,27 @@ def start_race(
     if rounds is None:
         rounds = count_rounds(len(searches))
     renders = max(1, int(_plan_renders(len(searches), steps, rounds)))
+    runners = _start_runners(searches, renders, seed)
+    race = Race(runners, steps, n_rounds=rounds)
+    all_runners = range(len(runners))
+    return race.begin_round(all_runners, number=0)
+
+
+def _start_runners(
+    searches: Sequence[tuple[Policy[Any], Domain]], renders: int, seed: int
+) -> tuple[Runner, ...]:
+    """Return the searches of a race in their first states.
+
+    Args:
+        searches: policies, each with the domain that it searches.
+        renders: renders that each plans for.
+        seed: seed of random numbers; each search gets other ones.
+    """
     runners = []
     for number, (policy, domain) in enumerate(searches):
         state = policy.start(domain, seeded(seed, number), renders)
         runners.append(Runner(policy, domain, state))
-    race = Race(tuple(runners), steps, n_rounds=rounds)
-    all_runners = range(len(runners))
-    return race.begin_round(all_runners, number=0)
+    return tuple(runners)
 
 
 def _plan_renders(n_searches: int, steps: int, rounds: int) -> float:
@@ -502,11 +516,9 @@ class Choices(RacingPolicy[ChoicesState]):
         numbers = (~is_choice).nonzero().flatten()
         choices = is_choice.nonzero().flatten()
         policy, inner_domain = self._make_inner_search(domain, numbers)
+        max_combinations = _count_affordable_combinations(domain, policy, steps)
         combinations = _select_combinations(
-            domain.option_counts[choices].tolist(),
-            domain.initial_point[choices],  # its combination is searched, too
-            max_combinations=_count_affordable_combinations(domain, policy, steps),
-            generator=seeded(seed, 0),
+            domain, choices, max_combinations, generator=seeded(seed, 0)
         )
         # one search for each combination, all of the same numbers
         searches = [(policy, inner_domain)] * len(combinations)
@@ -622,10 +634,7 @@ def _count_affordable_combinations(
 
 
 def _select_combinations(
-    n_options: list[int],
-    initial_point: Tensor,
-    max_combinations: int,
-    generator: torch.Generator,
+    domain: Domain, choices: Tensor, max_combinations: int, generator: torch.Generator
 ) -> Tensor:
     """Select combinations of options, the initial one first.
 
@@ -634,8 +643,8 @@ def _select_combinations(
     order.
 
     Args:
-        n_options: number of options of each of the c choices.
-        initial_point: (c,) elements of u that are choices, at the initial point.
+        domain: domain of numbers and choices.
+        choices: (c,) indices of the choices in u.
         max_combinations: largest number of combinations.
         generator: generator of random numbers; it advances.
 
@@ -643,7 +652,9 @@ def _select_combinations(
         (n, c) elements of u: those of the initial point as they are, then others at the
         centers of the options.
     """
+    n_options = domain.option_counts[choices].tolist()
     sizes = torch.tensor(n_options)
+    initial_point = domain.initial_point[choices]
     # index of the option of each choice; u = 1 belongs to the last
     initial = torch.floor(initial_point * sizes).long().clamp(max=sizes - 1)
     selected = _select_others(n_options, initial, max_combinations, generator)

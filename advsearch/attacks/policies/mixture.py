@@ -595,11 +595,12 @@ class Mixture(Policy[MixtureState]):
         )
         if any(block.norm == "l2" for block in state.domain.blocks):
             return failures
-        weights = state.log[:, WEIGHT_COLUMN]
-        max_weights = state.log[:, MAX_WEIGHT_COLUMN]
         with policies.limit_to_single_thread():
             failure_rate = policies.estimate_failure_rate(
-                weights, max_weights, has_failed, is_unknown
+                weights=state.log[:, WEIGHT_COLUMN],
+                bounds=state.log[:, MAX_WEIGHT_COLUMN],
+                failed=has_failed,
+                unknown=is_unknown,
             )
         return replace(failures, failure_rate=failure_rate)
 
@@ -620,13 +621,11 @@ class Mixture(Policy[MixtureState]):
         component_of_point = self._assign_components(mixture, points, state.ranges)
         examples = []
         for k in self._rank_components(mixture, component_of_point):
-            members = (component_of_point == k).nonzero().flatten()
-            worst = int(members[objectives[members].argmax()])
-            u = state.to_configuration(points[worst])
-            ranges = {}
-            if mixture is not None:
-                ranges = state.find_distinctive_ranges(mixture, k)
-            examples.append(policies.FoundFailure(u, float(objectives[worst]), ranges))
+            is_member = component_of_point == k
+            example = _choose_worst_example(
+                state, k, points[is_member], objectives[is_member]
+            )
+            examples.append(example)
         return tuple(examples)
 
     @staticmethod
@@ -821,3 +820,25 @@ class Mixture(Policy[MixtureState]):
         probs = torch.ones(n_components, n_elements, max_options, dtype=torch.float64)
         probs *= torch.arange(max_options) < ranges.n_options.clamp(min=1)[:, None]
         return probs / probs.sum(dim=2, keepdim=True)
+
+
+def _choose_worst_example(
+    state: MixtureState, k: int, points: Tensor, objectives: Tensor
+) -> policies.FoundFailure:
+    """Return the failure of a component with the largest objective.
+
+    It has the ranges that are distinctive of the component; none without a mixture.
+
+    Args:
+        state: state of the search.
+        k: index of the component.
+        points: (n, d) failures of the component, in fractions of each range.
+        objectives: (n,) their objectives.
+    """
+    worst = int(objectives.argmax())
+    u = state.to_configuration(points[worst])
+    mixture = state.mixtures[-1]
+    ranges = {}
+    if mixture is not None:
+        ranges = state.find_distinctive_ranges(mixture, k)
+    return policies.FoundFailure(u, float(objectives[worst]), ranges)

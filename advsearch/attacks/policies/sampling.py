@@ -346,17 +346,16 @@ def _check_grid_fits(options: Sequence[int], steps: int, min_values: int) -> Non
     n_combinations = math.prod(count for count in options if count)
     # 2^64 exceeds any budget already; a larger power would only take long to compute
     min_renders = n_combinations * min_values ** min(n_numbers, 64)
-    if min_renders <= steps:
-        return
-    combinations_text = ""
-    if n_combinations > 1:
-        combinations_text = f" and {n_combinations} combinations of options"
-    renders_text = "billions of" if min_renders >= 10**9 else str(min_renders)
-    raise InputError(
-        f"policy 'grid': {min_values} values for each of {n_numbers} "
-        f"numbers{combinations_text} are {renders_text} renders, and there are "
-        f"{steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
-    )
+    if min_renders > steps:
+        combinations_text = ""
+        if n_combinations > 1:
+            combinations_text = f" and {n_combinations} combinations of options"
+        renders_text = "billions of" if min_renders >= 10**9 else str(min_renders)
+        raise InputError(
+            f"policy 'grid': {min_values} values for each of {n_numbers} "
+            f"numbers{combinations_text} are {renders_text} renders, and there are "
+            f"{steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
+        )
 
 
 def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
@@ -373,9 +372,21 @@ def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
     values_each = max(2, int(root * (1 - 1e-9)))
     counts = [count or values_each for count in options]
     numbers = [index for index, n_options in enumerate(options) if not n_options]
+    _grow_axes(counts, numbers, steps)
+    return counts
+
+
+def _grow_axes(counts: list[int], numbers: Sequence[int], steps: int) -> None:
+    """Give each number of a grid one more value in turn, as long as the grid fits.
+
+    Args:
+        counts: number of values of each element of u; it is changed.
+        numbers: indices of the elements that are numbers.
+        steps: largest number of points of the grid.
+    """
     total = math.prod(counts)
     has_grown = True
-    while has_grown:  # one more value for each number in turn, as long as that fits
+    while has_grown:
         has_grown = False
         for index in numbers:
             grown_total = total // counts[index] * (counts[index] + 1)
@@ -383,7 +394,6 @@ def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
                 total = grown_total
                 counts[index] += 1
                 has_grown = True
-    return counts
 
 
 def _compute_levels(block: Block, count: int) -> Tensor:
