@@ -287,16 +287,29 @@ class Classification(ClassTask):
             has_nan_logits = not math.isfinite(probabilities[0])
             if has_nan_logits:
                 predictions_of_images.append((Prediction(NOT_A_NUMBER),))
-                continue
-            predictions = [
-                Prediction(self.get_class_name(class_id), class_id, probability)
-                for class_id, probability in zip(classes, probabilities, strict=True)
-                # Classes that `as_logits` excludes have a probability of 0, and are left
-                # out. But a single prediction is always returned.
-                if probability > 0.0 or count == 1
-            ]
-            predictions_of_images.append(tuple(predictions))
+            else:
+                predictions = self._make_predictions(classes, probabilities)
+                predictions_of_images.append(predictions)
         return predictions_of_images
+
+    def _make_predictions(
+        self, classes: Sequence[int], probabilities: Sequence[float]
+    ) -> tuple[Prediction, ...]:
+        """Return the predictions of the most probable classes of an image.
+
+        Classes that `as_logits` excludes have a probability of 0, and are left out. But
+        a single prediction is always returned.
+
+        Args:
+            classes: indices of the classes, the most probable first.
+            probabilities: their probabilities.
+        """
+        is_single = len(classes) == 1
+        return tuple(
+            Prediction(self.get_class_name(class_id), class_id, probability)
+            for class_id, probability in zip(classes, probabilities, strict=True)
+            if probability > 0.0 or is_single
+        )
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
         """Judge each of N outputs.

@@ -177,15 +177,19 @@ class Detection(ClassTask):
         self.check_numbers(
             lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "suppression"
         )
+        self._check_stated_order()
+        self._check_choice("boxes", ("", *FORMS))
+        self._check_choice("unit", ("", *UNITS))
+        self._check_choice("seek", tuple(GOALS))
+        self._check_goal()
+
+    def _check_stated_order(self) -> None:
+        """Raise InputError if the order of an output's components is invalid."""
         if self.order:
             try:
                 outputs.parse_order(self.order)
             except ValueError as error:
                 raise InputError(f"task detection: order: {error}") from None
-        self._check_choice("boxes", ("", *FORMS))
-        self._check_choice("unit", ("", *UNITS))
-        self._check_choice("seek", tuple(GOALS))
-        self._check_goal()
 
     def _check_goal(self) -> None:
         """Raise InputError if the target or `minimise` does not fit the goal.
@@ -828,21 +832,31 @@ class Detection(ClassTask):
         If there is a target, only the scores of target classes count; they may be right
         classes of the object, too.
         """
-        if self.target is None:
-            right_score = self._find_best_scores(detections, truth.labels)
-            wrong_score = self._find_rival_scores(detections, truth.labels)
-        else:
-            right_classes = set(truth.labels)
-            right_targets = tuple(sorted(set(self.target) & right_classes))
-            wrong_targets = tuple(sorted(set(self.target) - right_classes))
-            right_score = self._find_best_scores(detections, right_targets)
-            wrong_score = self._find_best_scores(detections, wrong_targets)
+        right_score, wrong_score = self._find_sought_scores(detections, truth)
         is_on_nothing = self._is_on_nothing(detections, truth)
         is_elsewhere = self._is_elsewhere(detections, truth)
         return torch.maximum(
             torch.where(is_on_nothing, right_score, 0.0),
             torch.where(is_elsewhere, wrong_score, 0.0),
         )
+
+    def _find_sought_scores(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> tuple[Tensor, Tensor]:
+        """Return each box's best score of a right class and of a wrong one, (D,) each.
+
+        If there is a target, only the scores of target classes count.
+        """
+        if self.target is None:
+            right_score = self._find_best_scores(detections, truth.labels)
+            wrong_score = self._find_rival_scores(detections, truth.labels)
+            return right_score, wrong_score
+        right_classes = set(truth.labels)
+        right_targets = tuple(sorted(set(self.target) & right_classes))
+        wrong_targets = tuple(sorted(set(self.target) - right_classes))
+        right_score = self._find_best_scores(detections, right_targets)
+        wrong_score = self._find_best_scores(detections, wrong_targets)
+        return right_score, wrong_score
 
     @staticmethod
     def _find_best_scores(detections: Detections, classes: Labels) -> Tensor:
@@ -922,19 +936,25 @@ class Detection(ClassTask):
             truth: truth of the scene.
             margins: not used; other tasks read them.
         """
-        results: list[PredictionWithPayload] = []
-        for detections in self._read_boxes(output):
-            match = self._match_object(self._suppress(detections), truth)
-            payload: dict[str, JsonValue] = {
-                "box": None if truth.box is None else list(truth.box),
-                "found": self._list_stored_boxes(detections, truth),
-            }
-            if match.outcome is not None:
-                payload[OUTCOME] = match.outcome.value
-                payload["class"] = self.get_class_name(match.class_index)
-                payload["iou"] = None if match.iou is None else round(match.iou, 3)
-            results.append((self._describe_match(match, truth), payload))
-        return results
+        return [
+            self._describe_detections(detections, truth)
+            for detections in self._read_boxes(output)
+        ]
+
+    def _describe_detections(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> PredictionWithPayload:
+        """Return the prediction about the object in one image, with its payload."""
+        match = self._match_object(self._suppress(detections), truth)
+        payload: dict[str, JsonValue] = {
+            "box": None if truth.box is None else list(truth.box),
+            "found": self._list_stored_boxes(detections, truth),
+        }
+        if match.outcome is not None:
+            payload[OUTCOME] = match.outcome.value
+            payload["class"] = self.get_class_name(match.class_index)
+            payload["iou"] = None if match.iou is None else round(match.iou, 3)
+        return self._describe_match(match, truth), payload
 
     def _list_stored_boxes(
         self, detections: Detections, truth: DetectionTruth

@@ -378,13 +378,7 @@ def _split_batch_rows(
     """
     batch_column = _find_batch_column(order_names)
     image_index = rows.detach()[:, batch_column]
-    is_index = (
-        (image_index == image_index.round())
-        & (image_index >= -1)  # -1 is padding
-        & (image_index < count)
-    )
-    if not bool(is_index.all()):
-        raise ValueError(EXPECTED)
+    _check_image_indices(image_index, count)
     other_columns = torch.cat(
         [rows[:, :batch_column], rows[:, batch_column + 1 :]], dim=1
     )
@@ -394,6 +388,17 @@ def _split_batch_rows(
         _find_components(other_columns[image_index == index], other_names)
         for index in range(count)
     ]
+
+
+def _check_image_indices(numbers: Tensor, count: int) -> None:
+    """Raise ValueError if numbers (D,) are not all indices of `count` images, or -1."""
+    is_index = (
+        (numbers == numbers.round())
+        & (numbers >= -1)  # -1 is padding
+        & (numbers < count)
+    )
+    if not bool(is_index.all()):
+        raise ValueError(EXPECTED)
 
 
 def _find_batch_column(order_names: Sequence[str]) -> int:
@@ -917,10 +922,7 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
         _check_no_values(detections)
         order = SCORES_FIRST  # no box has a score, so that the order does not matter
     if order in HEAD_ORDERS:
-        # Both are scores of classes; or the first is objectness, the probability of any
-        # object in the box, and the score of the only class is their product.
-        has_objectness = order.startswith(OBJECTNESS_HEAD)
-        scores = pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
+        scores = _compute_pair_scores(pairs, order)
         return _check_detections({"boxes": detections["boxes"], "scores": scores})
     components = {
         name: value
@@ -930,6 +932,16 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
     names = ("scores", "labels") if order == SCORES_FIRST else ("labels", "scores")
     components.update(zip(names, pairs.unbind(dim=1), strict=True))
     return _check_detections(components)
+
+
+def _compute_pair_scores(pairs: Tensor, order: str) -> Tensor:
+    """Return the scores (D, classes) in pairs (D, 2) by an order of `HEAD_ORDERS`.
+
+    Both numbers are scores of classes; or the first is objectness, the probability of
+    any object in the box, and the score of the only class is their product.
+    """
+    has_objectness = order.startswith(OBJECTNESS_HEAD)
+    return pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
 
 
 def _check_no_values(detections: Detections) -> None:
@@ -1081,6 +1093,24 @@ def _infer_pair_order(
         return _find_falling_order(pairs_of_images)
     if orders:
         return orders[0]
+    return _infer_score_order(detections_of_images, columns, classes)
+
+
+def _infer_score_order(
+    detections_of_images: Sequence[Detections],
+    columns: Sequence[Tensor],
+    classes: int | None,
+) -> str:
+    """Infer the order of two numbers of boxes of which neither seems to be a class.
+
+    Args:
+        detections_of_images: detections of images.
+        columns: the first and the second number of all their boxes, (D,) each.
+        classes: number of classes; None if it is unknown.
+
+    Raises:
+        ValueError: the numbers are neither scores nor classes.
+    """
     are_scores = all(map(_may_be_scores, columns))
     order = _infer_order_without_labels(columns, classes) if are_scores else ""
     if order:
@@ -1321,12 +1351,7 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
         may_be_rows: whether boxes are rows; these may begin with a box, a score and a
             class.
     """
-    # sets of labels with as many classes as there are channels from the first score on
-    fitting = [
-        f"`labels={name}`"
-        for n_channels_before_scores in HEADS.values()
-        for name in list_sets_of_size(n_channels - n_channels_before_scores)
-    ]
+    fitting = _list_fitting_labels(n_channels)
     if fitting:
         return f"; {' or '.join(fitting)} would fit"
     # channels after the box and a score for every class
@@ -1347,6 +1372,18 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
             "`labels` of the model's classes"
         )
     return "; set the `labels` of the model's classes"
+
+
+def _list_fitting_labels(n_channels: int) -> list[str]:
+    """Return the settings of known label sets that fit a number of channels.
+
+    Such a set has as many classes as there are channels from the first score on.
+    """
+    return [
+        f"`labels={name}`"
+        for n_channels_before_scores in HEADS.values()
+        for name in list_sets_of_size(n_channels - n_channels_before_scores)
+    ]
 
 
 def split_grid(

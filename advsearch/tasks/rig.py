@@ -96,12 +96,7 @@ class Rig(tasks.JointTask):
         # The task of an image does not depend on the number of cameras.
         image_model = replace(model, cameras=1)
         part = self.image_task.on(image_model, target=target, minimise=minimise)
-        if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
-            raise InputError(
-                f"task rig: task {part.name} judges one output for all pictures; use a "
-                "policy that takes all of them at once, as "
-                "advsearch.models.all_at_once.AllAtOnce"
-            )
+        _check_takes_all_images(model, part)
         return replace(
             self,
             image_task=part,
@@ -248,12 +243,7 @@ class Rig(tasks.JointTask):
             score: joint score by the rule.
         """
         image_payloads: list[tasks.JsonValue] = [
-            {
-                "prediction": judgement.prediction.label,
-                "right": judgement.right,
-                "payload": judgement.payload,
-            }
-            for judgement in judgements
+            _make_image_payload(judgement) for judgement in judgements
         ]
         prediction = tasks.join_predictions(
             judgement.prediction for judgement in judgements
@@ -305,3 +295,24 @@ class Rig(tasks.JointTask):
             return None
         other_images = [torch.zeros_like(mask)] * (self.cameras - 1)
         return torch.cat([mask, *other_images], dim=-1)
+
+
+def _check_takes_all_images(model: Model, part: Task) -> None:
+    """Raise InputError if a task needs one output for all images of a rig, and the
+    model takes them one by one.
+    """
+    if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
+        raise InputError(
+            f"task rig: task {part.name} judges one output for all pictures; use a "
+            "policy that takes all of them at once, as "
+            "advsearch.models.all_at_once.AllAtOnce"
+        )
+
+
+def _make_image_payload(judgement: tasks.Judgement) -> tasks.JsonValue:
+    """Return what is stored about one image of a rig, from its judgement."""
+    return {
+        "prediction": judgement.prediction.label,
+        "right": judgement.right,
+        "payload": judgement.payload,
+    }

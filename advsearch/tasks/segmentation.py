@@ -334,6 +334,17 @@ class Segmentation(tasks.ClassTask):
             prediction = tasks.Prediction(class_name, top_class, accuracy)
             outcome = tasks.Outcome.FOUND if is_right else tasks.Outcome.WRONG_CLASS
             return prediction, outcome
+        return self._describe_as_background(truth, accuracy)
+
+    def _describe_as_background(
+        self, truth: SegmentationTruth, accuracy: float
+    ) -> tuple[tasks.Prediction, tasks.Outcome]:
+        """Return the prediction and outcome for an object that is taken for background.
+
+        Args:
+            truth: truth of the image.
+            accuracy: fraction of the object's pixels that are right.
+        """
         name = self.get_class_name(truth.labels[0])
         if accuracy >= MIN_PARTIAL_ACCURACY:
             prediction = tasks.Prediction(f"{name} in part", None, accuracy)

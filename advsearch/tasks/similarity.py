@@ -249,27 +249,40 @@ def _minimize_cross_entropy(
         n_names, features.shape[1], dtype=torch.float64, requires_grad=True
     )
     biases = torch.zeros(n_names, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.LBFGS(
-        [weights, biases],
-        max_iter=MAX_ITERATIONS,
-        tolerance_grad=1e-8,
-        tolerance_change=1e-12,
-        line_search_fn="strong_wolfe",
-    )
+    optimizer = _make_lbfgs_optimizer([weights, biases])
 
     def closure() -> Tensor:
         """Return the loss, with its gradients by weights and biases."""
         optimizer.zero_grad()
         logits = functional.linear(features, weights, biases)
         image_loss = functional.cross_entropy(logits, name_index, reduction="none")
-        penalty = WEIGHT_PENALTY / 2.0 * weights.square().sum()
-        loss: Tensor = (image_weights * image_loss).sum() + penalty
+        loss = _add_penalty((image_weights * image_loss).sum(), weights)
         torch.autograd.backward(loss, inputs=[weights, biases])
         return loss
 
     with torch.enable_grad():
         optimizer.step(closure)
     return weights.detach(), biases.detach()
+
+
+def _make_lbfgs_optimizer(parameters: list[Tensor]) -> torch.optim.LBFGS:
+    """Return the optimizer of a smooth loss; one step of it minimizes the loss."""
+    return torch.optim.LBFGS(
+        parameters,
+        max_iter=MAX_ITERATIONS,
+        tolerance_grad=1e-8,
+        tolerance_change=1e-12,
+        line_search_fn="strong_wolfe",
+    )
+
+
+def _add_penalty(loss: Tensor, weights: Tensor) -> Tensor:
+    """Return a loss plus the penalty of weights (names, D): half the sum of their
+    squares, times `WEIGHT_PENALTY`.
+    """
+    penalty = WEIGHT_PENALTY / 2.0 * weights.square().sum()
+    penalized_loss: Tensor = loss + penalty
+    return penalized_loss
 
 
 def _list_visible(folder: Path) -> list[Path]:

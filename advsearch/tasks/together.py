@@ -203,11 +203,7 @@ class EnsembleTask(JointTask):
         """
         network = model.module
         models = network.models if isinstance(network, Ensemble) else ()
-        if len(models) != len(self.parts):
-            n_models = len(models) or 1  # a model that is no ensemble is a single one
-            raise InputError(
-                f"model: expected {len(self.parts)}, one for each task, got {n_models}"
-            )
+        self._check_model_count(len(models))
         # `parts` are the tasks as the user set them, `tasks` those for their models.
         tasks = []
         for part, part_model in zip(self.parts, models, strict=True):
@@ -217,6 +213,18 @@ class EnsembleTask(JointTask):
         return replace(
             self, models=models, tasks=tuple(tasks), target=targets, minimise=minimise
         )
+
+    def _check_model_count(self, n_models: int) -> None:
+        """Raise InputError if an ensemble has not one model for each task.
+
+        Args:
+            n_models: number of its models; 0 for a model that is no ensemble.
+        """
+        if n_models != len(self.parts):
+            raise InputError(
+                f"model: expected {len(self.parts)}, one for each task, got "
+                f"{n_models or 1}"
+            )
 
     def with_objective(self, objective: str) -> EnsembleTask:
         return replace(
