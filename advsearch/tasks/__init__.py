@@ -95,13 +95,7 @@ class FunctionTask(Task):
         got = type(losses).__name__
         if is_tensor:
             got = f"{losses.dtype} {tuple(losses.shape)}"
-        plural = "" if n_outputs == 1 else "s"
-        raise InputError(
-            f"task {self.name}: expected the loss of each output, a tensor of "
-            f"{n_outputs} floating-point number{plural}, over 0 for a wrong output, got "
-            f"{got}; for example a distance minus a tolerance, or a wrong logit minus "
-            "the right one"
-        )
+        raise _make_loss_error(self.name, n_outputs, got)
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return a prediction for each image (`_describe_values`)."""
@@ -127,6 +121,23 @@ class FunctionTask(Task):
 
     def truth_names(self, truth: Facts) -> tuple[str, ...]:
         return (truth.label or truth.object_label or truth.object,)
+
+
+def _make_loss_error(name: str, n_outputs: int, got: str) -> InputError:
+    """Return the error of a user's function that returned no losses.
+
+    Args:
+        name: name of the task.
+        n_outputs: number of outputs that were passed.
+        got: what the function returned instead.
+    """
+    plural = "" if n_outputs == 1 else "s"
+    return InputError(
+        f"task {name}: expected the loss of each output, a tensor of "
+        f"{n_outputs} floating-point number{plural}, over 0 for a wrong output, got "
+        f"{got}; for example a distance minus a tolerance, or a wrong logit minus "
+        "the right one"
+    )
 
 
 def make_function_task(function: Callable[[Any, Facts], Tensor]) -> FunctionTask:

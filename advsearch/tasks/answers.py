@@ -195,12 +195,9 @@ class FreeAnswer(Task):
         results = list[tasks.PredictionWithPayload]()
         for answer, margin in zip(output, margins, strict=True):
             texts = _list_texts(answer)
-            is_right = margin >= 0.0
-            # those that agree with the judgement; if none does, all texts count
-            agreeing = [text for text in texts if has_word(text, truth) == is_right]
-            [(most_frequent, _)] = Counter(agreeing or texts).most_common(1)
+            text = _find_most_frequent_text(texts, truth, is_right=margin >= 0.0)
             payload: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
-            results.append((_make_prediction(most_frequent), payload))
+            results.append((_make_prediction(text), payload))
         return results
 
 
@@ -298,3 +295,20 @@ def has_word(text: str, words: Words) -> bool:
     """
     text = " ".join(text.split()).casefold()
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)
+
+
+def _find_most_frequent_text(
+    texts: Sequence[str], truth: Words, *, is_right: bool
+) -> str:
+    """Return the most frequent of the texts that agree with a judgement.
+
+    If none agrees, all texts count.
+
+    Args:
+        texts: texts about an image.
+        truth: right words.
+        is_right: whether the image was judged right.
+    """
+    agreeing = [text for text in texts if has_word(text, truth) == is_right]
+    [(most_frequent, _)] = Counter(agreeing or texts).most_common(1)
+    return most_frequent

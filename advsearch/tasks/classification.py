@@ -322,18 +322,13 @@ class Classification(ClassTask):
             truth: indices of the right classes.
         """
         logits = self.as_logits(output, truth)
-        # true for a subclass that overrides it, whose methods are called
-        overrides_loss = type(self).loss is not Classification.loss
+        overrides_loss = type(self).loss is not Classification.loss  # in a subclass
         if overrides_loss:
             losses = self.loss(output, truth)
         else:
             # over 0 for a wrong prediction, as losses are
             losses = compute_misclassification_margin(logits, truth)
-        overrides_score = type(self).score is not Classification.score
-        if overrides_score or self.target is not None:
-            scores = self.score(output, truth)
-        else:  # as `Task.score`
-            scores = -losses if self.minimise else losses
+        scores = self._compute_scores_from(losses, output, truth)
         # A judgement's margin is over 0 for a right prediction. `-losses` would be -0.0
         # for 0.
         margins = 0.0 - losses
@@ -341,6 +336,19 @@ class Classification(ClassTask):
         predictions = [top for (top,) in self._rank_classes(logits, count=1)]
         rows = zip(scores.tolist(), margins.tolist(), predictions, strict=True)
         return [Judgement.from_margin(*row) for row in rows]
+
+    def _compute_scores_from(
+        self, losses: Tensor, output: Tensor, truth: Labels
+    ) -> Tensor:
+        """Return the scores (N,) of outputs whose losses (N,) are known.
+
+        They follow from the losses, as in `Task.score`. But if there is a target, or a
+        subclass overrides `score`, that method is called.
+        """
+        overrides_score = type(self).score is not Classification.score
+        if overrides_score or self.target is not None:
+            return self.score(output, truth)
+        return -losses if self.minimise else losses
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
         return self.get_class_names(truth)

@@ -328,10 +328,7 @@ class Detection(ClassTask):
         # The order is needed to read the boxes below.
         task_with_order = self._resolve_order(output)
         resolved = task_with_order._resolve_grids(output)
-        if self.has_declared_format:
-            unit = "pixels"  # the meaning of `DECLARED_FORMAT_ATTRIBUTE`
-        else:
-            unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
+        unit = self._infer_unit_of_boxes(resolved)
         # An output with boxes and rows of NaN shows that the model fills unused rows with
         # NaN.
         has_nan_rows = any(
@@ -343,6 +340,12 @@ class Detection(ClassTask):
             inferred_unit=unit,
             fills_with_nan=self.fills_with_nan or has_nan_rows,
         )
+
+    def _infer_unit_of_boxes(self, resolved: Sequence[Detections]) -> str:
+        """Return the unit of the boxes in an output; the one before if it shows none."""
+        if self.has_declared_format:
+            return "pixels"  # the meaning of `DECLARED_FORMAT_ATTRIBUTE`
+        return infer_unit(select_best_boxes(resolved)) or self.inferred_unit
 
     def _resolve_order(self, output: Sequence[Detections]) -> Detection:
         """Return the task with the order that an output of its model shows."""

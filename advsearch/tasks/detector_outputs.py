@@ -585,16 +585,32 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
         return None
     components = dict[str, Tensor]()
     for component, names in NAMES.items():
-        exact = [name for name in names if name in tensors]
-        words = WORDS[component]
-        similar = [
-            name for name in tensors if any(word in name.lower() for word in words)
-        ]
-        if exact or len(similar) == 1:
-            match = exact[0] if exact else similar[0]
+        match = _find_component_name(tensors, names, WORDS[component])
+        if match is not None:
             # removed, so that no tensor is found for two components
             components[component] = tensors.pop(match)
     return components
+
+
+def _find_component_name(
+    tensor_names: Iterable[str], known_names: Sequence[str], words: Sequence[str]
+) -> str | None:
+    """Return the name of the tensor that is a component; None if none seems to be.
+
+    Args:
+        tensor_names: names of the tensors.
+        known_names: names that the component may have.
+        words: words of which one is in the name otherwise; then it has to be the only
+            such name.
+    """
+    candidates = list(tensor_names)
+    exact = [name for name in known_names if name in candidates]
+    if exact:
+        return exact[0]
+    similar = [
+        name for name in candidates if any(word in name.lower() for word in words)
+    ]
+    return similar[0] if len(similar) == 1 else None
 
 
 def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:

@@ -222,15 +222,21 @@ class Rig(tasks.JointTask):
             scores = self.score(output, truth).tolist()
         rig_judgements = []
         for image_outputs, margin, score in zip(output, margins, scores, strict=True):
-            judgements = [
-                self.image_task.judge(image_output, image_truth)[0]
-                for image_output, image_truth in zip(image_outputs, truth, strict=True)
-            ]
+            judgements = self._judge_images(image_outputs, truth)
             # The rule may ignore an image with NaN, but the rig's judgement is NaN then.
             if any(judgement.is_non_finite for judgement in judgements):
                 margin = math.nan
             rig_judgements.append(self._join_judgements(judgements, margin, score))
         return rig_judgements
+
+    def _judge_images(
+        self, outputs: tasks.Outputs, truth: tasks.Truths
+    ) -> list[tasks.Judgement]:
+        """Return the judgement of each image of a single rig."""
+        return [
+            self.image_task.judge(image_output, image_truth)[0]
+            for image_output, image_truth in zip(outputs, truth, strict=True)
+        ]
 
     def _join_judgements(
         self, judgements: Sequence[tasks.Judgement], margin: float, score: float

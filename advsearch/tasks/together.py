@@ -332,10 +332,9 @@ class EnsembleTask(JointTask):
             margin = math.nan
         payload = None
         if any(judgement.payload is not None for judgement in judgements):
-            payload = {
-                model.name: judgement.payload
-                for model, judgement in zip(self.models, judgements, strict=True)
-            }
+            names = [model.name for model in self.models]
+            payloads = [judgement.payload for judgement in judgements]
+            payload = dict(zip(names, payloads, strict=True))
             payload |= make_outcome_payload(worst)
         prediction = join_predictions(judgement.prediction for judgement in judgements)
         score = min(judgement.score for judgement in judgements)
