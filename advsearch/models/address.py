@@ -213,12 +213,7 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
     for name, value in ask.items():
         _check_limit(name, value)
     limits = {**LIMITS, **ask}
-    at_once = limits["at_once"]
-    if not 1 <= at_once <= MAX_CONCURRENT or at_once != int(at_once):
-        raise InputError(
-            "`ask` at_once: expected a whole number from 1 to "
-            f"{MAX_CONCURRENT}, got {at_once:g}"
-        )
+    _check_concurrency(limits["at_once"])
     has_price = any(
         limits[name] for name in ("per_call", "per_million_in", "per_million_out")
     )
@@ -239,6 +234,15 @@ def _check_limit(name: str, value: float) -> None:
     if not is_number or not value >= 0:  # NaN is not either
         raise InputError(
             f"`ask` {name}: expected a number of at least 0, got {value!r}"
+        )
+
+
+def _check_concurrency(at_once: float) -> None:
+    """Raise InputError if a number of requests at once is not allowed."""
+    if not 1 <= at_once <= MAX_CONCURRENT or at_once != int(at_once):
+        raise InputError(
+            "`ask` at_once: expected a whole number from 1 to "
+            f"{MAX_CONCURRENT}, got {at_once:g}"
         )
 
 
@@ -488,8 +492,7 @@ class AddressModel(models.RemoteNetwork):
                 answers[key] = stored_answer
             else:  # there is none, or it is corrupt
                 new_bodies[key] = body
-        for key, answer in self._request_answers(new_bodies):
-            answers[key] = answer
+        answers.update(self._request_answers(new_bodies))
         return [answers[key] for key in keys]
 
     def _make_answer_key(self, body: Mapping[str, Any], turn: int) -> str:
@@ -589,9 +592,8 @@ class AddressModel(models.RemoteNetwork):
             content = message.get("content")
             refusal = message.get("refusal")
         except (KeyError, IndexError, TypeError, AttributeError):
-            raise self._make_error(
-                "choices with a message, as a chat answers", response
-            ) from None
+            expected = "choices with a message, as a chat answers"
+            raise self._make_error(expected, response) from None
         content = _join_pieces(content)
         if not content:  # None, or empty
             is_filtered = choice.get("finish_reason") == "content_filter"
@@ -772,19 +774,21 @@ class AddressModel(models.RemoteNetwork):
         """
         count = 0
         while count < max_count:
-            spent = self._spent_by_limit
-            reached_limits = [
-                name for name in spent if spent[name] >= self.limits[name]
-            ]
-            if reached_limits and count:
+            name = self._find_reached_limit()
+            if name is not None and count:
                 break  # the calls that are counted so far may be made
-            if reached_limits:
-                name = reached_limits[0]
-                raise self._make_limit_error(name, spent[name])
+            if name is not None:
+                raise self._make_limit_error(name, self._spent_by_limit[name])
             self.spent["calls"] += 1
             count += 1
         self._store_spent()
         return count
+
+    def _find_reached_limit(self) -> str | None:
+        """Return the name of the first limit that is reached; None if none is."""
+        spent = self._spent_by_limit
+        reached_limits = [name for name in spent if spent[name] >= self.limits[name]]
+        return reached_limits[0] if reached_limits else None
 
     def _make_limit_error(self, name: str, spent: float) -> errors.ModelError:
         """Return the error for a limit that is reached, by its name."""

@@ -596,9 +596,7 @@ def _open_session(path: Path) -> tuple[Any, Any]:
     """
     runtime = import_library("onnxruntime", str(path), "onnx")
     _check_version(runtime.__version__, path)
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    options.log_severity_level = 4  # errors are raised as well
+    options = _make_session_options(runtime)
     problem = (
         f"model file {path}: cannot be read as ONNX with onnxruntime "
         f"{runtime.__version__}"
@@ -615,6 +613,14 @@ def _open_session(path: Path) -> tuple[Any, Any]:
             enable_fallback=0,  # it would print, and try the same again
         )
     return session, runtime
+
+
+def _make_session_options(runtime: Any) -> Any:
+    """Return onnxruntime's options: as many threads as torch has, and no log."""
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 4  # errors are raised as well
+    return options
 
 
 def _check_version(version: str, path: Path) -> None:

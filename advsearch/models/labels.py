@@ -132,8 +132,22 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
     if synonyms and not contains_word:
         # A synonym is a better suggestion than a name that is only spelled alike.
         similar = []
+    return _list_classes_of_names((*similar, *synonyms), indices_of_name)
+
+
+def _list_classes_of_names(
+    names: Sequence[str], indices_of_name: Mapping[str, Sequence[int]]
+) -> list[tuple[int, str]]:
+    """Return index and name of each class that has one of the names, in their order.
+
+    A class with several of the names gets the first of them.
+
+    Args:
+        names: names of classes.
+        indices_of_name: indices of the classes that have a name.
+    """
     name_of_index: dict[int, str] = {}
-    for name in (*similar, *synonyms):
+    for name in names:
         for index in indices_of_name[name]:
             name_of_index.setdefault(index, name)
     return list(name_of_index.items())
@@ -173,13 +187,20 @@ def _find_class(
     if len(indices) == 1:
         return indices[0]
     if indices:
-        classes = ", ".join(f"#{index} ({labels[index]})" for index in indices)
-        raise InputError(
-            f"label {term!r} names {len(indices)} classes: {classes}. Give "
-            f"the index, e.g. '#{indices[0]}'"
-        )
+        raise _make_ambiguous_label_error(term, indices, labels)
     hint = _hint_of_labels(term, labels, named)
     raise InputError(f"the model has no label {term!r}. {hint}")
+
+
+def _make_ambiguous_label_error(
+    term: str, indices: Sequence[int], labels: Sequence[str]
+) -> InputError:
+    """Return the error of a term that names several classes, by their indices."""
+    classes = ", ".join(f"#{index} ({labels[index]})" for index in indices)
+    return InputError(
+        f"label {term!r} names {len(indices)} classes: {classes}. Give "
+        f"the index, e.g. '#{indices[0]}'"
+    )
 
 
 def _parse_index(term: str, *, is_name: bool) -> int | None:

@@ -153,6 +153,7 @@ def load_model(
     switches = find_expected_torch_state()
     if prompts is not None:
         _check_reads_text(source, spec)
+    # `switches` are those of torch that the code of the network expects.
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
         use_torch_state_in_calls(source.module, switches)
     if task:
@@ -317,9 +318,23 @@ def _adapt_model(
     spec = model.spec if has_same_names else None
     read = read or model.read
     model = replace(model, name=name or model.name, read=read, spec=spec)
-    if names is None:
-        return model
-    returns_logits = read is None
+    return model if names is None else _replace_labels(model, names, origin)
+
+
+def _replace_labels(
+    model: Model, names: tuple[str, ...], origin: LabelsOrigin
+) -> Model:
+    """Return a model with other names of its classes.
+
+    Args:
+        model: the model.
+        names: names of classes.
+        origin: where the names come from, for messages.
+
+    Raises:
+        InputError: the number of names is not that of classes.
+    """
+    returns_logits = model.read is None
     if returns_logits:
         # Only logits have a known number of classes, which the names must fit.
         names = fit_labels(model.classes, names, origin, model.name)

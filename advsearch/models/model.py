@@ -792,6 +792,16 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
         if output.requires_grad:
             correct_batch_norm_gradients(output)
         return output.float()
+    return _find_checked_logits(output, count, classes, name)
+
+
+def _find_checked_logits(
+    output: Any, count: int, classes: int | None, name: str
+) -> Tensor:
+    """Return the logits in a network's return value of any accepted form.
+
+    The arguments and errors are those of `read_logits`.
+    """
     tensor = _find_logits(output)
     expected = (
         f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"

@@ -641,10 +641,8 @@ def _find_batch_limits(
         return max(min_batch, cameras), max_batch
     if max_batch < 2:
         return min_batch, max_batch
-    try:
-        with torch.no_grad():
-            batch_rows = _compute_output_rows(model, pair)
-    except ModelError:  # it takes only one image at a time
+    batch_rows = _compute_rows_if_accepted(model, pair)
+    if batch_rows is None:  # it takes only one image at a time
         return 1, 1
     if rows is not None and not _are_equal(model, rows, batch_rows):
         warn(
@@ -652,6 +650,15 @@ def _find_batch_limits(
             "in training mode? Call .eval() before exporting"
         )
     return min_batch, max_batch
+
+
+def _compute_rows_if_accepted(model: Model, images: Tensor) -> Tensor | None:
+    """Return a model's rows for a batch of images; None if the model fails on it."""
+    try:
+        with torch.no_grad():
+            return _compute_output_rows(model, images)
+    except ModelError:
+        return None
 
 
 def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
@@ -905,16 +912,9 @@ def _check_gradient(
         gradient: (N, H, W, 3), the gradient of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.
     """
-    returns_logits = model.read is None
-    for step_size in _choose_step_sizes(model):
-        step = step_size * gradient.sign()
-        change = _measure_change(model, images, step, gradient)
-        if not returns_logits and _jumps(model, images, change):
-            return  # outputs that jump cannot be compared with a gradient
-        predicted = change.predicted[0]  # there is one gradient
-        if _is_predicted(change, predicted):
-            return
-    # The change for the last step size is reported.
+    change = _find_unpredicted_change(model, images, gradient)
+    if change is None:
+        return
     reason = "Steps that round, or a defence that masks gradients?"
     if detached:
         reason = (
@@ -923,10 +923,34 @@ def _check_gradient(
         )
     warn(
         f"the gradient of model {model.name} does not say how its outputs change: "
-        f"{predicted:.3g} expected, {change.actual:.3g} observed for a small step "
-        f"along it. {reason} A search by this gradient may find nothing: try a policy "
-        "without gradients, too"
+        f"{change.predicted[0]:.3g} expected, {change.actual:.3g} observed for a small "
+        f"step along it. {reason} A search by this gradient may find nothing: try a "
+        "policy without gradients, too"
     )
+
+
+def _find_unpredicted_change(
+    model: Model, images: Tensor, gradient: Tensor
+) -> _Change | None:
+    """Return the change of outputs for the last step size, if a gradient is wrong.
+
+    None if the gradient predicts the change for one of the step sizes, or if outputs
+    jump, so that they cannot be compared with a gradient.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3).
+        gradient: (N, H, W, 3), the gradient of `_compute_checked_value`.
+    """
+    returns_logits = model.read is None
+    for step_size in _choose_step_sizes(model):
+        step = step_size * gradient.sign()
+        change = _measure_change(model, images, step, gradient)
+        if not returns_logits and _jumps(model, images, change):
+            return None
+        if _is_predicted(change, change.predicted[0]):  # there is one gradient
+            return None
+    return change
 
 
 def _jumps(model: Model, images: Tensor, change: _Change) -> bool:

@@ -120,10 +120,15 @@ def _make_checked_module(
     module = _FreeAnswerer(reader, max_answer_tokens) if is_free else classifier
     with torch.no_grad():
         _check_likelihood(loaded, classifier)
-        # A black image is only timed.
-        start_time = time.perf_counter()
-        module(torch.zeros((1, 3, *reader.image_size)))
-        return module, time.perf_counter() - start_time
+        black_image = torch.zeros((1, 3, *reader.image_size))
+        return module, _measure_call_seconds(module, black_image)
+
+
+def _measure_call_seconds(module: nn.Module, images: Tensor) -> float:
+    """Return how many seconds a network takes for images (N, 3, H, W)."""
+    start_time = time.perf_counter()
+    module(images)
+    return time.perf_counter() - start_time
 
 
 def _check_has_choice(names: Sequence[str] | None, model_name: str) -> None:
@@ -336,8 +341,7 @@ class _LanguageModel(nn.Module):
             # None if the tokenizer joins the end of the prompt with this word.
             tokens = self._tokenize_after_prompt(f"{separator}{word}")
             if tokens is None or not keeps_prompt:
-                tokenized = self.processor.tokenizer(word, add_special_tokens=False)
-                tokens = tokenized["input_ids"]
+                tokens = self._tokenize_alone(word)
             if not tokens:
                 raise InputError(
                     "labels: expected names that the network has tokens "
@@ -345,6 +349,12 @@ class _LanguageModel(nn.Module):
                 )
             tokens_of_names.append(tokens)
         return tokens_of_names
+
+    def _tokenize_alone(self, word: str) -> list[int]:
+        """Return the tokens of a word without the prompt and without special tokens."""
+        tokenized = self.processor.tokenizer(word, add_special_tokens=False)
+        tokens: list[int] = tokenized["input_ids"]
+        return tokens
 
     def _find_separator(self) -> str:
         """Return the text between the prompt and a name.

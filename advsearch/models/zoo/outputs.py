@@ -400,9 +400,8 @@ def _make_timm_source(
     needs_features = purpose.task == TASK  # the task that compares features
     has_head = module.num_classes > 0
     if not has_head and not needs_features:
-        raise make_no_classes_error(
-            name, "is a network without a head (num_classes is 0)"
-        )
+        problem = "is a network without a head (num_classes is 0)"
+        raise make_no_classes_error(name, problem)
     options = {}
     if pretrained_config:
         options = {"pretrained_cfg": dict(pretrained_config)}
@@ -465,10 +464,7 @@ def load_torchvision(spec: str) -> models.Source:
     detectors = zoo.list_models(module=zoo.detection)
     known_names = (*classifiers, *segmenters, *detectors)
     if name not in known_names:
-        # A network for videos, or a quantized one, has an error of its own.
-        _check_reads_images(zoo, name, spec)
-        similar_names = models.find_near_names(name, known_names)
-        raise errors.UnknownNameError("torchvision network", name, similar_names)
+        raise _make_unknown_network_error(zoo, name, known_names, spec)
     default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
     # Without this option torchvision would fetch weights of the backbone, which are
     # replaced afterwards. Classifiers have no such option.
@@ -487,6 +483,25 @@ def load_torchvision(spec: str) -> models.Source:
         network = AdaptedNetwork(module, _run_segmenter)
         return models.make_source(network, name, **fields)
     return _make_detector_source(module, name, fields)
+
+
+def _make_unknown_network_error(
+    zoo: Any, name: str, known_names: Sequence[str], spec: str
+) -> errors.UnknownNameError:
+    """Return the error of a network that torchvision does not have.
+
+    Args:
+        zoo: torchvision's networks.
+        name: name that the user wrote.
+        known_names: names of all networks that can be loaded.
+        spec: what the user wrote in full, for messages.
+
+    Raises:
+        ModelError: the network is for videos, or quantized.
+    """
+    _check_reads_images(zoo, name, spec)
+    similar_names = models.find_near_names(name, known_names)
+    return errors.UnknownNameError("torchvision network", name, similar_names)
 
 
 def _make_detector_source(

@@ -270,9 +270,7 @@ def _check_scores(
     Raises:
         ModelError: the scores differ.
     """
-    shape = (1, 3, *(source.input_size or (224, 224)))
-    noise = torch.rand(shape, generator=torch.Generator().manual_seed(0))
-    noise = noise.to(network.device, network.dtype)
+    noise = _sample_noise_image(network, source.input_size or (224, 224))
     inputs = _tokenize(network, tokenizer, [text])
     expected = network(**inputs, pixel_values=noise).logits_per_image.float()
     # The rows of the head are embeddings of length 1, multiplied by the scale of
@@ -292,6 +290,18 @@ def _check_scores(
             "scaled cosine of a picture and a "
             "text; expected one such as CLIPModel or SiglipModel"
         )
+
+
+def _sample_noise_image(network: Any, size: tuple[int, int]) -> Tensor:
+    """Return an image (1, 3, height, width) of uniform noise for a network.
+
+    Args:
+        network: states the device and the dtype.
+        size: (height, width) in pixels.
+    """
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.rand((1, 3, *size), generator=generator)
+    return noise.to(network.device, network.dtype)
 
 
 def _compute_score(
