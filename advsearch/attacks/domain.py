@@ -668,20 +668,31 @@ def _solve_multiplier(
         s: where Newton's method begins, not above the solution.
     """
     for _ in range(_MAX_ITERATIONS):
-        value = 0.0
-        slope = 0.0
-        for square, room in zip(squares, rooms, strict=True):
-            scaled = square * s
-            # elements that have reached their bound grow no further with s
-            still_grows = (scaled < room).to(square.dtype)
-            slope += float(torch.dot(square, still_grows))
-            value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
+        value, slope = _compute_squared_length(squares, rooms, s)
         # Newton's step; where nothing grows any more, it stays
         next_s = s + (radius**2 - value) / slope if slope > 0.0 else s
         if next_s <= s * (1.0 + 1e-7):  # steps only go up, so this one is rounding
             break
         s = next_s
     return s
+
+
+def _compute_squared_length(
+    squares: Sequence[Tensor], rooms: Sequence[Tensor], s: float
+) -> tuple[float, float]:
+    """Return g(s) = sum_i min(s v_i^2, room_i^2), and its derivative by s.
+
+    The arguments are those of `_solve_multiplier`.
+    """
+    value = 0.0
+    slope = 0.0
+    for square, room in zip(squares, rooms, strict=True):
+        scaled = square * s
+        # elements that have reached their bound grow no further with s
+        still_grows = (scaled < room).to(square.dtype)
+        slope += float(torch.dot(square, still_grows))
+        value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
+    return value, slope
 
 
 def _move_towards(

@@ -109,11 +109,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         ModelError: it cannot do the task, or there is no answer.
     """
     address = models.check_address(spec)
-    if not models.is_fetch_allowed(spec):
-        raise models.CodeNotAllowedError(
-            f"a file names the model {spec}, to which pictures would be sent, and the "
-            f"key in {models.KEY}; {models.explain_how_to_allow(spec)}"
-        )
+    _check_sending_allowed(spec)
     module = _make_network(address, spec, purpose)
     return Model(
         module=module,
@@ -126,6 +122,15 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         batch_limits=(1, MAX_BATCH),
         differentiable=False,
     )
+
+
+def _check_sending_allowed(spec: str) -> None:
+    """Raise CodeNotAllowedError if only a file, and not the user, names the address."""
+    if not models.is_fetch_allowed(spec):
+        raise models.CodeNotAllowedError(
+            f"a file names the model {spec}, to which pictures would be sent, and the "
+            f"key in {models.KEY}; {models.explain_how_to_allow(spec)}"
+        )
 
 
 def _make_network(

@@ -717,11 +717,7 @@ def _parse_numbers(
         InputError: they are no numbers, or their count is none of `counts`.
     """
     problem = InputError(f"{key}: expected {expected}, got {value!r}")
-    if isinstance(value, str):
-        value = value.split(",")
-    elif hasattr(value, "tolist"):  # a tensor or an array
-        value = value.tolist()
-    items = list(value) if isinstance(value, Sequence) else [value]
+    items = _split_into_items(value)
     try:
         numbers = tuple(float(item) for item in items)
     except (TypeError, ValueError):
@@ -729,3 +725,14 @@ def _parse_numbers(
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
         raise problem
     return numbers
+
+
+def _split_into_items(value: Any) -> list[Any]:
+    """Return the items of a sequence, a tensor or a string with commas; for any other
+    value a list with this value.
+    """
+    if isinstance(value, str):
+        value = value.split(",")
+    elif hasattr(value, "tolist"):  # a tensor or an array
+        value = value.tolist()
+    return list(value) if isinstance(value, Sequence) else [value]

@@ -117,9 +117,7 @@ def probe_model(
             batch; or no gradient reaches the image.
     """
     _check_batch_size(model)
-    height, width = model.input_size
-    gray = torch.full((1, height, width, 3), 0.5)
-    noise = torch.rand(gray.shape, generator=torch.Generator().manual_seed(0))
+    gray, noise = _make_probe_images(*model.input_size)
     with torch.no_grad():
         rows_of_images = [_compute_output_rows(model, image) for image in (gray, noise)]
         rows = torch.cat(rows_of_images)
@@ -195,6 +193,13 @@ def _check_finite(model: Model, rows: Tensor) -> None:
         f"{image} image; "
         "check its weights and the value range and normalization that it expects"
     )
+
+
+def _make_probe_images(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return a gray image and one of uniform noise, (1, height, width, 3) each."""
+    gray = torch.full((1, height, width, 3), 0.5)
+    noise = torch.rand(gray.shape, generator=torch.Generator().manual_seed(0))
+    return gray, noise
 
 
 def _find_probabilities(model: Model, rows: Tensor) -> bool:

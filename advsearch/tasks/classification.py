@@ -64,11 +64,7 @@ class ClassTask(Task):
                 task reads.
         """
         self._check_output_kind(model)
-        if self.reads_logits:  # a classifier, whose labels were checked when loaded
-            labels = model.labels
-            named = model.named
-        else:
-            labels, named = self._get_model_labels(model)
+        labels, named = self._choose_labels(model)
         target_classes = None
         if target is not None:
             target_classes = _find_target_classes(target, labels, named=named)
@@ -79,6 +75,12 @@ class ClassTask(Task):
             target=target_classes,
             minimise=minimise,
         )
+
+    def _choose_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
+        """Return the labels of a model's classes, and whether they are names."""
+        if self.reads_logits:  # a classifier, whose labels were checked when loaded
+            return model.labels, model.named
+        return self._get_model_labels(model)
 
     def _check_output_kind(self, model: Model) -> None:
         """Check that a model returns logits if this task reads them, and only then.

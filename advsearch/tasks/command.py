@@ -263,9 +263,7 @@ class Command(Task):
         if self.clean_action is None:
             return ()
         clean_action = self.clean_action.tolist()
-        envelope = list(self.envelope)
-        if len(envelope) == 1:  # the same for all elements
-            envelope = envelope * len(clean_action)
+        envelope = _expand_to_elements(self.envelope, len(clean_action))
         return (
             f"The clean action is {self._format_action(clean_action)}, from one picture of "
             f"the clean scene; its envelope is {self._format_action(envelope, sign='± ')}. "
@@ -415,9 +413,7 @@ class Command(Task):
             sign: a text before each number.
             with_names: begin each element with its name.
         """
-        units = list(self.units)
-        if len(units) == 1:  # the same for all elements
-            units = units * len(action)
+        units = _expand_to_elements(self.units, len(action))
         elements = []
         for index, number in enumerate(action[:MAX_FORMATTED_ELEMENTS]):
             name = f"{self._get_element_name(index)} " if with_names else ""
@@ -441,6 +437,17 @@ def _check_is_policy(model: Model) -> None:
             "labels: task command has no classes, and this model is a classifier; "
             "set a policy as `model`"
         )
+
+
+def _expand_to_elements(values: Any, count: int) -> list[Any]:
+    """Return a list of the values; a single one is repeated for all elements.
+
+    Args:
+        values: a value for each of `count` elements, one for all of them, or none.
+        count: number of elements of an action.
+    """
+    expanded = list(values)
+    return expanded * count if len(expanded) == 1 else expanded
 
 
 def _find_actions(returned: Any, count: int) -> Tensor:

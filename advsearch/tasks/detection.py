@@ -1044,8 +1044,7 @@ class Detection(ClassTask):
                     outcome, detections, scores, is_candidate, truth
                 )
         best_score = float(max_or_zero(right_score, is_at_object))
-        stored_score = best_score if math.isfinite(best_score) else None  # no JSON NaN
-        return ObjectMatch(Outcome.MISSED, truth.labels[0], stored_score)
+        return _make_missed_match(truth, best_score)
 
     @staticmethod
     def _match_best_box(
@@ -1165,3 +1164,14 @@ def _select_rows(detections: Detections, is_used: Tensor) -> Detections:
         name: values if name == "n_nan_rows" else values[is_used]
         for name, values in detections.items()
     }
+
+
+def _make_missed_match(truth: DetectionTruth, best_score: float) -> ObjectMatch:
+    """Return the outcome for an object that no box of sufficient score is about.
+
+    Args:
+        truth: truth of the scene.
+        best_score: largest score of a right class at the object.
+    """
+    stored_score = best_score if math.isfinite(best_score) else None  # no JSON NaN
+    return ObjectMatch(Outcome.MISSED, truth.labels[0], stored_score)

@@ -393,13 +393,8 @@ class RacingPolicy(Policy[Racing]):
             evaluated: configurations and their evaluations, in the order of the latest
                 proposals; there may be fewer, if the search is interrupted.
         """
-        evaluated_by_runner = defaultdict[int, list[Any]](list)
-        # there may be fewer evaluations than proposals
-        pairs = zip(state.runner_of_proposal, evaluated, strict=False)
-        for k, evaluated_proposal in pairs:
-            evaluated_by_runner[k].append(evaluated_proposal)
         runners = list(state.runners)
-        for k, runner_evaluated in evaluated_by_runner.items():
+        for k, runner_evaluated in self._group_by_runner(state, evaluated).items():
             runners[k] = runners[k].update(runner_evaluated)
         cost = sum(evaluation.cost for _, evaluation in evaluated)
         return replace(
@@ -408,6 +403,16 @@ class RacingPolicy(Policy[Racing]):
             renders_spent=state.renders_spent + cost,
             runner_of_proposal=(),
         )
+
+    @staticmethod
+    def _group_by_runner(race: Race, evaluated: Evaluated) -> dict[int, list[Any]]:
+        """Return the evaluated proposals of each search, by the index of the search."""
+        evaluated_by_runner = defaultdict[int, list[Any]](list)
+        # there may be fewer evaluations than proposals
+        pairs = zip(race.runner_of_proposal, evaluated, strict=False)
+        for k, evaluated_proposal in pairs:
+            evaluated_by_runner[k].append(evaluated_proposal)
+        return evaluated_by_runner
 
     def distribution(self, state: Racing) -> Distribution | None:
         runner = state.runners[state.leader]

@@ -71,11 +71,24 @@ def utilities(values: Sequence[float]) -> list[float]:
     descending = sorted(values, reverse=True)
     weight_of_value = {}
     for value in set(values):
-        first = descending.index(value)  # index of the first of its ranks
-        count = descending.count(value)
-        mean_weight = math.fsum(rank_weights[first : first + count]) / count
+        mean_weight = _average_rank_weights(value, descending, rank_weights)
         weight_of_value[value] = mean_weight / total - 1.0 / n
     return [weight_of_value[value] for value in values]
+
+
+def _average_rank_weights(
+    value: float, descending: Sequence[float], rank_weights: Sequence[float]
+) -> float:
+    """Return the mean weight of the ranks that a value has among all values.
+
+    Args:
+        value: one of the values; equal ones share their ranks.
+        descending: all values, the largest first.
+        rank_weights: weight of each rank.
+    """
+    first = descending.index(value)  # index of the first of its ranks
+    count = descending.count(value)
+    return math.fsum(rank_weights[first : first + count]) / count
 
 
 @dataclass(frozen=True, eq=False)

@@ -302,9 +302,7 @@ class Observations:
         `REFIT_INTERVAL` new points, or a tenth of all points if that is more.
         """
         n_points = len(self.values)
-        values = torch.tensor(self.values, dtype=torch.float64)
-        is_finite = torch.isfinite(values)
-        values = torch.where(is_finite, values, values[is_finite].min())
+        values = self._replace_non_finite_values()
         scales = self.scales
         n_fitted = self.n_fitted  # number of points when the scales were fitted
         refit_interval = max(REFIT_INTERVAL, n_fitted // 10)
@@ -315,6 +313,14 @@ class Observations:
         used_points = self.points[used]
         surrogate = fit_gaussian_process(self.box, used_points, values[used], scales)
         return surrogate, replace(self, scales=scales, n_fitted=n_fitted)
+
+    def _replace_non_finite_values(self) -> Tensor:
+        """Return the values (n,) float64, with the smallest one for each that is not
+        finite.
+        """
+        values = torch.tensor(self.values, dtype=torch.float64)
+        is_finite = torch.isfinite(values)
+        return torch.where(is_finite, values, values[is_finite].min())
 
     def _fit_scales(self, values: Tensor) -> Scales:
         """Return the scales that fit finite objectives (n,) of the points best.

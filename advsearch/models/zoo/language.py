@@ -124,6 +124,13 @@ def _make_checked_module(
         return module, _measure_call_seconds(module, black_image)
 
 
+def _find_max_error(values: Tensor, expected: Tensor) -> float:
+    """Return the largest absolute difference; infinity for tensors of other shapes."""
+    if values.shape != expected.shape:
+        return float("inf")
+    return float((values - expected).abs().max())
+
+
 def _measure_call_seconds(module: nn.Module, images: Tensor) -> float:
     """Return how many seconds a network takes for images (N, 3, H, W)."""
     start_time = time.perf_counter()
@@ -275,9 +282,7 @@ class _LanguageModel(nn.Module):
             # In use, `Preprocessing` does this before the image reaches this module.
             image = self._apply_preprocessing(image)
         pixels = self._compute_pixel_values(image)
-        max_error = float("inf")
-        if pixels.shape == expected.shape:
-            max_error = float((pixels - expected).abs().max())
+        max_error = _find_max_error(pixels, expected)
         is_accurate = max_error <= PIXEL_TOLERANCE * float(expected.abs().max())
         if not is_accurate:  # also if the error is NaN
             raise errors.ModelError(

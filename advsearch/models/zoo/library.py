@@ -54,13 +54,18 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     # Libraries raise many types of errors for missing and corrupt files.
     except Exception as error:
         if rejected:
-            raise models.CodeNotAllowedError(
-                f"a file names the model {spec}, which is not on this machine and "
-                f"would be fetched; {models.explain_how_to_allow(spec)}"
-            ) from error
+            raise _make_fetch_error(spec) from error
         raise _make_library_error(spec, error, advice) from error
     finally:
         logging.disable(disabled_before)
+
+
+def _make_fetch_error(spec: str) -> errors.ModelError:
+    """Return the error of a model that would be fetched, though only a file names it."""
+    return models.CodeNotAllowedError(
+        f"a file names the model {spec}, which is not on this machine and "
+        f"would be fetched; {models.explain_how_to_allow(spec)}"
+    )
 
 
 def _make_library_error(spec: str, error: Exception, advice: str) -> errors.ModelError:

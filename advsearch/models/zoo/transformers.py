@@ -93,12 +93,8 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
     name = _resolve_name(name, spec)
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
-    # arguments of the functions of transformers that read from the hub
-    hub_options: dict[str, Any] = {"revision": revision} if revision else {}
     with report_library_errors(spec, ADVICE):
-        # If the hub does not respond, its client would try each file for half a minute.
-        if not Path(name).is_dir() and _is_hub_unreachable(name):
-            hub_options["local_files_only"] = True
+        hub_options = _choose_hub_options(name, revision)
         saved = _load_config(transformers, name, spec, hub_options)
         # transformers reads the config of any network of timm as a "timm_wrapper". But
         # only a config that transformers has saved states "architectures".
@@ -116,6 +112,22 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         purpose=purpose,
     )
     return family.source(loaded)
+
+
+def _choose_hub_options(name: str, revision: str) -> dict[str, Any]:
+    """Return arguments of the functions of transformers that read from the hub.
+
+    Only files on this machine are read if the hub does not respond: its client would
+    try each file for half a minute.
+
+    Args:
+        name: name of the repository or directory.
+        revision: revision of the repository; "" for its default.
+    """
+    hub_options: dict[str, Any] = {"revision": revision} if revision else {}
+    if not Path(name).is_dir() and _is_hub_unreachable(name):
+        hub_options["local_files_only"] = True
+    return hub_options
 
 
 def _resolve_name(name: str, spec: str) -> str:
