@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise, product
 from statistics import fmean
@@ -134,19 +134,22 @@ class _MarginRenderer:
         self.n_rendered[spp] += len(seeds)
         queries = []
         for offset, seed in enumerate(seeds):
+            query = self._make_margin_query(spp, seed, first_query + offset)
             includes_image = first_render + offset < self.n_images
-            query = Query(
-                self.u,
-                seed,
-                self.kind,
-                row_index=first_query + offset,
-                spp=spp,
-                draws_conditions=self.draws_conditions,
-                includes_image=includes_image,
-            )
-            queries.append(query)
+            queries.append(replace(query, includes_image=includes_image))
         evaluations = self.evaluate(queries)
         return [-evaluation.required_judgement.score for evaluation in evaluations]
+
+    def _make_margin_query(self, spp: int, seed: int, row_index: int) -> Query:
+        """Return the query of one render, without an image."""
+        return Query(
+            self.u,
+            seed,
+            self.kind,
+            row_index=row_index,
+            spp=spp,
+            draws_conditions=self.draws_conditions,
+        )
 
 
 @dataclass(frozen=True)

@@ -542,6 +542,10 @@ class AddressModel(models.RemoteNetwork):
             if self.question:
                 body["prompt"] = self.question
             return body
+        return self._make_chat_body(encoded)
+
+    def _make_chat_body(self, encoded: str) -> dict[str, Any]:
+        """Return the JSON body of a chat's request about an image, a PNG in base64."""
         image_url = {"url": f"data:image/png;base64,{encoded}"}
         content = [
             {"type": "text", "text": self.question},

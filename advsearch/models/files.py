@@ -185,7 +185,6 @@ def _find_archive_kind(archive: Archive) -> str:
     Raises:
         FileFormatError: it is of another kind, such as a pickle that `torch.save` made.
     """
-    path = archive.path
     names = archive.members
     if any(name.startswith("models/") and name.endswith(".json") for name in names):
         _check_no_code(archive)
@@ -195,12 +194,18 @@ def _find_archive_kind(archive: Archive) -> str:
         return "exported"
     if "constants.pkl" in names and any(name.startswith("code/") for name in names):
         return "torchscript"
-    if "data.pkl" in names:
-        raise FileFormatError(
+    raise _make_archive_kind_error(archive)
+
+
+def _make_archive_kind_error(archive: Archive) -> FileFormatError:
+    """Return the error of an archive that is neither torch.export nor TorchScript."""
+    path = archive.path
+    if "data.pkl" in archive.members:
+        return FileFormatError(
             f"model file {path}: is a pickle (made by torch.save), which is never "
             f"opened. {EXPORT_HINT}"
         )
-    raise FileFormatError(
+    return FileFormatError(
         f"model file {path}: a zip archive, but neither torch.export "
         f"nor TorchScript. {EXPORT_HINT}"
     )

@@ -640,10 +640,7 @@ def _find_batch_limits(
     """
     min_batch, max_batch = model.batch_limits
     if isinstance(model.module, AllAtOnce):
-        # The images of a rig stay together: the maximum is a multiple of their number.
-        cameras = model.module.cameras
-        max_batch = max(min_batch, max_batch - max_batch % cameras)
-        return max(min_batch, cameras), max_batch
+        return _fit_limits_to_rigs(min_batch, max_batch, model.module.cameras)
     if max_batch < 2:
         return min_batch, max_batch
     batch_rows = _compute_rows_if_accepted(model, pair)
@@ -655,6 +652,22 @@ def _find_batch_limits(
             "in training mode? Call .eval() before exporting"
         )
     return min_batch, max_batch
+
+
+def _fit_limits_to_rigs(
+    min_batch: int, max_batch: int, cameras: int
+) -> tuple[int, int]:
+    """Return batch limits with which the images of a rig stay together.
+
+    The maximum is a multiple of the number of images of a rig, if that is possible.
+
+    Args:
+        min_batch: minimum batch size.
+        max_batch: maximum batch size.
+        cameras: number of images of a rig.
+    """
+    max_batch = max(min_batch, max_batch - max_batch % cameras)
+    return max(min_batch, cameras), max_batch
 
 
 def _compute_rows_if_accepted(model: Model, images: Tensor) -> Tensor | None:

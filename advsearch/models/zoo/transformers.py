@@ -280,11 +280,7 @@ def _load_config(
     find_file = partial(find_cached_file, transformers, name, hub_options=hub_options)
     try:
         if not find_file("config.json") and find_file("open_clip_config.json"):
-            raise errors.ModelError(
-                f"model {spec}: is a repository of open_clip, which transformers can't "
-                "read; give the network as transformers has it, such as "
-                "hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
-            )
+            raise _make_open_clip_error(spec)
         config: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(
             name, **hub_options
         )[0]
@@ -293,6 +289,15 @@ def _load_config(
         if Path(name).is_dir():
             raise  # the error of the library says what is wrong with the directory
         raise _make_missing_error(name, spec, error) from error
+
+
+def _make_open_clip_error(spec: str) -> errors.ModelError:
+    """Return the error of a repository of open_clip."""
+    return errors.ModelError(
+        f"model {spec}: is a repository of open_clip, which transformers can't "
+        "read; give the network as transformers has it, such as "
+        "hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
+    )
 
 
 def _make_missing_error(name: str, spec: str, error: OSError) -> errors.ModelError:
