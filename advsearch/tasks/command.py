@@ -167,12 +167,7 @@ class Command(Task):
                 has names of classes, the target is no action, or `minimise` is set.
         """
         _check_is_policy(model)
-        if self.envelope is None:
-            raise InputError(
-                "task command: envelope: expected the allowed deviation of an action, "
-                "in its unit, or a list with a number for each element, got none; write "
-                "`task='command={envelope: 0.2}'`"
-            )
+        self._check_has_envelope()
         if minimise:
             raise InputError(
                 "minimise: the clean action is already within its envelope; leave it "
@@ -180,6 +175,15 @@ class Command(Task):
             )
         parsed_target = None if target is None else self._parse_target(target)
         return replace(self, target=parsed_target)
+
+    def _check_has_envelope(self) -> None:
+        """Raise InputError if the user has set no envelope."""
+        if self.envelope is None:
+            raise InputError(
+                "task command: envelope: expected the allowed deviation of an action, "
+                "in its unit, or a list with a number for each element, got none; write "
+                "`task='command={envelope: 0.2}'`"
+            )
 
     def _parse_target(self, text: str) -> Tensor:
         """Parse a target action to numbers, (A,).

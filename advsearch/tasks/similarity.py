@@ -385,14 +385,18 @@ class Similarity(tasks.Classification):
             )
         self._check_k()
         if self.threshold is not None:
-            self.check_numbers(
-                lambda bar: -1.0 < bar < 1.0, "a cosine between -1 and 1", "threshold"
+            self._check_cosine_threshold()
+
+    def _check_cosine_threshold(self) -> None:
+        """Raise InputError if the threshold is no cosine, or there are references."""
+        self.check_numbers(
+            lambda bar: -1.0 < bar < 1.0, "a cosine between -1 and 1", "threshold"
+        )
+        if self.references:
+            raise InputError(
+                "task similarity: threshold: compares with the clean "
+                "picture; leave `references` out"
             )
-            if self.references:
-                raise InputError(
-                    "task similarity: threshold: compares with the clean "
-                    "picture; leave `references` out"
-                )
 
     def _check_k(self) -> None:
         """Raise InputError if `k` is no number from 1 on, or does not fit the method."""

@@ -472,10 +472,7 @@ def load_torchvision(spec: str) -> models.Source:
     if name not in classifiers:
         options["weights_backbone"] = None
     options["weights"] = None if weights else default
-    with report_library_errors(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
-        module: nn.Module = zoo.get_model(name, **options)
-    if weights is not None:
-        models.load_weights(module, weights, name)
+    module = _build_torchvision_network(zoo, spec, options)
     if name in classifiers:
         return models.make_source(module, name, **_get_default_fields(default, module))
     fields = _get_default_fields(default, classifier=None)
@@ -483,6 +480,27 @@ def load_torchvision(spec: str) -> models.Source:
         network = AdaptedNetwork(module, _run_segmenter)
         return models.make_source(network, name, **fields)
     return _make_detector_source(module, name, fields)
+
+
+def _build_torchvision_network(
+    zoo: Any, spec: str, options: Mapping[str, Any]
+) -> nn.Module:
+    """Return a network of torchvision with the weights that the user states, if any.
+
+    Args:
+        zoo: torchvision's networks.
+        spec: what the user wrote, ``torchvision:NAME[@weights.safetensors]``.
+        options: arguments of torchvision's function that builds a network.
+
+    Raises:
+        ModelError: torchvision cannot build it, or the user's weights do not fit.
+    """
+    name, weights = models.split_weights(spec.partition(":")[2])
+    with report_library_errors(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
+        module: nn.Module = zoo.get_model(name, **options)
+    if weights is not None:
+        models.load_weights(module, weights, name)
+    return module
 
 
 def _make_unknown_network_error(
