@@ -488,8 +488,7 @@ def _may_settle(
     rendered_rungs = [index for index in range(rung + 1) if values[index]]
     if not rendered_rungs:
         return True  # nothing is known yet
-    was_rendered = bool(values[rung])
-    if was_rendered and min(values[rung]) <= 0.0 <= max(values[rung]):
+    if _have_both_signs(values[rung]):
         return False
     # The first look renders its rung and the one below, so that two are rendered now.
     last_rung = rendered_rungs[-1]
@@ -498,6 +497,11 @@ def _may_settle(
     quantile = _compute_quantile(count, looks)
     min_mean = error * quantile / math.sqrt(count)
     return min_mean <= max_mean
+
+
+def _have_both_signs(margins: Sequence[float]) -> bool:
+    """Return whether some margins are at least 0 and some at most 0; False for none."""
+    return bool(margins) and min(margins) <= 0.0 <= max(margins)
 
 
 def _forecast_mean(

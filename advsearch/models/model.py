@@ -108,9 +108,10 @@ def _propagate_gradients(
             output_gradients.append(gradient)
     if not outputs:
         return None
-    return torch.autograd.grad(
+    (image_gradient,) = torch.autograd.grad(
         outputs, images, output_gradients, create_graph=create_graph, allow_unused=True
-    )[0]
+    )
+    return image_gradient
 
 
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -345,8 +345,7 @@ def _explain_failed_call(
         The reason, to follow the model's name; and advice, a further sentence or "".
     """
     if isinstance(model.module, WithState) and model.module.state:
-        state = model.module.state.items()
-        sizes = ", ".join(f"{name} (N, {len(numbers)})" for name, numbers in state)
+        sizes = _list_state_sizes(model.module.state)
         reason = f"cannot be called with pictures and a state of {sizes[:200]}"
         return reason, ". Give the `state` that it was made for"
     reason = _describe_other_inputs(network, str(error))
@@ -376,6 +375,11 @@ LABEL_ARGUMENTS = {
     "ground_truth",
 }
 """Names of arguments that take the right labels, for networks that compute a loss."""
+
+
+def _list_state_sizes(state: Mapping[str, Sequence[float]]) -> str:
+    """Return the names of a state's inputs with their shapes, as text."""
+    return ", ".join(f"{name} (N, {len(numbers)})" for name, numbers in state.items())
 
 
 def _describe_other_inputs(network: object, error: str) -> str:
