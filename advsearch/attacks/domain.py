@@ -620,12 +620,11 @@ def project_l2_box(
     # u_i. If u_i is within the bounds, this is v_i^2 and not room_i^2. But then the
     # minimum in g is s v_i^2 with either, as s is at most 1.
     squares = _square_distances(u, center)
-    clipped = u.clamp(low, high)
-    rooms = _square_distances(clipped, center)
+    rooms = _square_distances(u.clamp(low, high), center)
     # p(1), u clipped to the box, is the solution if it lies in the ball
     max_distance = radius * (1.0 + ROUNDING_SLACK)
     if rooms.total <= max_distance**2:
-        return clipped
+        return u.clamp(low, high)
     # Without the box this would be the solution. The box makes g smaller, so that the
     # solution is at least as large: Newton's method begins on its left.
     initial_s = radius**2 / squares.total

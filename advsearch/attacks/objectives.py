@@ -274,7 +274,7 @@ class _UserObjective:
             # This calls the objective again, with a count of 1.
             result = _evaluate_each_image(self, output, images, truth, inputs)
         values = _check_values(self.name, result, count)
-        if _are_written_into((argument_copies, input_copies)):
+        if values.requires_grad and _are_written_into((argument_copies, input_copies)):
             self._check_backward_pass(values, output, images, inputs)
         # values without a gradient, though an argument has one, are an error
         _check_keeps_gradient(self.name, values, (images, output, *inputs.values()))
@@ -325,9 +325,8 @@ class _UserObjective:
         fail. It is tried here, so that the error names the function. The gradient is by
         the output and the inputs, or else by the images.
         """
-        if values.requires_grad:
-            sources = _list_differentiable((output, inputs)) or [images]
-            _check_differentiable(self.name, values, sources)
+        sources = _list_differentiable((output, inputs)) or [images]
+        _check_differentiable(self.name, values, sources)
 
 
 def _are_written_into(copies: Any) -> bool:

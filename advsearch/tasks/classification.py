@@ -290,12 +290,14 @@ class Classification(ClassTask):
             if has_nan_logits:
                 predictions_of_images.append((Prediction(NOT_A_NUMBER),))
             else:
-                predictions = self._make_predictions(classes, probabilities)
+                predictions = self._make_predictions(
+                    classes, probabilities, is_single=count == 1
+                )
                 predictions_of_images.append(predictions)
         return predictions_of_images
 
     def _make_predictions(
-        self, classes: Sequence[int], probabilities: Sequence[float]
+        self, classes: Sequence[int], probabilities: Sequence[float], *, is_single: bool
     ) -> tuple[Prediction, ...]:
         """Return the predictions of the most probable classes of an image.
 
@@ -305,8 +307,8 @@ class Classification(ClassTask):
         Args:
             classes: indices of the classes, the most probable first.
             probabilities: their probabilities.
+            is_single: whether a single prediction is requested.
         """
-        is_single = len(classes) == 1
         return tuple(
             Prediction(self.get_class_name(class_id), class_id, probability)
             for class_id, probability in zip(classes, probabilities, strict=True)

@@ -250,13 +250,14 @@ class Segmentation(tasks.ClassTask):
             truth: truth of the scene.
             margins: margin of each image; at least 0 if it is right.
         """
+        mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
         return [
-            self._describe_image(logits, truth, is_right=margin >= 0.0)
+            self._describe_image(logits, truth, mask, is_right=margin >= 0.0)
             for logits, margin in zip(output, margins, strict=True)
         ]
 
     def _describe_image(
-        self, logits: Tensor, truth: SegmentationTruth, *, is_right: bool
+        self, logits: Tensor, truth: SegmentationTruth, mask: Tensor, *, is_right: bool
     ) -> tasks.PredictionWithPayload:
         """Return the prediction about the object in an image, and a payload.
 
@@ -267,13 +268,13 @@ class Segmentation(tasks.ClassTask):
         Args:
             logits: (classes, h, w).
             truth: truth of the scene.
+            mask: (h, w) bool, the object's pixels.
             is_right: whether enough of the object's pixels are right.
         """
         # (P, classes) of the object's pixels, from a batch with this image only
         pixels = self._select_object_logits(logits[None], truth)
         if pixels is None:
             return tasks.Prediction(tasks.OUT_OF_VIEW), None
-        mask = truth.resize_mask((logits.shape[1], logits.shape[2])).to(logits.device)
         # (h, w) which pixels of the full image have a right class
         is_right_class = self._find_right_pixels(logits, truth)
         accuracy = float(is_right_class[mask].float().mean())
