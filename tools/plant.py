@@ -201,8 +201,8 @@ FAULTS = (
     Fault(
         "attacks: trials of the wrong group count",
         "advsearch/attacks/verification.py",
-        "or clean.n_successes >= self.count_needed_successes(clean.n_trials)",
-        "or adversarial.n_successes >= self.count_needed_successes(adversarial.n_trials)",
+        "self._is_control_right(clean)",
+        "self._is_control_right(adversarial)",
         ("tests/attacks/test_attacks_verification.py",),
     ),
     Fault(

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -92,22 +93,39 @@ def add_candidate(
     """
     for old in pool:
         if torch.equal(old.u, new.u):
-            # The order stays, as it only depends on the first render.
-            updated = old.with_repeat(new.objective, new.success)
-            return tuple(
-                updated if candidate is old else candidate for candidate in pool
-            )
+            return _repeat_candidate(pool, old, new)
     is_full = len(pool) >= size
     if is_full and _sort_key(new) <= _sort_key(pool[-1]):  # no better than the worst
         return pool
+    similar = _find_similar(pool, new)
+    if similar is not None and _sort_key(new) <= _sort_key(similar):
+        return pool
+    # `new` replaces a similar candidate, which is no better
+    others = [candidate for candidate in pool if candidate is not similar]
+    return tuple(sorted((*others, new), key=_sort_key, reverse=True)[:size])
+
+
+def _repeat_candidate(
+    pool: tuple[Candidate, ...], old: Candidate, new: Candidate
+) -> tuple[Candidate, ...]:
+    """Return the pool with `new` counted as a later render of its member `old`.
+
+    The order stays, as it only depends on the first render.
+    """
+    updated = old.with_repeat(new.objective, new.success)
+    return tuple(updated if candidate is old else candidate for candidate in pool)
+
+
+def _find_similar(pool: tuple[Candidate, ...], new: Candidate) -> Candidate | None:
+    """Return the first candidate of the pool that is nearly the same as `new`, or None.
+
+    Two are if no element differs by `SAME` or more.
+    """
     for old in pool:
-        is_nearly_same = float((old.u - new.u).abs().amax()) < SAME
-        if is_nearly_same and _sort_key(new) <= _sort_key(old):
-            return pool
-        if is_nearly_same:  # `new` is the better of the two and takes its place
-            pool = tuple(candidate for candidate in pool if candidate is not old)
-            break
-    return tuple(sorted((*pool, new), key=_sort_key, reverse=True)[:size])
+        largest_difference = float((old.u - new.u).abs().amax())
+        if largest_difference < SAME:
+            return old
+    return None
 
 
 def replace_worst(
@@ -167,14 +185,7 @@ def _is_clearly_worse(candidate: Candidate, leader: Candidate, n_shared: int) ->
         leader: the best candidate so far.
         n_shared: number of the latest renders that share their seeds, at least 2.
     """
-    differences = [
-        leader_objective - objective
-        for leader_objective, objective in zip(
-            leader.repeat_objectives[-n_shared:],
-            candidate.repeat_objectives[-n_shared:],
-            strict=True,
-        )
-    ]
+    differences = _subtract_objectives(leader, candidate, n_shared)
     if not all(map(math.isfinite, differences)):
         return not math.isfinite(candidate.mean_objective)
     mean_difference = math.fsum(differences) / n_shared
@@ -185,6 +196,26 @@ def _is_clearly_worse(candidate: Candidate, leader: Candidate, n_shared: int) ->
     standard_error = math.sqrt(variance / n_shared)
     has_higher_rate = candidate.success_rate > leader.success_rate
     return not has_higher_rate and mean_difference > standard_error
+
+
+def _subtract_objectives(
+    leader: Candidate, candidate: Candidate, n_shared: int
+) -> list[float]:
+    """Return by how much the leader's objective is larger, for each shared seed.
+
+    Args:
+        leader: one candidate.
+        candidate: another one.
+        n_shared: number of the latest renders that share their seeds.
+    """
+    objective_pairs = zip(
+        leader.repeat_objectives[-n_shared:],
+        candidate.repeat_objectives[-n_shared:],
+        strict=True,
+    )
+    return [
+        leader_objective - objective for leader_objective, objective in objective_pairs
+    ]
 
 
 def select_best(pool: tuple[Candidate, ...]) -> Candidate:
@@ -261,19 +292,27 @@ def estimate_failure_rate(
     x_if_unknown_pass = weights * (failed & ~unknown)
     x_if_unknown_fail = weights * (failed | unknown)
     n_samples = len(weights)
-    total = float(x_if_unknown_pass.sum())
-    # number of equally weighted failures that are worth as much (Kish 1965)
-    effective = 0.0
-    if total:
-        effective = total**2 / float(x_if_unknown_pass.square().sum())
+    effective = _count_effective_failures(x_if_unknown_pass)
     estimate = None
     if effective >= MIN_EFFECTIVE_FAILURES and not bool(unknown.any()):
-        # The mean of x_t may exceed 1 by chance, as weights do; a rate can't.
-        estimate = min(1.0, total / n_samples)
+        mean = float(x_if_unknown_pass.sum()) / n_samples
+        estimate = min(1.0, mean)  # by chance the mean may exceed 1; a rate can't
     interval = _bound_failure_rate(
         x_if_unknown_pass, x_if_unknown_fail, bounds.double()
     )
     return FailureRate(estimate, interval, effective, draws=n_samples)
+
+
+def _count_effective_failures(x: Tensor) -> float:
+    """Return the number of equally weighted failures that are worth as much.
+
+    It is (sum x)^2 / sum x^2 (Kish 1965).
+
+    Args:
+        x: (n,) weights of the samples that failed, and 0 for all others.
+    """
+    total = float(x.sum())
+    return total**2 / float(x.square().sum()) if total else 0.0
 
 
 def _bound_failure_rate(
@@ -300,33 +339,48 @@ def _bound_failure_rate(
         x_if_unknown_fail: (n,) x_t for the upper end.
         bounds: (n,) b_t, at least 1 and at least x_t, known before sample t.
     """
-    # c of the formulas: 1, 1/2, 1/4, ...; (bets, 1)
-    bet_sizes = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
-    # The mean capital is compared with 40 = 2 / 0.05. Below, `logsumexp` gives the
-    # logarithm of the sum over all bets, which is `N_BETS` times the mean.
-    log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
-
-    def have_won_over(p: float) -> bool:
-        """Return whether the bets that the rate is over p have won."""
-        # A bet of the whole capital (c = 1) is lost at the first sample without a
-        # failure. Its logarithm is -inf, which adds nothing to the sum below.
-        factors = 1.0 - bet_sizes + bet_sizes * x_if_unknown_pass / p  # (bets, n)
-        log_capital = torch.log(factors).sum(dim=1)
-        return float(log_capital.logsumexp(dim=0)) >= log_limit
-
-    def have_won_under(p: float) -> bool:
-        """Return whether the bets that the rate is under p have won."""
-        gains = bet_sizes * (p - x_if_unknown_fail) / (bounds - p)  # (bets, n)
-        log_capital = torch.log1p(gains).sum(dim=1)
-        return float(log_capital.logsumexp(dim=0)) >= log_limit
-
     # The interval begins where the bets on a larger rate have no longer won, and ends
     # where the bets on a smaller one begin to win.
     # `find_threshold` returns where a condition on p begins to hold. It tries only p
     # between 0 and 1, exclusive, so that neither p nor `bounds - p` is 0.
-    lower = find_threshold(lambda p: not have_won_over(p))
-    upper = find_threshold(have_won_under)
+    lower = find_threshold(lambda p: not _have_won_over(p, x_if_unknown_pass))
+    upper = find_threshold(lambda p: _have_won_under(p, x_if_unknown_fail, bounds))
     return lower, upper
+
+
+def _have_won_over(p: float, x: Tensor) -> bool:
+    """Return whether the bets that the rate is over p have won, from x_t (n,)."""
+    bet_sizes = _make_bet_sizes()
+    # A bet of the whole capital (c = 1) is lost at the first sample without a
+    # failure. Its logarithm is -inf, which adds nothing to the sum of `_exceed_limit`.
+    factors = 1.0 - bet_sizes + bet_sizes * x / p  # (bets, n)
+    return _exceed_limit(torch.log(factors).sum(dim=1))
+
+
+def _have_won_under(p: float, x: Tensor, bounds: Tensor) -> bool:
+    """Return whether the bets that the rate is under p have won, from x_t and b_t."""
+    gains = _make_bet_sizes() * (p - x) / (bounds - p)  # (bets, n)
+    return _exceed_limit(torch.log1p(gains).sum(dim=1))
+
+
+def _make_bet_sizes() -> Tensor:
+    """Return the fractions of the capital that are bet, c: 1, 1/2, 1/4, ...; (bets, 1)
+    float64.
+    """
+    bet_sizes: Tensor = 0.5 ** torch.arange(N_BETS, dtype=torch.float64)[:, None]
+    return bet_sizes
+
+
+def _exceed_limit(log_capital: Tensor) -> bool:
+    """Return whether the mean capital of the bets is at least 40 = 2 / 0.05.
+
+    Args:
+        log_capital: (bets,) logarithm of each bet's capital after all samples.
+    """
+    # `logsumexp` gives the logarithm of the sum over all bets, which is `N_BETS` times
+    # the mean.
+    log_limit = math.log(2.0 / (1.0 - CONFIDENCE)) + math.log(N_BETS)
+    return float(log_capital.logsumexp(dim=0)) >= log_limit
 
 
 MAX_FAILURES = 24  # maximum number of failures in a result
@@ -397,21 +451,36 @@ def select_diverse(
     """
     # the worst first: `argmax` below returns the first of equally far points
     order = sorted(range(len(points)), key=lambda index: -objectives[index])
-    points = points[order].double()
+    ordered_points = points[order].double()
     # (n,) distance to the nearest selected point; infinite before there is one
     nearest_distance = torch.full((len(points),), torch.inf, dtype=torch.float64)
     selected = list[int]()
     for _ in range(min(limit, len(points))):
         farthest = int(nearest_distance.argmax())
         selected.append(farthest)
-        difference = (points - points[farthest]).abs()  # (n, k)
-        # around a circle of length 1, the shorter of both directions
-        wrapped_difference = torch.minimum(difference, 1.0 - difference)
-        difference = torch.where(is_periodic, wrapped_difference, difference)
-        difference = torch.where(is_discrete, (difference > 0.0).double(), difference)
-        nearest_distance = torch.minimum(nearest_distance, difference.norm(dim=1))
+        difference = (ordered_points - ordered_points[farthest]).abs()
+        distance = _compute_length(difference, is_periodic, is_discrete)
+        nearest_distance = torch.minimum(nearest_distance, distance)
         nearest_distance[selected] = -1.0  # below every distance: never selected again
     return [order[rank] for rank in selected]
+
+
+def _compute_length(
+    difference: Tensor, is_periodic: Tensor, is_discrete: Tensor
+) -> Tensor:
+    """Return the lengths (n,) of absolute differences (n, k) in fractions of a range.
+
+    Args:
+        difference: (n, k) absolute differences of two values, each in [0, 1].
+        is_periodic: (k,) bool, whether 0 and 1 are the same value.
+        is_discrete: (k,) bool, whether all different values have the distance 1.
+    """
+    # around a circle of length 1, the shorter of both directions
+    wrapped_difference = torch.minimum(difference, 1.0 - difference)
+    difference = torch.where(is_periodic, wrapped_difference, difference)
+    difference = torch.where(is_discrete, (difference > 0.0).double(), difference)
+    length: Tensor = difference.norm(dim=1)
+    return length
 
 
 # The bracket of the smallest change is closed once high / low is at most this.
@@ -496,6 +565,16 @@ def scale_domain(domain: Domain, scale: float) -> Domain:
     Raises:
         InputError: a block has a range and no epsilon.
     """
+    _check_all_have_budgets(domain)
+    scaled_blocks = []
+    for block in domain.blocks:
+        assert block.epsilon is not None
+        scaled_blocks.append(replace(block, epsilon=block.epsilon * scale))
+    return replace(domain, blocks=tuple(scaled_blocks))
+
+
+def _check_all_have_budgets(domain: Domain) -> None:
+    """Raise InputError if a block has a range and no epsilon."""
     # "pose.yaw", the name of a block, belongs to the control "pose"
     controls_without_budget = [
         block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None
@@ -507,11 +586,6 @@ def scale_domain(domain: Domain, scale: float) -> Domain:
             f"...), got {', '.join(names)}, "
             "whose parameters have ranges and no epsilon; leave it out"
         )
-    scaled_blocks = []
-    for block in domain.blocks:
-        assert block.epsilon is not None
-        scaled_blocks.append(replace(block, epsilon=block.epsilon * scale))
-    return replace(domain, blocks=tuple(scaled_blocks))
 
 
 def shrink_towards_start(domain: Domain, u: Tensor, scale: float) -> Tensor:
@@ -558,36 +632,48 @@ def find_smallest_change(
     full_u = search(domain, 0)  # the best configuration in the full budgets
     # Nothing is known to pass yet. The counts include the search above and the check
     # below.
-    bracket = Bracket(
-        largest_failing_scale=0.0,
-        smallest_passing_scale=math.inf,
-        u=None,
-        searches=1,
-        n_checks=1,
-    )
+    bracket = Bracket(0.0, math.inf, u=None, searches=1, n_checks=1)
     if not passes(full_u, 0):  # the check with the index 0
         return replace(bracket, largest_failing_scale=1.0)
     bracket = _shorten(bracket, full_u, 1.0, passes, domain, likely)
-    while (
-        bracket.searches < MAX_SEARCHES
-        # the bracket is not closed
-        and bracket.smallest_passing_scale > RATIO * bracket.largest_failing_scale
-        and bracket.smallest_passing_scale > SMALLEST_SCALE
-    ):
-        scale = _choose_next_scale(bracket)
-        # The counts so far are the indices of the next search and the next check.
-        search_index = bracket.searches
-        check_index = bracket.n_checks
-        u = search(scale_domain(domain, scale), search_index)
-        has_passed = passes(u, check_index)
-        bracket = replace(bracket, searches=search_index + 1, n_checks=check_index + 1)
-        if has_passed:
-            bracket = replace(bracket, found_by=search_index)
-            bracket = _shorten(bracket, u, scale, passes, domain, likely)
-        else:
-            # This search found nothing at `scale`, so nothing smaller is expected.
-            bracket = replace(bracket, largest_failing_scale=scale)
+    while _is_worth_a_search(bracket):
+        bracket = _search_again(bracket, search, passes, domain, likely)
     return bracket
+
+
+def _is_worth_a_search(bracket: Bracket) -> bool:
+    """Return whether one more search may narrow the bracket, and may be made."""
+    is_open = bracket.smallest_passing_scale > RATIO * bracket.largest_failing_scale
+    return (
+        bracket.searches < MAX_SEARCHES
+        and is_open
+        and bracket.smallest_passing_scale > SMALLEST_SCALE
+    )
+
+
+def _search_again(
+    bracket: Bracket,
+    search: Search,
+    passes: Passes,
+    domain: Domain,
+    likely: Guess | None,
+) -> Bracket:
+    """Search once more inside the bracket, and return the bracket with the result.
+
+    The arguments are those of `find_smallest_change`.
+    """
+    scale = _choose_next_scale(bracket)
+    # The counts so far are the indices of the next search and the next check.
+    search_index = bracket.searches
+    check_index = bracket.n_checks
+    u = search(scale_domain(domain, scale), search_index)
+    has_passed = passes(u, check_index)
+    bracket = replace(bracket, searches=search_index + 1, n_checks=check_index + 1)
+    if not has_passed:
+        # This search found nothing at `scale`, so nothing smaller is expected.
+        return replace(bracket, largest_failing_scale=scale)
+    bracket = replace(bracket, found_by=search_index)
+    return _shorten(bracket, u, scale, passes, domain, likely)
 
 
 def _choose_next_scale(bracket: Bracket) -> float:
@@ -630,26 +716,35 @@ def confirm_bracket(
     """
     if bracket.u is None:
         return bracket
-    shortest_u = bracket.u
-    shortest_scale = bracket.smallest_passing_scale
+    shortest = bracket
     growth = 1.0  # factor of the change since the shortest that passed
     for _ in range(MAX_CONFIRMATIONS):
         # The seeds of a check's trials follow from its index. Every attempt takes
         # `times` new indices, even if it ends at the first failure.
-        check_indices = range(bracket.n_checks, bracket.n_checks + times)
+        next_check = bracket.n_checks + times
+        check_indices = range(bracket.n_checks, next_check)
+        assert bracket.u is not None
         if all(passes(bracket.u, check_index) for check_index in check_indices):
-            return replace(bracket, n_checks=bracket.n_checks + times, confirmed=True)
+            return replace(bracket, n_checks=next_check, confirmed=True)
         growth *= math.sqrt(RATIO)  # the 2.5 %
-        scale = min(1.0, shortest_scale * growth)
-        change = shortest_u - domain.start
-        grown_u = scale_domain(domain, scale).project(domain.start + growth * change)
-        bracket = replace(
-            bracket,
-            smallest_passing_scale=scale,
-            u=grown_u,
-            n_checks=bracket.n_checks + times,
-        )
+        grown = _grow(shortest, growth, domain)
+        bracket = replace(grown, n_checks=next_check)
     return bracket
+
+
+def _grow(bracket: Bracket, growth: float, domain: Domain) -> Bracket:
+    """Return the bracket with its configuration's change multiplied by `growth`.
+
+    Args:
+        bracket: bracket that has a configuration.
+        growth: factor of the change, at least 1.
+        domain: domain with the full budgets; the scale never exceeds 1.
+    """
+    assert bracket.u is not None
+    scale = min(1.0, bracket.smallest_passing_scale * growth)
+    change = bracket.u - domain.start
+    grown_u = scale_domain(domain, scale).project(domain.start + growth * change)
+    return replace(bracket, smallest_passing_scale=scale, u=grown_u)
 
 
 def _shorten(
@@ -662,13 +757,8 @@ def _shorten(
 ) -> Bracket:
     """Move a configuration towards the start as far as it still passes its trials.
 
-    A length is the scale of the budgets that a configuration needs. The logarithm of
-    the length is bisected until the bounds are within `LENGTH_RATIO` of each other.
-
-    With `likely`, the first trial is at the shortest length that is predicted to pass.
-    The prediction is nearly right, so the next trial is only a factor of `LENGTH_RATIO`
-    away. The factor is squared after each trial, until a step of bisection (to the
-    geometric mean of the bounds) is shorter.
+    A length is the scale of the budgets that a configuration needs. It is found by
+    bisection (`_LengthBisection`).
 
     Args:
         bracket: bracket so far. No length below its largest failing scale is tried,
@@ -683,38 +773,96 @@ def _shorten(
     Returns:
         The bracket with the shortest configuration that passed at its upper bound.
     """
+    shrink_to = partial(_shrink_to_length, domain, u, length)
     low = max(bracket.largest_failing_scale, SMALLEST_SCALE * length)
-    high = length
-    shortest_u = u
-    check_index = bracket.n_checks
+    bisection = _LengthBisection.start_between(low, length, likely, shrink_to)
+    bracket = replace(bracket, u=u)
+    while not bisection.is_done:
+        shorter_u = shrink_to(bisection.trial_length)
+        has_passed = passes(shorter_u, bracket.n_checks)
+        bracket = replace(bracket, n_checks=bracket.n_checks + 1)
+        if has_passed:
+            bracket = replace(bracket, u=shorter_u)
+        bisection.add_trial(has_passed)
+    return replace(bracket, smallest_passing_scale=bisection.high)
 
-    def shrink_to(scale: float) -> Tensor:
-        # u has the scale `length`, so that its change is multiplied by this ratio
-        return shrink_towards_start(scale_domain(domain, scale), u, scale / length)
 
-    if likely is None:
-        max_step_factor = math.inf  # plain bisection; its square is infinite, too
-        trial_length = math.sqrt(high * low)
-    else:
-        max_step_factor = LENGTH_RATIO
+def _shrink_to_length(
+    domain: Domain, u: Tensor, length: float, new_length: float
+) -> Tensor:
+    """Return a configuration of one length moved towards the start, to another one.
+
+    Args:
+        domain: domain with the full budgets.
+        u: (d,) the configuration.
+        length: scale of the budgets that it needs.
+        new_length: scale of the budgets that the result needs.
+    """
+    scaled_domain = scale_domain(domain, new_length)
+    return shrink_towards_start(scaled_domain, u, new_length / length)
+
+
+@dataclass
+class _LengthBisection:
+    """A bisection of the logarithm of the shortest length that passes its trials.
+
+    Without a prediction of the shortest length it is plain bisection: each trial is at
+    the geometric mean of the bounds. With one, the first trial is at the predicted
+    length. The prediction is nearly right, so the next trial is only a factor of
+    `LENGTH_RATIO` away. The factor is squared after each trial, until a step of
+    bisection is shorter.
+
+    Attributes:
+        low: length at which nothing passes, or which is not tried.
+        high: shortest length so far that passed.
+        trial_length: length to try next.
+        max_step_factor: largest ratio of the next trial's length to that of this one.
+    """
+
+    low: float
+    high: float
+    trial_length: float
+    max_step_factor: float
+
+    @classmethod
+    def start_between(
+        cls,
+        low: float,
+        high: float,
+        likely: Guess | None,
+        shrink_to: Callable[[float], Tensor],
+    ) -> _LengthBisection:
+        """Return a bisection between two lengths, before its first trial.
+
+        Args:
+            low, high: bounds of the length, over 0.
+            likely: predicts whether a configuration would pass; None for plain
+                bisection.
+            shrink_to: returns the configuration (d,) of a length.
+        """
+        if likely is None:
+            # plain bisection; the square of infinity is infinite, too
+            return cls(low, high, math.sqrt(high * low), math.inf)
         trial_length = _guess_shortest(likely, shrink_to, low, high)
-    while high > LENGTH_RATIO * low:
-        shorter_u = shrink_to(trial_length)
-        if passes(shorter_u, check_index):
-            shortest_u = shorter_u
-            high = trial_length
-            geometric_mean = math.sqrt(high * low)
-            trial_length = max(geometric_mean, high / max_step_factor)
+        return cls(low, high, trial_length, LENGTH_RATIO)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the bounds are within `LENGTH_RATIO` of each other."""
+        return not self.high > LENGTH_RATIO * self.low
+
+    def add_trial(self, has_passed: bool) -> None:
+        """Move a bound to the length that was tried, and choose the next length."""
+        if has_passed:
+            self.high = self.trial_length
+            geometric_mean = math.sqrt(self.high * self.low)
+            self.trial_length = max(geometric_mean, self.high / self.max_step_factor)
         else:
-            low = trial_length
-            geometric_mean = math.sqrt(high * low)
-            trial_length = min(geometric_mean, low * max_step_factor)
+            self.low = self.trial_length
+            geometric_mean = math.sqrt(self.high * self.low)
+            self.trial_length = min(geometric_mean, self.low * self.max_step_factor)
         # not `**`, which raises OverflowError for large numbers
-        max_step_factor = max_step_factor * max_step_factor
-        check_index = check_index + 1
-    return replace(
-        bracket, smallest_passing_scale=high, u=shortest_u, n_checks=check_index
-    )
+        self.max_step_factor = self.max_step_factor * self.max_step_factor
 
 
 def _guess_shortest(

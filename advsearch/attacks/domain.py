@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -66,62 +66,82 @@ class Block:
 
     def __post_init__(self) -> None:
         """Check that every attribute is within its limits."""
-        where = f" of {self.name!r}" if self.name else ""
+        self._check_size_and_norm()
+        self._check_interval()
+        self._check_epsilon()
+        self._check_box_options()
+        self._check_n_options()
+
+    @property
+    def _name_suffix(self) -> str:
+        """What names the block in messages: " of 'pose.yaw'", say, or nothing."""
+        return f" of {self.name!r}" if self.name else ""
+
+    def _check_size_and_norm(self) -> None:
+        """Raise InputError if the block is empty or its norm unknown."""
         if self.size < 1:
             raise InputError(
-                f"block{where}: expected a size of at least 1, got {self.size}"
+                f"block{self._name_suffix}: expected a size of at least 1, got "
+                f"{self.size}"
             )
         if self.norm not in NORMS:
             raise InputError(
-                f"`norm`{where}: expected one of {', '.join(NORMS)}, got {self.norm!r}"
+                f"`norm`{self._name_suffix}: expected one of {', '.join(NORMS)}, got "
+                f"{self.norm!r}"
             )
+
+    def _check_interval(self) -> None:
+        """Raise InputError if the bounds are not an interval within [0, 1]."""
         if not 0.0 <= self.low < self.high <= 1.0:
             raise InputError(
-                f"bounds{where}: expected 0 <= low < high <= 1, got "
+                f"bounds{self._name_suffix}: expected 0 <= low < high <= 1, got "
                 f"[{self.low}, {self.high}]"
             )
-        self._check_budget(where)
+
+    def _check_epsilon(self) -> None:
+        """Raise InputError if a box has an epsilon, or a ball has none in its limits."""
+        is_box = self.norm == "box"
+        if is_box and self.epsilon is not None:
+            raise InputError(
+                f"`epsilon`{self._name_suffix}: has bounds and no norm budget; leave "
+                "`epsilon` out"
+            )
+        has_budget = self.epsilon is not None and 0.0 < self.epsilon < math.inf
+        if not is_box and not has_budget:
+            raise InputError(
+                f"`epsilon`{self._name_suffix}: expected a finite number over 0 (the "
+                f"{self.norm} radius, in units where the parameter's whole range is "
+                f"1), got {self.epsilon}; try `epsilon=0.1`"
+            )
+
+    def _check_box_options(self) -> None:
+        """Raise InputError if a ball has what only a box may have.
+
+        That is to be periodic, or a `unit_step_length`, which messages call its reach.
+        """
+        is_box = self.norm == "box"
+        if self.periodic and not is_box:
+            raise InputError(
+                f"block{self._name_suffix}: a periodic block cannot have a norm "
+                "budget; use norm 'box'"
+            )
+        reach = self.unit_step_length
+        if reach is not None and (not is_box or not reach > 0.0):
+            raise InputError(
+                f"block{self._name_suffix}: expected a reach over 0 and norm 'box', "
+                f"got {reach} and {self.norm!r}"
+            )
+
+    def _check_n_options(self) -> None:
+        """Raise InputError if a discrete choice is not one number of the full range."""
         has_full_range = self.low == 0.0 and self.high == 1.0 and not self.periodic
         is_plain_number = self.size == 1 and self.norm == "box" and has_full_range
         is_choice = self.n_options != 0  # 0 options mean numbers
         if is_choice and (self.n_options < 0 or not is_plain_number):
             raise InputError(
-                f"block{where}: expected a discrete choice to have at least one "
-                f"option, size 1, norm 'box' and bounds [0, 1], got {self}"
-            )
-
-    def _check_budget(self, where: str) -> None:
-        """Raise InputError if epsilon, periodic or the reach do not fit the norm.
-
-        A ball ("linf" or "l2") needs an epsilon. Only a box may be periodic or have a
-        `unit_step_length`, which messages call its reach.
-
-        Args:
-            where: " of 'pose.yaw'", say, for messages; empty without a name.
-        """
-        is_box = self.norm == "box"
-        if is_box and self.epsilon is not None:
-            raise InputError(
-                f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out"
-            )
-        has_budget = self.epsilon is not None and 0.0 < self.epsilon < math.inf
-        if not is_box and not has_budget:
-            raise InputError(
-                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} "
-                "radius, in units where the parameter's whole range is 1), got "
-                f"{self.epsilon}; try `epsilon=0.1`"
-            )
-        if self.periodic and not is_box:
-            raise InputError(
-                f"block{where}: a periodic block cannot have a norm "
-                "budget; use norm 'box'"
-            )
-        if self.unit_step_length is not None and (
-            not is_box or not self.unit_step_length > 0.0
-        ):
-            raise InputError(
-                f"block{where}: expected a reach over 0 and norm 'box', got "
-                f"{self.unit_step_length} and {self.norm!r}"
+                f"block{self._name_suffix}: expected a discrete choice to have at "
+                "least one option, size 1, norm 'box' and bounds [0, 1], got "
+                f"{self}"
             )
 
     @property
@@ -215,16 +235,8 @@ class Domain:
                 finite.
         """
         start = self.start.detach().to(torch.float32, copy=True)
-        total = sum(block.size for block in self.blocks)
-        if start.ndim != 1 or start.numel() != total:
-            raise InputError(
-                f"start: expected shape ({total},), the sum of the "
-                f"blocks, got {tuple(start.shape)}"
-            )
-        if not bool(torch.isfinite(start).all()):
-            raise InputError(
-                "start: found NaN or infinite values; a start must be a configuration"
-            )
+        n_elements = sum(block.size for block in self.blocks)
+        _check_elements(start, n_elements)
         # the dataclass is frozen
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "blocks", tuple(self.blocks))
@@ -244,15 +256,7 @@ class Domain:
         for block, part in self.list_block_slices():
             lower[part] = block.low
             upper[part] = block.high
-            is_inside = (start[part] >= lower[part]) & (start[part] <= upper[part])
-            if not bool(is_inside.all()):
-                low = float(start[part].min())
-                high = float(start[part].max())
-                where = f" of {block.name!r}" if block.name else ""
-                raise InputError(
-                    f"start{where}: expected values in "
-                    f"[{block.low}, {block.high}], got {low:.6g} to {high:.6g}"
-                )
+            _check_start_of_block(block, start[part], lower[part], upper[part])
             if block.norm == "linf" and block.epsilon is not None:
                 # A slice is a view, so this changes `lower` and `upper` in place.
                 lower[part].clamp_(min=start[part] - block.epsilon)
@@ -345,15 +349,7 @@ class Domain:
                     u[part], self.start[part], block.epsilon, block.low, block.high
                 )
             elif block.periodic:
-                wrapped = block.low + torch.remainder(
-                    u[part] - block.low, block.high - block.low
-                )
-                # rounding of the sum may leave the bounds
-                wrapped.clamp_(block.low, block.high)
-                # Elements that clipping has not changed are inside and are not wrapped.
-                projected[part] = torch.where(
-                    u[part] == projected[part], projected[part], wrapped
-                )
+                projected[part] = _wrap_around(block, u[part], projected[part])
         return projected
 
     def violation(self, u: Tensor) -> float:
@@ -419,25 +415,14 @@ class Domain:
             extreme: whether a norm ball is sampled at its corners or surface.
         """
         uniform = torch.rand(block.size, generator=generator)
-        is_l2_ball = block.norm == "l2" and block.epsilon is not None
-        if not is_l2_ball:
-            # fraction of the way from the lower to the upper bound
-            fraction = uniform
-            if block.n_options:
-                fraction = option_center(uniform, block.n_options)
-            elif extreme and block.norm != "box":
-                fraction = uniform.round()  # 0 or 1: a corner
+        if block.norm != "l2" or block.epsilon is None:
+            fraction = _choose_fraction(block, uniform, extreme=extreme)
             return torch.lerp(
                 self.lower_bounds[part], self.upper_bounds[part], fraction
             )
-        assert block.epsilon is not None
         if extreme:
-            # A point in a direction of random signs, outside of the ball: it is farther
-            # away than the radius and the diagonal of the unit box. The projection
-            # brings it to the surface.
-            signs = uniform.round() * 2.0 - 1.0
-            far_distance = 2.0 * max(block.epsilon, math.sqrt(block.size))
-            return self.start[part] + signs * far_distance
+            # The projection brings it to the surface.
+            return self.start[part] + _make_far_change(uniform, block.epsilon)
         # one uniform number decides the distance from the center
         return self.start[part] + _sample_ball(
             block.size, block.epsilon, float(uniform[0]), generator
@@ -465,21 +450,103 @@ class Domain:
             slope = gradient[part]
             if block.n_options:
                 step[part] = 0.0
-                continue
-            if block.norm == "linf":
+            elif block.norm == "linf":
                 torch.sign(slope, out=step[part])
                 step[part] *= block.radius
-                continue
-            if block.norm == "box" and not block.periodic:
-                points_out_above = (u[part] >= block.high) & (slope > 0)
-                points_out_below = (u[part] <= block.low) & (slope < 0)
-                slope = slope.masked_fill(points_out_above | points_out_below, 0.0)
-            # Divide by the largest element first, so that squares do not overflow. Then
-            # the norm is at least 1, unless the slope is zero.
-            slope = slope / slope.abs().amax().clamp_min(torch.finfo(slope.dtype).tiny)
-            norm = max(float(torch.linalg.vector_norm(slope)), 1.0)
-            step[part] = slope * (block.radius / norm)
+            else:
+                step[part] = _compute_euclidean_step(block, u[part], slope)
         return step
+
+
+def _check_elements(start: Tensor, n_elements: int) -> None:
+    """Raise InputError if a start has another number of elements, or is not finite."""
+    if start.ndim != 1 or start.numel() != n_elements:
+        raise InputError(
+            f"start: expected shape ({n_elements},), the sum of the "
+            f"blocks, got {tuple(start.shape)}"
+        )
+    if not bool(torch.isfinite(start).all()):
+        raise InputError(
+            "start: found NaN or infinite values; a start must be a configuration"
+        )
+
+
+def _check_start_of_block(
+    block: Block, start: Tensor, lower: Tensor, upper: Tensor
+) -> None:
+    """Raise InputError if a block's start lies outside of its bounds, each (size,)."""
+    is_inside = (start >= lower) & (start <= upper)
+    if not bool(is_inside.all()):
+        low = float(start.min())
+        high = float(start.max())
+        raise InputError(
+            f"start{block._name_suffix}: expected values in "
+            f"[{block.low}, {block.high}], got {low:.6g} to {high:.6g}"
+        )
+
+
+def _wrap_around(block: Block, u: Tensor, clipped: Tensor) -> Tensor:
+    """Return the value (size,) of a periodic block, wrapped around at its bounds.
+
+    Args:
+        block: the block.
+        u: (size,) value to wrap.
+        clipped: (size,) the same value, clipped to the bounds.
+    """
+    wrapped = block.low + torch.remainder(u - block.low, block.high - block.low)
+    # rounding of the sum may leave the bounds
+    wrapped.clamp_(block.low, block.high)
+    # Elements that clipping has not changed are inside and are not wrapped.
+    return torch.where(u == clipped, clipped, wrapped)
+
+
+def _choose_fraction(block: Block, uniform: Tensor, *, extreme: bool) -> Tensor:
+    """Return random fractions (size,) of the way from the lower to the upper bound.
+
+    Args:
+        block: block that is a box, or an l-infinity ball.
+        uniform: (size,) uniform random numbers in [0, 1).
+        extreme: whether a ball is sampled at its corners.
+    """
+    if block.n_options:
+        return option_center(uniform, block.n_options)
+    if extreme and block.norm != "box":
+        return uniform.round()  # 0 or 1: a corner
+    return uniform
+
+
+def _make_far_change(uniform: Tensor, radius: float) -> Tensor:
+    """Return a vector (size,) of random signs that leads out of an l2 ball around 0.
+
+    It is longer than the radius and than the diagonal of the unit box.
+
+    Args:
+        uniform: (size,) uniform random numbers in [0, 1), which give the signs.
+        radius: radius of the ball.
+    """
+    signs = uniform.round() * 2.0 - 1.0
+    far_distance = 2.0 * max(radius, math.sqrt(uniform.numel()))
+    return signs * far_distance
+
+
+def _compute_euclidean_step(block: Block, u: Tensor, slope: Tensor) -> Tensor:
+    """Return the step (size,) of the length `block.radius` along a gradient.
+
+    Args:
+        block: block with the norm "l2" or "box".
+        u: (size,) value of the block. In a box, elements at a bound that the gradient
+            would push past it get no step.
+        slope: (size,) gradient of the objective, finite.
+    """
+    if block.norm == "box" and not block.periodic:
+        points_out_above = (u >= block.high) & (slope > 0)
+        points_out_below = (u <= block.low) & (slope < 0)
+        slope = slope.masked_fill(points_out_above | points_out_below, 0.0)
+    # Divide by the largest element first, so that squares do not overflow. Then
+    # the norm is at least 1, unless the slope is zero.
+    slope = slope / slope.abs().amax().clamp_min(torch.finfo(slope.dtype).tiny)
+    norm = max(float(torch.linalg.vector_norm(slope)), 1.0)
+    return slope * (block.radius / norm)
 
 
 def _sample_ball(
@@ -549,29 +616,39 @@ def project_l2_box(
         ball. A point inside is returned bit for bit; projecting a result again changes
         at most the last bits.
     """
-    # v_i^2 and room_i^2 in chunks, and their sums. `rooms` has the squared distance
-    # from the center to the clipped u_i. If u_i is within the bounds, this is v_i^2 and
-    # not room_i^2. But then the minimum in g is s v_i^2 with either, as s is at most 1.
-    squares = []
-    rooms = []
-    squared_distance = 0.0
-    squared_distance_in_box = 0.0
-    for u_chunk, center_chunk in zip(
-        torch.split(u, CHUNK), torch.split(center, CHUNK), strict=True
-    ):
-        squares.append((u_chunk - center_chunk).square_())
-        rooms.append(u_chunk.clamp(low, high).sub_(center_chunk).square_())
-        squared_distance += float(squares[-1].sum(dtype=torch.float64))
-        squared_distance_in_box += float(rooms[-1].sum(dtype=torch.float64))
+    # v_i^2 and room_i^2. `rooms` has the squared distance from the center to the clipped
+    # u_i. If u_i is within the bounds, this is v_i^2 and not room_i^2. But then the
+    # minimum in g is s v_i^2 with either, as s is at most 1.
+    squares = _square_distances(u, center)
+    rooms = _square_distances(u.clamp(low, high), center)
     # p(1), u clipped to the box, is the solution if it lies in the ball
     max_distance = radius * (1.0 + ROUNDING_SLACK)
-    if squared_distance_in_box <= max_distance**2:
+    if rooms.total <= max_distance**2:
         return u.clamp(low, high)
     # Without the box this would be the solution. The box makes g smaller, so that the
     # solution is at least as large: Newton's method begins on its left.
-    initial_s = radius**2 / squared_distance
-    s = _solve_multiplier(squares, rooms, radius, initial_s)
+    initial_s = radius**2 / squares.total
+    s = _solve_multiplier(squares.chunks, rooms.chunks, radius, initial_s)
     return _move_towards(center, u, math.sqrt(s), low, high)
+
+
+class _Squares(NamedTuple):
+    """The squares of a vector's elements, in chunks of `CHUNK`, and their sum."""
+
+    chunks: list[Tensor]
+    total: float
+
+
+def _square_distances(u: Tensor, center: Tensor) -> _Squares:
+    """Return the squared distances of the elements of two vectors (d,)."""
+    chunks = []
+    total = 0.0
+    chunk_pairs = zip(torch.split(u, CHUNK), torch.split(center, CHUNK), strict=True)
+    for u_chunk, center_chunk in chunk_pairs:
+        chunk = (u_chunk - center_chunk).square_()
+        chunks.append(chunk)
+        total += float(chunk.sum(dtype=torch.float64))
+    return _Squares(chunks, total)
 
 
 def _solve_multiplier(
@@ -590,19 +667,31 @@ def _solve_multiplier(
         s: where Newton's method begins, not above the solution.
     """
     for _ in range(_MAX_ITERATIONS):
-        value = 0.0
-        slope = 0.0
-        for square, room in zip(squares, rooms, strict=True):
-            scaled = square * s
-            # elements that have reached their bound grow no further with s
-            slope += float(torch.dot(square, (scaled < room).to(square.dtype)))
-            value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
+        value, slope = _compute_squared_length(squares, rooms, s)
         # Newton's step; where nothing grows any more, it stays
         next_s = s + (radius**2 - value) / slope if slope > 0.0 else s
         if next_s <= s * (1.0 + 1e-7):  # steps only go up, so this one is rounding
             break
         s = next_s
     return s
+
+
+def _compute_squared_length(
+    squares: Sequence[Tensor], rooms: Sequence[Tensor], s: float
+) -> tuple[float, float]:
+    """Return g(s) = sum_i min(s v_i^2, room_i^2), and its derivative by s.
+
+    The arguments are those of `_solve_multiplier`.
+    """
+    value = 0.0
+    slope = 0.0
+    for square, room in zip(squares, rooms, strict=True):
+        scaled = square * s
+        # elements that have reached their bound grow no further with s
+        still_grows = (scaled < room).to(square.dtype)
+        slope += float(torch.dot(square, still_grows))
+        value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
+    return value, slope
 
 
 def _move_towards(
@@ -620,20 +709,27 @@ def _move_towards(
         low, high: bounds of every element.
     """
     moved = torch.empty_like(u)
-    for out, u_chunk, center_chunk in zip(
+    chunks = zip(
         torch.split(moved, CHUNK),
         torch.split(u, CHUNK),
         torch.split(center, CHUNK),
         strict=True,
-    ):
-        torch.lerp(center_chunk, u_chunk, t, out=out)
-        distance = (out - center_chunk).abs()
-        max_distance = ((u_chunk - center_chunk) * t).abs()
-        is_too_far = distance > max_distance
-        rounded_inwards = torch.nextafter(out, center_chunk)
+    )
+    for out, u_chunk, center_chunk in chunks:
         # `out` is a part of `moved`, so this writes the result there
-        torch.where(is_too_far, rounded_inwards, out, out=out).clamp_(low, high)
+        _move_chunk_towards(center_chunk, u_chunk, t, out)
+        out.clamp_(low, high)
     return moved
+
+
+def _move_chunk_towards(center: Tensor, u: Tensor, t: float, out: Tensor) -> None:
+    """Write center + t (u - center), rounded towards the center, to `out`; each (k,)."""
+    torch.lerp(center, u, t, out=out)
+    distance = (out - center).abs()
+    max_distance = ((u - center) * t).abs()
+    is_too_far = distance > max_distance
+    rounded_inwards = torch.nextafter(out, center)
+    torch.where(is_too_far, rounded_inwards, out, out=out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -749,25 +845,12 @@ class SampleSequence:
         Raises:
             InputError: an unknown sampler, or too many dimensions for it.
         """
-        if sampler not in SAMPLERS:
-            raise InputError(
-                f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}"
-            )
-        if sampler == "sobol" and dimensions > MAX_DIMENSIONS:
-            raise InputError(
-                f"`sampler` sobol: expected at most {MAX_DIMENSIONS} numbers to draw, "
-                f"got {dimensions}; use `sampler=random`"
-            )
+        _check_sampler(sampler, dimensions)
         self.dimensions = dimensions
         self._sampler = sampler
         self._seed = seed
         self._name = name
-        # Points are computed in blocks of equally many rows, one for each point. A
-        # block has at most `MAX_BLOCK_VALUES` values, and no more points than a net.
-        max_rows_of_values = MAX_BLOCK_VALUES // max(1, dimensions)
-        max_rows = max(1, min(POINTS_PER_NET, max_rows_of_values))
-        # rounded down to a power of two, so that a net is divided into full blocks
-        self._rows = 1 << (max_rows.bit_length() - 1)
+        self._rows = _count_rows_of_block(dimensions)
         self._block_index = -1  # none is loaded yet
         self._block = np.empty((0, dimensions))
         self._engine: Any = None
@@ -811,26 +894,56 @@ class SampleSequence:
     def _sample_sobol(self, block_index: int) -> Float64Array:
         """Return a block of points of a scrambled Sobol net, (rows, dimensions).
 
+        Points of the net before the block are skipped.
+        """
+        # A block never crosses the end of a net.
+        first_point = block_index * self._rows
+        net_index, first_row = divmod(first_point, POINTS_PER_NET)
+        self._load_engine(net_index, first_row)
+        if first_row > self._n_sampled:
+            self._engine.fast_forward(first_row - self._n_sampled)
+        self._n_sampled = first_row + self._rows
+        return np.asarray(self._engine.random(self._rows))
+
+    def _load_engine(self, net_index: int, first_row: int) -> None:
+        """Get an engine of a Sobol net that has not gone past a row of the net.
+
         SciPy's engine generates the points of a net in order. It continues if it has
-        not reached this block yet; otherwise a new one begins. Points before the block
-        are skipped.
+        not reached this row yet; otherwise a new one begins.
         """
         # imported here, as it takes a quarter of a second and few runs need it
         from scipy.stats import qmc
 
-        # A block never crosses the end of a net.
-        first_point = block_index * self._rows
-        net_index, first_row = divmod(first_point, POINTS_PER_NET)
         is_behind = first_row < self._n_sampled  # the engine only goes forward
         if net_index != self._net or self._engine is None or is_behind:
             seed = derive_seed(self._seed, self._name, net_index)
             self._engine = qmc.Sobol(self.dimensions, scramble=True, seed=seed)
             self._net = net_index
             self._n_sampled = 0
-        if first_row > self._n_sampled:
-            self._engine.fast_forward(first_row - self._n_sampled)
-        self._n_sampled = first_row + self._rows
-        return np.asarray(self._engine.random(self._rows))
+
+
+def _check_sampler(sampler: str, dimensions: int) -> None:
+    """Raise InputError if a sampler is unknown, or cannot draw so many numbers."""
+    if sampler not in SAMPLERS:
+        raise InputError(
+            f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}"
+        )
+    if sampler == "sobol" and dimensions > MAX_DIMENSIONS:
+        raise InputError(
+            f"`sampler` sobol: expected at most {MAX_DIMENSIONS} numbers to draw, "
+            f"got {dimensions}; use `sampler=random`"
+        )
+
+
+def _count_rows_of_block(dimensions: int) -> int:
+    """Return the number of points of a block, one for each row.
+
+    A block has at most `MAX_BLOCK_VALUES` values, and no more points than a net.
+    """
+    max_rows_of_values = MAX_BLOCK_VALUES // max(1, dimensions)
+    max_rows = max(1, min(POINTS_PER_NET, max_rows_of_values))
+    # rounded down to a power of two, so that a net is divided into full blocks
+    return 1 << (max_rows.bit_length() - 1)
 
 
 class SeedSequence:

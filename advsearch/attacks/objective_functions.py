@@ -195,6 +195,16 @@ def _sort_logits(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, T
     Raises:
         InputError: there are fewer than two other classes.
     """
+    _check_other_classes(group, setting)
+    merged_logit = compute_largest_logit(logits, group)[:, None]
+    all_logits = torch.cat([merged_logit, logits[:, ~group]], dim=1)
+    top_logits = all_logits.topk(min(4, all_logits.shape[1]), dim=1).values
+    spread = top_logits[:, 0] - all_logits.amin(dim=1)
+    return top_logits, spread
+
+
+def _check_other_classes(group: Tensor, setting: str) -> None:
+    """Raise InputError if fewer than two classes are outside of a group (C,) bool."""
     n_merged = int(group.sum())
     n_other = int((~group).sum())
     if n_other < 2:
@@ -203,11 +213,6 @@ def _sort_logits(logits: Tensor, group: Tensor, setting: str) -> tuple[Tensor, T
             f"`{setting}`, got {n_other}; "
             "its ratio needs a third logit: use `objective=margin`"
         )
-    merged_logit = compute_largest_logit(logits, group)[:, None]
-    all_logits = torch.cat([merged_logit, logits[:, ~group]], dim=1)
-    top_logits = all_logits.topk(min(4, all_logits.shape[1]), dim=1).values
-    spread = top_logits[:, 0] - all_logits.amin(dim=1)
-    return top_logits, spread
 
 
 def _compute_wide_gap(top_logits: Tensor) -> Tensor:
@@ -338,14 +343,18 @@ def _compute_reference(features: ReadFeatures, clean: Tensor) -> Tensor:
     """Return the mean features (F,) of the clean image, or of several renders of it."""
     with torch.no_grad():
         reference = features(clean if clean.dim() == 4 else clean[None])
-    if reference.dim() != 2:
+    _check_features(reference)
+    return reference.mean(dim=0)
+
+
+def _check_features(features: Tensor) -> None:
+    """Raise InputError if features are not (N, F), or not finite."""
+    if features.dim() != 2:
         raise InputError(
-            "objective: expected features of shape (N, F), got "
-            f"{tuple(reference.shape)}"
+            f"objective: expected features of shape (N, F), got {tuple(features.shape)}"
         )
-    if not bool(torch.isfinite(reference).all()):
+    if not bool(torch.isfinite(features).all()):
         raise InputError(
             "objective: expected finite features of the clean picture, got NaN or "
             "infinity; check that the model predicts it"
         )
-    return reference.mean(dim=0)

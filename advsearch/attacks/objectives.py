@@ -122,14 +122,28 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
         # A function written in C has no signature. By default it gets (output, images,
         # truth), and no further inputs.
         return ObjectiveSignature()
+    _check_takes_output_first(function, signature)
+    requests = _find_requests(signature)
+    _check_binding(function, signature, requests)
+    return requests
+
+
+def _check_takes_output_first(
+    function: Callable[..., Any], signature: inspect.Signature
+) -> None:
+    """Raise InputError if a function takes images first, like a metric."""
     by_position = _list_positional(signature)
-    takes_images_first = bool(by_position) and by_position[0] in IMAGE_PARAMETERS
-    if takes_images_first:  # like a metric
+    if by_position and by_position[0] in IMAGE_PARAMETERS:
         raise InputError(
             f"objective {get_name(function)!r}: its first argument is called "
             f"{by_position[0]!r}, but gets what the "
             "model says; write (output, images, truth)"
         )
+
+
+def _find_requests(signature: inspect.Signature) -> ObjectiveSignature:
+    """Return which arguments a function takes, by the names of its parameters."""
+    by_position = _list_positional(signature)
     # The first two always get output and truth (or images), even if they are called "u"
     # or "inputs".
     requested_inputs = tuple(
@@ -143,14 +157,6 @@ def read_signature(function: Callable[..., Any]) -> ObjectiveSignature:
     )
     other_names = [name for name in by_position if name not in requested_inputs]
     takes_images = has_star_args or _has_image_parameter(other_names)
-    try:
-        _check_arguments(signature, takes_images, requested_inputs)
-    except TypeError as error:
-        raise InputError(
-            f"objective {get_name(function)!r}: expected a function that takes "
-            "(output, images, truth) or (output, labels), and beside them any of "
-            f"{', '.join(REQUESTABLE_INPUTS)} by name: {error}"
-        ) from None
     return ObjectiveSignature(takes_images, requested_inputs)
 
 
@@ -164,19 +170,29 @@ def _list_positional(signature: inspect.Signature) -> list[str]:
     ]
 
 
-def _check_arguments(
-    signature: inspect.Signature, takes_images: bool, requested_inputs: Iterable[str]
+def _check_binding(
+    function: Callable[..., Any],
+    signature: inspect.Signature,
+    requests: ObjectiveSignature,
 ) -> None:
-    """Raise TypeError if a function can't be called as an objective is.
+    """Raise InputError if a function can't be called as an objective is.
 
     Args:
-        signature: signature of the function.
-        takes_images: whether it is called with (output, images, truth), otherwise with
-            (output, labels).
-        requested_inputs: names of the inputs that are passed by keyword as well.
+        function: the function.
+        signature: its signature.
+        requests: how it is called: with (output, images, truth) or (output, labels),
+            and with the requested inputs by keyword.
     """
-    n_positional = 3 if takes_images else 2
-    signature.bind(*([None] * n_positional), **dict.fromkeys(requested_inputs))
+    n_positional = 3 if requests.takes_images else 2
+    by_keyword = dict.fromkeys(requests.requested_inputs)
+    try:
+        signature.bind(*([None] * n_positional), **by_keyword)
+    except TypeError as error:
+        raise InputError(
+            f"objective {get_name(function)!r}: expected a function that takes "
+            "(output, images, truth) or (output, labels), and beside them any of "
+            f"{', '.join(REQUESTABLE_INPUTS)} by name: {error}"
+        ) from None
 
 
 def _has_image_parameter(names: Sequence[str]) -> bool:
@@ -221,51 +237,96 @@ def wrap_objective(function: Callable[..., Tensor]) -> Objective:
         InputError: (when the objective is called) the result has a wrong type or shape,
             or does not depend on the arguments differentiably.
     """
-    function_name = get_name(function)
-    signature = read_signature(function)
+    return _UserObjective(get_name(function), function, read_signature(function))
 
-    def objective(
+
+@dataclass(frozen=True, eq=False)
+class _UserObjective:
+    """A user's function as an objective: it is called with what it requests, and what
+    it returns is checked.
+
+    Attributes:
+        name: name of the function, for messages.
+        function: the function.
+        signature: which arguments it takes.
+    """
+
+    name: str
+    function: Callable[..., Tensor]
+    signature: ObjectiveSignature
+
+    def __call__(
+        self,
         output: Any,
         images: Tensor,
         truth: Any,
         read_input: ReadInput = reject_inputs,
         /,
     ) -> Tensor:
-        """Call the function with what it requests, and check what it returns, (N,)."""
-        inputs = {name: read_input(name) for name in signature.requested_inputs}
+        """Return the values (N,) of the function."""
+        inputs = {name: read_input(name) for name in self.signature.requested_inputs}
         count = images.shape[0]
-        labels = truth_to_labels(truth, output, count)
-        arguments = (
-            (output, images, labels) if signature.takes_images else (output, labels)
-        )
-        argument_copies = copy_value(arguments)
+        argument_copies = self._copy_arguments(output, images, truth)
         input_copies = copy_value(inputs)
+        result = self._call_function(argument_copies, input_copies)
+        is_scalar = isinstance(result, Tensor) and result.ndim == 0
+        if is_scalar and count > 1:
+            # This calls the objective again, with a count of 1.
+            result = _evaluate_each_image(self, output, images, truth, inputs)
+        values = _check_values(self.name, result, count)
+        if values.requires_grad and _are_written_into((argument_copies, input_copies)):
+            self._check_backward_pass(values, output, images, inputs)
+        # values without a gradient, though an argument has one, are an error
+        _check_keeps_gradient(self.name, values, (images, output, *inputs.values()))
+        return values
+
+    def _copy_arguments(
+        self, output: Any, images: Tensor, truth: Any
+    ) -> tuple[Any, ...]:
+        """Return copies of the arguments that the function takes by position.
+
+        Args:
+            output: output of the model for N images.
+            images: (N, H, W, 3).
+            truth: what is right for all images.
+        """
+        labels = truth_to_labels(truth, output, count=images.shape[0])
+        takes_images = self.signature.takes_images
+        arguments = (output, images, labels) if takes_images else (output, labels)
+        copies: tuple[Any, ...] = copy_value(arguments)
+        return copies
+
+    def _call_function(
+        self, arguments: tuple[Any, ...], inputs: Mapping[str, Any]
+    ) -> Any:
+        """Return what the function returns; its last argument are the labels.
+
+        Raises:
+            InputError: it is a loss of torch, and there are several labels.
+        """
+        labels = arguments[-1]
         try:
-            result = function(*argument_copies, **input_copies)
+            return self.function(*arguments, **inputs)
         except TypeError as error:
             if not _is_label_set_rejected(labels, error):
                 raise
             raise InputError(
-                f"objective {function_name!r}: expected one right label for a loss of "
+                f"objective {self.name!r}: expected one right label for a loss of "
                 f"torch, got {len(labels)} (indices "
                 f"{labels}); use those of advsearch.losses, or name one with `label`"
             ) from error
-        is_scalar = isinstance(result, Tensor) and result.ndim == 0
-        if is_scalar and count > 1:
-            # This calls `objective` again, with a count of 1.
-            result = _evaluate_each_image(objective, output, images, truth, inputs)
-        values = _check_values(function_name, result, count)
-        if values.requires_grad and _are_written_into((argument_copies, input_copies)):
-            # The function has changed a copy in place, which may make torch's backward
-            # pass fail. It is tried here, so that the error names the function. The
-            # gradient is by the output and the inputs, or else by the images.
-            sources = _list_differentiable((output, inputs)) or [images]
-            _check_differentiable(function_name, values, sources)
-        # values without a gradient, though an argument has one, are an error
-        _check_keeps_gradient(function_name, values, (images, output, *inputs.values()))
-        return values
 
-    return objective
+    def _check_backward_pass(
+        self, values: Tensor, output: Any, images: Tensor, inputs: Mapping[str, Any]
+    ) -> None:
+        """Raise InputError if torch can't differentiate values with a gradient.
+
+        The function has changed a copy in place, which may make torch's backward pass
+        fail. It is tried here, so that the error names the function. The gradient is by
+        the output and the inputs, or else by the images.
+        """
+        sources = _list_differentiable((output, inputs)) or [images]
+        _check_differentiable(self.name, values, sources)
 
 
 def _are_written_into(copies: Any) -> bool:
@@ -300,11 +361,10 @@ def _evaluate_each_image(
     """
     values = []
     for index in range(images.shape[0]):
-        image_slice = slice(index, index + 1)  # a batch of one
+        batch = slice(index, index + 1)  # a batch of one
         read_input = partial(_select_input, inputs, index)
-        values.append(
-            objective(output[image_slice], images[image_slice], truth, read_input)
-        )
+        value = objective(output[batch], images[batch], truth, read_input)
+        values.append(value)
     return torch.cat(values)
 
 
@@ -382,17 +442,7 @@ def _check_values(name: str, values: Any, count: int) -> Tensor:
     Raises:
         InputError: it is no floating-point tensor of that shape.
     """
-    if not isinstance(values, Tensor):
-        raise InputError(
-            f"objective {name!r}: expected a torch tensor of shape ({count},), got "
-            f"{type(values).__name__}; compute it with torch operations and don't call "
-            ".item(), float() or .numpy()"
-        )
-    if not values.is_floating_point():
-        raise InputError(
-            f"objective {name!r}: expected floating-point values, got {values.dtype}; "
-            "a count or a comparison has no gradient"
-        )
+    _check_floating_point(name, values, count)
     value_per_image: Tensor = values
     # a scalar is the value of a single image
     if values.ndim == 0 and count == 1:
@@ -404,6 +454,23 @@ def _check_values(name: str, values: Any, count: int) -> Tensor:
             "reduce over everything but the first axis"
         )
     return value_per_image
+
+
+def _check_floating_point(name: str, values: Any, count: int) -> None:
+    """Raise InputError if what a user's function returned for `count` images is no
+    tensor of floating-point numbers.
+    """
+    if not isinstance(values, Tensor):
+        raise InputError(
+            f"objective {name!r}: expected a torch tensor of shape ({count},), got "
+            f"{type(values).__name__}; compute it with torch operations and don't call "
+            ".item(), float() or .numpy()"
+        )
+    if not values.is_floating_point():
+        raise InputError(
+            f"objective {name!r}: expected floating-point values, got {values.dtype}; "
+            "a count or a comparison has no gradient"
+        )
 
 
 def truth_to_labels(truth: Any, output: Any, count: int) -> Any:
@@ -685,11 +752,21 @@ def get_objective(
     targeted = task.target is not None
     check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind = _find_kind(objective)
-    if kind is None:
-        function = wrap_objective(objective)  # type: ignore[arg-type]
-        return _orient_objective(
-            function, task, takes_logits_of_task=False, user_function=objective
-        )
+    if kind is not None:
+        return _make_named_objective(kind, task, features, clean)
+    function = wrap_objective(objective)  # type: ignore[arg-type]
+    name = get_name(objective)  # type: ignore[arg-type]
+    return _OrientedObjective(function, task, name if targeted else "")
+
+
+def _make_named_objective(
+    kind: ObjectiveKind, task: Task, features: ReadFeatures | None, clean: Tensor | None
+) -> Objective:
+    """Return a named objective for a task; the arguments are those of `get_objective`.
+
+    Raises:
+        InputError: the objective needs features and got none.
+    """
     if kind.of_task is not None:
         # The objective that the task itself defines has its target and direction
         # already.
@@ -697,13 +774,10 @@ def get_objective(
         return task_objective if _is_built_in(kind) else _pass_copies(task_objective)
     if kind.of_features is not None:
         function = _make_feature_objective(kind, features, clean)
-        takes_logits_of_task = False
-    else:
-        function = _make_output_objective(kind, targeted=targeted)
-        takes_logits_of_task = _must_convert_outputs(task)
-    return _orient_objective(
-        function, task, takes_logits_of_task=takes_logits_of_task, user_function=None
-    )
+        return _OrientedObjective(function, task)
+    function = _make_output_objective(kind, targeted=task.target is not None)
+    converts_output = _must_convert_outputs(task)
+    return _OrientedObjective(function, task, converts_output=converts_output)
 
 
 def _is_built_in(kind: ObjectiveKind) -> bool:
@@ -764,14 +838,9 @@ def _must_convert_outputs(task: Task) -> bool:
     return compares_features or has_nothing_classes
 
 
-def _orient_objective(
-    function: Objective,
-    task: Task,
-    *,
-    takes_logits_of_task: bool,
-    user_function: str | Callable[..., Tensor] | None,
-) -> Objective:
-    """Return an objective that is called with the truth and is to be maximized.
+@dataclass(eq=False)
+class _OrientedObjective:
+    """An objective that is called with the truth and is to be maximized.
 
     So a search need not distinguish targets or minimizing.
 
@@ -781,18 +850,21 @@ def _orient_objective(
       target becomes more likely. This is checked once, in the first call with a
       gradient. A named objective has the right sign.
 
-    Args:
+    Attributes:
         function: function to orient.
         task: task with the target and the direction.
-        takes_logits_of_task: whether the function gets `Task.as_logits` of the output.
-        user_function: the user's function that `function` wraps; None for a named
-            objective.
+        name_to_check: name of a user's function whose sign is not checked yet, else
+            empty.
+        converts_output: whether the function gets `Task.as_logits` of the output.
     """
-    targeted = task.target is not None
-    # set to False by the first call that has checked it
-    must_check_direction = user_function is not None and targeted
 
-    def oriented_objective(
+    function: Objective
+    task: Task
+    name_to_check: str = ""
+    converts_output: bool = False
+
+    def __call__(
+        self,
         output: Any,
         images: Tensor,
         truth: Any,
@@ -800,20 +872,16 @@ def _orient_objective(
         /,
     ) -> Tensor:
         """Return the values (N,) of the function, negated if the task minimizes."""
-        nonlocal must_check_direction
-        labels = task.target if targeted else truth
-        function_output = output
-        if takes_logits_of_task:
-            function_output = task.as_logits(output, labels)
-        values = function(function_output, images, labels, read_input)
+        labels = truth if self.task.target is None else self.task.target
+        converts = self.converts_output
+        function_output = self.task.as_logits(output, labels) if converts else output
+        values = self.function(function_output, images, labels, read_input)
         # it can only be checked if the values have a gradient by the model's output
-        if must_check_direction and _has_slope_by_class(values, output):
-            must_check_direction = False
-            name = get_name(user_function)  # type: ignore[arg-type]
+        if self.name_to_check and _has_slope_by_class(values, output):
+            name = self.name_to_check
+            self.name_to_check = ""
             _warn_of_direction(name, values, output, labels)
-        return -values if task.minimise else values
-
-    return oriented_objective
+        return -values if self.task.minimise else values
 
 
 def _has_slope_by_class(values: Tensor, output: Any) -> bool:
@@ -833,6 +901,23 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
         output: (N, classes) logits.
         target: indices of classes; anything else is not checked.
     """
+    if _falls_with_target(values, output, target):
+        warnings.warn(
+            f"objective {name!r} falls as the target becomes more likely, and an "
+            "objective is maximised: the search walks away from the target. Negate "
+            "it, or take a loss of advsearch.losses that begins with targeted_.",
+            stacklevel=2,
+        )
+
+
+def _falls_with_target(values: Tensor, output: Tensor, target: Any) -> bool:
+    """Return whether the value of every image falls as the target's logits rise.
+
+    Args:
+        values: (N,) values of an objective, with a graph.
+        output: (N, classes) logits.
+        target: indices of classes; False for anything else.
+    """
     # the graph is retained, as the search differentiates it again
     (slope,) = torch.autograd.grad(
         values.sum(), output, retain_graph=True, allow_unused=True
@@ -841,14 +926,8 @@ def _warn_of_direction(name: str, values: Tensor, output: Tensor, target: Any) -
     if isinstance(target, tuple):
         classes = [index for index in target if isinstance(index, int)]
     if slope is None or not classes:
-        return
-    if bool((slope[:, classes].sum(dim=1) < 0.0).all()):
-        warnings.warn(
-            f"objective {name!r} falls as the target becomes more likely, and an "
-            "objective is maximised: the search walks away from the target. Negate "
-            "it, or take a loss of advsearch.losses that begins with targeted_.",
-            stacklevel=2,
-        )
+        return False
+    return bool((slope[:, classes].sum(dim=1) < 0.0).all())
 
 
 def check_objective(
@@ -877,6 +956,16 @@ def check_objective(
             "minimise: expected no `target` beside it; to make the object easier to "
             "recognise as something else, give that as `label`"
         )
+    _check_exists(objective)
+    kind = _find_kind(objective)
+    if kind is not None:
+        _check_kind(kind, task, targeted=targeted, minimise=minimise)
+    else:  # a function: this raises if it takes other arguments
+        read_signature(objective)  # type: ignore[arg-type]
+
+
+def _check_exists(objective: object) -> None:
+    """Raise InputError if it is neither the name of an objective nor a function."""
     if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
         hint = (
             "From Python, objective= also takes a function (output, images, truth), "
@@ -888,11 +977,6 @@ def check_objective(
             "objective: expected a name or a function (output, images, "
             f"truth), got {objective!r}"
         )
-    kind = _find_kind(objective)
-    if kind is not None:
-        _check_kind(kind, task, targeted=targeted, minimise=minimise)
-    else:  # a function: this raises if it takes other arguments
-        read_signature(objective)  # type: ignore[arg-type]
 
 
 def _check_kind(
@@ -912,19 +996,22 @@ def _check_kind(
             f"objective: expected an objective of task {task} ({', '.join(fitting)}), "
             f"got {kind.name}, which takes outputs of {kind.task}"
         )
-    if kind.needs_features and (targeted or minimise):
-        # An objective of features is a distance from the clean image, which can only be
-        # maximized.
-        if targeted:
-            setting = "target"
-            reason = "it leads away from the clean image, to no class in particular"
-        else:
-            setting = "minimise"
-            reason = "its minimum is at the start already"
-        raise InputError(
-            f"{setting}: expected `objective` {' or '.join(OBJECTIVES)}, "
-            f"got {kind.name}; {reason}"
-        )
+    # An objective of features is a distance from the clean image, which can only be
+    # maximized.
+    if kind.needs_features and targeted:
+        reason = "it leads away from the clean image, to no class in particular"
+        raise _make_features_error(kind, "target", reason)
+    if kind.needs_features and minimise:
+        reason = "its minimum is at the start already"
+        raise _make_features_error(kind, "minimise", reason)
+
+
+def _make_features_error(kind: ObjectiveKind, setting: str, reason: str) -> InputError:
+    """Return the error of a setting that an objective of features can't have."""
+    return InputError(
+        f"{setting}: expected `objective` {' or '.join(OBJECTIVES)}, "
+        f"got {kind.name}; {reason}"
+    )
 
 
 def list_requested_inputs(objective: str | Callable[..., Tensor]) -> tuple[str, ...]:

@@ -223,18 +223,11 @@ def search(
     """
     _check_limits(steps, candidates, repeats, max_extra_repeats, seconds)
     started = time.perf_counter()
-    log = _Log(
-        evaluate,
-        domain,
-        on_step,
-        # without a ranking the best candidate is stored as well: it is the result
-        size=max(1, candidates),
-        kind=kind,
-        render_seed=render_seed,
-    )
+    # without a ranking the best candidate is stored as well: it is the result
+    size = max(1, candidates)
+    log = _Log(evaluate, domain, on_step, size, kind, render_seed)
     if is_out_of_time is None:
-        deadline = math.inf if seconds is None else started + seconds
-        is_out_of_time = _make_deadline_check(deadline)
+        is_out_of_time = _make_deadline_check(started, seconds)
     try:
         with reraise_lost_interrupt():
             stopped = _explore(log, policy, steps, seed, is_out_of_time)
@@ -249,8 +242,14 @@ def search(
     return _make_result(log, stopped, time.perf_counter() - started)
 
 
-def _make_deadline_check(deadline: float) -> IsOutOfTime:
-    """Return a function that says whether `time.perf_counter` has passed a deadline."""
+def _make_deadline_check(started: float, seconds: float | None) -> IsOutOfTime:
+    """Return a function that says whether a search has taken more than some seconds.
+
+    Args:
+        started: when it began, as `time.perf_counter` counts.
+        seconds: its time limit; None for no limit.
+    """
+    deadline = math.inf if seconds is None else started + seconds
     return lambda n_evaluations: time.perf_counter() >= deadline
 
 
@@ -297,24 +296,19 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         stopped: why the search stopped.
         seconds: seconds that the search took.
     """
-    # without a success, so that nothing is claimed
-    best = Candidate(log.domain.start, objective=math.nan, success=False)
-    if log.pool:  # else nothing could be evaluated
-        best = select_best(log.pool)
+    best = _choose_best(log)
     # mean of the renders in the ranking, of which one may be -inf
-    best_objective = math.nan
-    if math.isfinite(best.mean_objective):
-        best_objective = best.mean_objective
+    is_finite = math.isfinite(best.mean_objective)
     is_claimed = best.success_rate >= 0.5 and stopped is not Ending.INTERRUPTED
     result = SearchResult(
         best_u=best.u,
-        best_objective=best_objective,
+        best_objective=best.mean_objective if is_finite else math.nan,
         claimed_objective=best.objective,  # of its first render
         success_rate=best.success_rate,
         ending=Ending.FOUND if is_claimed else stopped,
         stopped=stopped,
-        history=tuple(record for record in log.records if record.phase == "search"),
-        ranking=tuple(record for record in log.records if record.phase == "ranking"),
+        history=log.list_records("search"),
+        ranking=log.list_records("ranking"),
         renders=log.renders,
         gradients=log.gradients,
         non_finite_objectives=log.non_finite,
@@ -323,6 +317,14 @@ def _make_result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         agreement=tuple(log.agreement),
     )
     return _add_policy_findings(result, log)
+
+
+def _choose_best(log: _Log) -> Candidate:
+    """Return the best candidate; the start, without a success, if there is none."""
+    if log.pool:
+        return select_best(log.pool)
+    # Nothing could be evaluated. Without a success, nothing is claimed.
+    return Candidate(log.domain.start, objective=math.nan, success=False)
 
 
 def _add_policy_findings(result: SearchResult, log: _Log) -> SearchResult:
@@ -370,6 +372,8 @@ class _Log:
         state: state of the policy, after its latest proposals.
         evaluated_batch: evaluations of these proposals that were not passed to the
             policy yet.
+        latest_non_finite: number of the latest objectives of the search, in a row, that
+            were not finite.
     """
 
     evaluate: Evaluate
@@ -390,6 +394,16 @@ class _Log:
     policy: Policy[Any] | None = None
     state: Any = None
     evaluated_batch: list[tuple[Tensor, Evaluation]] = field(default_factory=list)
+    latest_non_finite: int = 0
+
+    def list_records(self, phase: Phase) -> tuple[StepRecord, ...]:
+        """Return the records of one phase."""
+        return tuple(record for record in self.records if record.phase == phase)
+
+    def begin_batch(self, state: Any) -> None:
+        """Store a state of the policy that has received all evaluations so far."""
+        self.state = state
+        self.evaluated_batch = []
 
     def evaluate_and_record(
         self, proposals: Sequence[Proposal], indices: Sequence[int], phase: Phase
@@ -408,20 +422,39 @@ class _Log:
         """
         started = time.perf_counter()
         queries = self._make_queries(proposals, indices, phase)
+        raw_evaluations = self.evaluate(queries)
         for proposal, query, raw in zip(
-            proposals, queries, self.evaluate(queries), strict=True
+            proposals, queries, raw_evaluations, strict=True
         ):
             seconds = time.perf_counter() - started
             _check_evaluation(raw, proposal, self.domain)
             evaluation = raw.sanitize()
-            self._count(proposal, evaluation, phase)
-            self.records.append(self._make_record(proposal, query, evaluation, seconds))
-            self._measure_agreement(evaluation.gradient)
-            if self.on_step is not None:
-                # copies, as the callback may write into the tensors
-                self.on_step(self.records[-1], *copy_value((proposal.u, evaluation)))
+            self._record_evaluation(proposal, query, evaluation, seconds)
+            self._report_latest_record(proposal.u, evaluation)
             yield evaluation
             started = time.perf_counter()
+
+    def _record_evaluation(
+        self, proposal: Proposal, query: Query, evaluation: Evaluation, seconds: float
+    ) -> None:
+        """Count an evaluation, append its record, and compare its gradient.
+
+        Args:
+            proposal: proposal of the policy.
+            query: query that was made of the proposal.
+            evaluation: its evaluation, sanitized.
+            seconds: seconds that the evaluation took.
+        """
+        assert query.phase is not None
+        self._count(proposal, evaluation, query.phase)
+        self.records.append(self._make_record(proposal, query, evaluation, seconds))
+        self._measure_agreement(evaluation.gradient)
+
+    def _report_latest_record(self, u: Tensor, evaluation: Evaluation) -> None:
+        """Call `on_step`, if there is one, with the latest record and its evaluation."""
+        if self.on_step is not None:
+            # copies, as the callback may write into the tensors
+            self.on_step(self.records[-1], *copy_value((u, evaluation)))
 
     def _make_queries(
         self, proposals: Sequence[Proposal], seed_indices: Sequence[int], phase: Phase
@@ -433,21 +466,33 @@ class _Log:
             seed_indices: index of the seed of each proposal in the search's stream.
             phase: "search" or "ranking".
         """
-        queries = list[Query]()
-        for record_index, (proposal, seed_index) in enumerate(
-            zip(proposals, seed_indices, strict=True), start=len(self.records)
-        ):
-            query = Query(
-                proposal.u.clone(),
-                seed=derive_seed(self.render_seed, self.kind, seed_index),
-                kind=self.kind,
-                row_index=record_index,
-                phase=phase,
-                gradient=proposal.gradient,
-                samples=proposal.samples,
-            )
-            queries.append(query)
-        return queries
+        first_record = len(self.records)
+        pairs = zip(proposals, seed_indices, strict=True)
+        return [
+            self._make_proposal_query(proposal, seed_index, record_index, phase)
+            for record_index, (proposal, seed_index) in enumerate(pairs, first_record)
+        ]
+
+    def _make_proposal_query(
+        self, proposal: Proposal, seed_index: int, record_index: int, phase: Phase
+    ) -> Query:
+        """Return the query of a proposal.
+
+        Args:
+            proposal: proposal to evaluate.
+            seed_index: index of its seed in the search's stream.
+            record_index: index of the record that its evaluation will have.
+            phase: "search" or "ranking".
+        """
+        return Query(
+            proposal.u.clone(),
+            seed=derive_seed(self.render_seed, self.kind, seed_index),
+            kind=self.kind,
+            row_index=record_index,
+            phase=phase,
+            gradient=proposal.gradient,
+            samples=proposal.samples,
+        )
 
     def _count(self, proposal: Proposal, evaluation: Evaluation, phase: Phase) -> None:
         """Count the costs of an evaluation, and update the best and the candidates.
@@ -486,9 +531,6 @@ class _Log:
             evaluation: its evaluation, sanitized.
             seconds: seconds that the evaluation took.
         """
-        objective = math.nan
-        if evaluation.is_finite:
-            objective = evaluation.objective
         gradient_norm = math.nan
         if evaluation.gradient is not None:
             gradient_norm = float(evaluation.gradient.norm())
@@ -497,7 +539,7 @@ class _Log:
             step=query.row_index,
             seed=query.seed,
             phase=query.phase,
-            objective=objective,
+            objective=evaluation.objective if evaluation.is_finite else math.nan,
             best=self.best_objective,
             success=evaluation.success,
             step_size=proposal.step_size,
@@ -552,32 +594,66 @@ def _explore(
     policy = wrap_choices(policy, log.domain)
     log.policy = policy
     state = policy.start(log.domain, generator, steps)
-    n_non_finite = 0  # in a row
-    max_batch = max_batch_size(log.domain.dim)
     while log.renders < steps:
-        max_proposals = min(max_batch, steps - log.renders)
-        proposals, state = policy.propose(state, max_proposals)
-        if not proposals:
+        renders_left = steps - log.renders
+        batch, state = _propose_batch(policy, state, log.domain, renders_left, name)
+        if not batch:
             return Ending.STALLED
-        _check_proposals(proposals, max_proposals, log.domain, name)
-        batch = _limit_batch(proposals, log.domain, renders_left=steps - log.renders)
-        log.state = state
-        log.evaluated_batch = []
-        # An evaluation may take several renders, so seeds follow from their own count.
-        first_index = len(log.records)
-        seed_indices = range(first_index, first_index + len(batch))
-        evaluations = log.evaluate_and_record(batch, seed_indices, "search")
-        for proposal, evaluation in zip(batch, evaluations, strict=True):
-            log.evaluated_batch.append((proposal.u, evaluation))
-            n_non_finite = 0 if evaluation.is_finite else n_non_finite + 1
-            if n_non_finite == NON_FINITE_LIMIT:
-                return Ending.NON_FINITE
-            if is_out_of_time(len(log.records)):
-                return Ending.BUDGET_SPENT
+        # the state that an interrupted search makes its result from
+        log.begin_batch(state)
+        ending = _evaluate_proposals(log, batch, is_out_of_time)
+        if ending is not None:
+            return ending
         state = policy.update(state, log.evaluated_batch)
-        log.state = state
-        log.evaluated_batch = []
+        log.begin_batch(state)
     return Ending.BUDGET_SPENT
+
+
+def _propose_batch(
+    policy: Policy[Any], state: Any, domain: Domain, renders_left: int, name: str
+) -> tuple[list[Proposal], Any]:
+    """Return the next proposals that the renders can pay, and the policy's new state.
+
+    There are none if the policy has nothing more to propose.
+
+    Args:
+        policy: policy that proposes.
+        state: state of the policy.
+        domain: domain of the search.
+        renders_left: number of renders that the budget has left, at least 1.
+        name: name of the policy, for messages.
+
+    Raises:
+        RuntimeError: a proposal breaks the contract of a policy, which is a bug.
+    """
+    max_proposals = min(max_batch_size(domain.dim), renders_left)
+    proposals, state = policy.propose(state, max_proposals)
+    if not proposals:
+        return [], state
+    _check_proposals(proposals, max_proposals, domain, name)
+    return _limit_batch(proposals, domain, renders_left), state
+
+
+def _evaluate_proposals(
+    log: _Log, batch: Sequence[Proposal], is_out_of_time: IsOutOfTime
+) -> Ending | None:
+    """Evaluate a batch of proposals; return why the search ends, or None.
+
+    The evaluations are added to the log one by one.
+    """
+    # An evaluation may take several renders, so seeds follow from their own count.
+    first_index = len(log.records)
+    seed_indices = range(first_index, first_index + len(batch))
+    evaluations = log.evaluate_and_record(batch, seed_indices, "search")
+    for proposal, evaluation in zip(batch, evaluations, strict=True):
+        log.evaluated_batch.append((proposal.u, evaluation))
+        is_finite = evaluation.is_finite
+        log.latest_non_finite = 0 if is_finite else log.latest_non_finite + 1
+        if log.latest_non_finite == NON_FINITE_LIMIT:
+            return Ending.NON_FINITE
+        if is_out_of_time(len(log.records)):
+            return Ending.BUDGET_SPENT
+    return None
 
 
 def _limit_batch(
@@ -719,7 +795,18 @@ def _check_evaluation(
         proposal: proposal that was evaluated.
         domain: states how many renders a gradient costs.
     """
-    gradient = evaluation.gradient
+    _check_returned_gradient(evaluation.gradient, proposal)
+    min_cost = proposal.samples
+    max_cost = proposal.max_cost(domain)
+    if not min_cost <= evaluation.cost <= max_cost:
+        raise RuntimeError(
+            f"evaluate took {evaluation.cost} renders; expected {min_cost} to "
+            f"{max_cost}, by the proposal's samples and the domain's gradient_cost"
+        )
+
+
+def _check_returned_gradient(gradient: Tensor | None, proposal: Proposal) -> None:
+    """Raise RuntimeError if a gradient was requested and is missing or not like u."""
     u = proposal.u
     if proposal.gradient and gradient is None:
         raise RuntimeError("evaluate returned no gradient although one was asked for")
@@ -730,10 +817,3 @@ def _check_evaluation(
                 f"evaluate returned a gradient of {gradient.dtype}, shape "
                 f"{tuple(gradient.shape)}; expected {u.dtype}, shape {tuple(u.shape)}"
             )
-    min_cost = proposal.samples
-    max_cost = proposal.max_cost(domain)
-    if not min_cost <= evaluation.cost <= max_cost:
-        raise RuntimeError(
-            f"evaluate took {evaluation.cost} renders; expected {min_cost} to "
-            f"{max_cost}, by the proposal's samples and the domain's gradient_cost"
-        )

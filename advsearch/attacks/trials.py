@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise, product
 from statistics import fmean
 
@@ -98,34 +99,57 @@ def make_margin_function(
         draws_conditions: whether each seed also samples conditions (e.g. the weather);
             otherwise the scene's own conditions hold.
     """
-    n_rendered = Counter[int]()
+    return _MarginRenderer(evaluate, kind, u, n_images, draws_conditions)
 
-    def margins(spp: int, seeds: Sequence[int]) -> list[float]:
+
+@dataclass(eq=False)
+class _MarginRenderer:
+    """Renders a configuration and returns its margins.
+
+    Attributes:
+        evaluate: renders queries and yields their evaluations.
+        kind: kind of the queries, which are numbered across all sample counts.
+        u: (d,) the configuration.
+        n_images: number of renders at each sample count, the first ones, whose images
+            are requested.
+        draws_conditions: whether each seed also samples conditions.
+        n_rendered: number of renders so far, by their samples per pixel.
+    """
+
+    evaluate: Evaluate
+    kind: str
+    u: Tensor
+    n_images: int
+    draws_conditions: bool
+    n_rendered: Counter[int] = field(default_factory=Counter)
+
+    def __call__(self, spp: int, seeds: Sequence[int]) -> list[float]:
         """Return the margin of one render for each seed.
 
-        Calls are counted in `n_rendered`: a later call with the same `spp` continues
-        the numbering, so that only the first `n_images` renders request an image.
+        A later call with the same `spp` continues the numbering, so that only the first
+        `n_images` renders request an image.
         """
-        first_render = n_rendered[spp]  # at this sample count
-        first_query = n_rendered.total()  # at all sample counts
-        n_rendered[spp] += len(seeds)
-        queries = [
-            Query(
-                u,
-                seed,
-                kind,
-                row_index=first_query + offset,
-                spp=spp,
-                draws_conditions=draws_conditions,
-                includes_image=first_render + offset < n_images,
-            )
-            for offset, seed in enumerate(seeds)
-        ]
-        return [
-            -evaluation.required_judgement.score for evaluation in evaluate(queries)
-        ]
+        first_render = self.n_rendered[spp]  # at this sample count
+        first_query = self.n_rendered.total()  # at all sample counts
+        self.n_rendered[spp] += len(seeds)
+        queries = []
+        for offset, seed in enumerate(seeds):
+            query = self._make_margin_query(spp, seed, first_query + offset)
+            includes_image = first_render + offset < self.n_images
+            queries.append(replace(query, includes_image=includes_image))
+        evaluations = self.evaluate(queries)
+        return [-evaluation.required_judgement.score for evaluation in evaluations]
 
-    return margins
+    def _make_margin_query(self, spp: int, seed: int, row_index: int) -> Query:
+        """Return the query of one render, without an image."""
+        return Query(
+            self.u,
+            seed,
+            self.kind,
+            row_index=row_index,
+            spp=spp,
+            draws_conditions=self.draws_conditions,
+        )
 
 
 @dataclass(frozen=True)
@@ -221,11 +245,7 @@ def choose_spp(
     Raises:
         InputError: the ladder is empty, not rising, or has a count below 1.
     """
-    if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
-        raise InputError(
-            "verify_spp: expected rising sample counts of at least 1, "
-            f"got {list(ladder)}"
-        )
+    _check_ladder(ladder)
     if len(ladder) == 1:
         return SampleCount(ladder[0], converged=False, table=(), renders=0)
     table = list[Rung]()
@@ -236,22 +256,44 @@ def choose_spp(
     for name, render in margins.items():
         # for each rung that was rendered, which are the first ones of the ladder
         margins_of_rungs = _climb_ladder(render, seed, ladder, look_sizes, trials)
-        below: list[float] = []  # margins of the rung below; the first has none
-        for spp, at_rung in zip(ladder, margins_of_rungs, strict=False):
-            row = _summarize_rung(
-                name, spp, at_rung, below, looks=len(look_sizes), trials=trials
-            )
-            table.append(row)
-            below = at_rung
+        table += _summarize_rungs(name, ladder, margins_of_rungs, trials)
         n_renders += sum(map(len, margins_of_rungs))
-        highest_rung = max(highest_rung, len(margins_of_rungs) - 1)
         if not table[-1].is_settled:
-            return SampleCount(
-                ladder[-1], converged=False, table=tuple(table), renders=n_renders
-            )
-    return SampleCount(
-        ladder[highest_rung], converged=True, table=tuple(table), renders=n_renders
-    )
+            return SampleCount(ladder[-1], False, tuple(table), n_renders)
+        highest_rung = max(highest_rung, len(margins_of_rungs) - 1)
+    return SampleCount(ladder[highest_rung], True, tuple(table), n_renders)
+
+
+def _check_ladder(ladder: Sequence[int]) -> None:
+    """Raise InputError if a ladder is empty, not rising, or has a count below 1."""
+    if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
+        raise InputError(
+            "verify_spp: expected rising sample counts of at least 1, "
+            f"got {list(ladder)}"
+        )
+
+
+def _summarize_rungs(
+    name: str,
+    ladder: Sequence[int],
+    margins_of_rungs: Sequence[Sequence[float]],
+    trials: int,
+) -> list[Rung]:
+    """Return a row for each sample count at which a configuration was rendered.
+
+    Args:
+        name: name of the configuration.
+        ladder: sample counts; those that were rendered are the first ones.
+        margins_of_rungs: margins at each of these.
+        trials: number of trials that will follow, see `_is_settled`.
+    """
+    n_looks = len(list_look_sizes(trials))
+    rows = []
+    below: Sequence[float] = ()  # margins of the rung below; the first has none
+    for spp, at_rung in zip(ladder, margins_of_rungs, strict=False):
+        rows.append(_summarize_rung(name, spp, at_rung, below, n_looks, trials))
+        below = at_rung
+    return rows
 
 
 def _summarize_rung(
@@ -274,11 +316,8 @@ def _summarize_rung(
     """
     mean = fmean(at_rung)
     # distance of the mean from its one-sided confidence bound
-    half_width = (
-        _compute_quantile(len(at_rung), looks)
-        * _compute_deviation(at_rung)
-        / math.sqrt(len(at_rung))
-    )
+    quantile = _compute_quantile(len(at_rung), looks)
+    half_width = quantile * _compute_deviation(at_rung) / math.sqrt(len(at_rung))
     is_first_rung = not below
     if is_first_rung:
         return Rung(name, spp, mean, half_width, drift=math.nan, is_settled=False)
@@ -311,26 +350,48 @@ def _climb_ladder(
     """
     margins_of_rungs: list[list[float]] = [[] for _ in ladder]
     n_looks = len(look_sizes)  # at each rung
+    for rung, count in _iterate_promising_looks(margins_of_rungs, ladder, look_sizes):
+        seeds = _derive_look_seeds(seed, count)
+        for index in (rung - 1, rung):
+            _render_missing(margins_of_rungs[index], margins, ladder[index], seeds)
+        at_rung = margins_of_rungs[rung]
+        if _is_settled(at_rung, margins_of_rungs[rung - 1], n_looks, trials):
+            break
+    return [margins_of_rung for margins_of_rung in margins_of_rungs if margins_of_rung]
 
-    def may_settle(rung: int, count: int) -> bool:
-        return _may_settle(margins_of_rungs, ladder, rung, count, n_looks)
 
-    # (index of the rung, number of renders there), in order; the first rung has no look
-    looks = list(product(range(1, len(ladder)), look_sizes))
+def _iterate_promising_looks(
+    margins_of_rungs: Sequence[list[float]],
+    ladder: Sequence[int],
+    look_sizes: Sequence[int],
+) -> Iterator[tuple[int, int]]:
+    """Yield the looks that may show that a configuration has settled.
+
+    Whether a look may show it depends on the margins at the moment when the look is
+    requested. The iteration ends when no remaining look may.
+
+    Args:
+        margins_of_rungs: margins at each rung; the caller adds new ones meanwhile.
+        ladder: samples per pixel of the rungs, ascending.
+        look_sizes: numbers of renders at a rung after which there is a look, ascending.
+
+    Yields:
+        The index of the rung, and the number of renders there.
+    """
+    n_looks = len(look_sizes)
+    may_settle = partial(_may_settle, margins_of_rungs, ladder, n_looks)
+    looks = list(product(range(1, len(ladder)), look_sizes))  # none at the first rung
     for look_index, (rung, count) in enumerate(looks):
         remaining_looks = looks[look_index:]  # including this one
         if not any(may_settle(*look) for look in remaining_looks):
-            break
-        if not may_settle(rung, count):  # but a later look may
-            continue
-        seeds = [derive_seed(seed, "sample count", number) for number in range(count)]
-        below = margins_of_rungs[rung - 1]
-        _render_missing(below, margins, ladder[rung - 1], seeds)
-        at_rung = margins_of_rungs[rung]
-        _render_missing(at_rung, margins, ladder[rung], seeds)
-        if _is_settled(at_rung, below, n_looks, trials):
-            break
-    return [margins_of_rung for margins_of_rung in margins_of_rungs if margins_of_rung]
+            return
+        if may_settle(rung, count):
+            yield rung, count
+
+
+def _derive_look_seeds(seed: int, count: int) -> list[int]:
+    """Return the seeds of the first renders at a rung, the same at all rungs."""
+    return [derive_seed(seed, "sample count", number) for number in range(count)]
 
 
 def _is_settled(
@@ -349,25 +410,41 @@ def _is_settled(
         trials: number of trials that will follow, as in `choose_spp`.
     """
     mean = fmean(at_rung)
-    deviation = _compute_deviation(at_rung)
     # The rung below may have more renders, from an earlier look there.
     count = min(len(at_rung), len(below))
-    # The mean if more samples changed it as much again as the step from the rung below
-    # did, and its standard error.
+    # the mean if more samples changed it as much again as the step from below did
     extrapolated = 2.0 * mean - fmean(below)
-    single_render_error = math.hypot(2.0 * deviation, _compute_deviation(below))
-    extrapolated_error = single_render_error / math.sqrt(count)
-    # With fewer renders than trials, the mean has to exceed the deviation of a single
-    # render, so that the other trials are on the same side, too. With as many renders
-    # as trials, its standard error suffices.
-    are_as_many_as_trials = count == trials
-    mean_error = deviation / math.sqrt(count) if are_as_many_as_trials else deviation
     sign = math.copysign(1.0, mean)
     quantile = _compute_quantile(count, looks)
+    mean_error = _compute_mean_error(at_rung, count, trials)
     is_mean_sure = sign * mean > quantile * mean_error
+    extrapolated_error = _compute_extrapolated_error(at_rung, below, count)
     is_extrapolated_sure = sign * extrapolated > quantile * extrapolated_error
     is_sign_constant = all(sign * value > 0.0 for value in at_rung)
     return is_mean_sure and is_extrapolated_sure and is_sign_constant
+
+
+def _compute_mean_error(at_rung: Sequence[float], count: int, trials: int) -> float:
+    """Return the error that the mean margin of a rung has to exceed.
+
+    With fewer renders than trials, that is the deviation of a single render, so that
+    the other trials are on the same side, too. With as many renders as trials, the
+    standard error of the mean suffices.
+    """
+    deviation = _compute_deviation(at_rung)
+    are_as_many_as_trials = count == trials
+    return deviation / math.sqrt(count) if are_as_many_as_trials else deviation
+
+
+def _compute_extrapolated_error(
+    at_rung: Sequence[float], below: Sequence[float], count: int
+) -> float:
+    """Return the standard error of 2 m - m', with the mean margins of a rung and of the
+    rung below, from `count` renders at each.
+    """
+    deviation = _compute_deviation(at_rung)
+    single_render_error = math.hypot(2.0 * deviation, _compute_deviation(below))
+    return single_render_error / math.sqrt(count)
 
 
 def _render_missing(
@@ -389,55 +466,71 @@ def _render_missing(
 def _may_settle(
     values: Sequence[list[float]],
     ladder: Sequence[int],
+    looks: int,
     rung: int,
     count: int,
-    looks: int,
 ) -> bool:
     """Return whether `count` renders at a rung may show that the margin has settled.
 
     This is an optimistic forecast from the renders so far. The largest mean to be
     expected at the rung is compared with the smallest one that could settle there.
 
-    - Largest: the mean at the last rendered rung, plus its standard error, plus as much
-      again as it changed from the rung below.
-    - Smallest: let m be the mean at the rung, and m' the one at the rung below. To
-      settle, 2 m - m' has to exceed its error (`_is_settled`). It is assumed here that
-      m = m', so that m has to exceed the error. The error follows from the standard
-      deviations of the renders so far. At a rung that was not rendered they are assumed
-      to fall with the square root of the samples.
-
     If margins at the rung have both signs, it cannot settle.
 
     Args:
         values: margins of each rung; an empty list if it was not rendered.
         ladder: samples per pixel of the rungs.
-        rung: index of the rung in `ladder`.
-        count: number of renders at the rung that the look would use.
         looks: number of looks. The probability of an error, 5 %, is divided equally
             among them.
+        rung: index of the rung in `ladder`.
+        count: number of renders at the rung that the look would use.
     """
     rendered_rungs = [index for index in range(rung + 1) if values[index]]
     if not rendered_rungs:
         return True  # nothing is known yet
-    was_rendered = bool(values[rung])
-    if was_rendered and min(values[rung]) <= 0.0 <= max(values[rung]):
+    if _have_both_signs(values[rung]):
         return False
     # The first look renders its rung and the one below, so that two are rendered now.
     last_rung = rendered_rungs[-1]
-    last_values = values[last_rung]
-    values_below = values[rendered_rungs[-2]]
+    max_mean = _forecast_mean(values[last_rung], values[rendered_rungs[-2]])
+    error = _forecast_error(values, ladder, last_rung, rung)
+    quantile = _compute_quantile(count, looks)
+    min_mean = error * quantile / math.sqrt(count)
+    return min_mean <= max_mean
+
+
+def _have_both_signs(margins: Sequence[float]) -> bool:
+    """Return whether some margins are at least 0 and some at most 0; False for none."""
+    return bool(margins) and min(margins) <= 0.0 <= max(margins)
+
+
+def _forecast_mean(
+    last_values: Sequence[float], values_below: Sequence[float]
+) -> float:
+    """Return the largest magnitude of a mean margin to be expected at a later rung.
+
+    It is the mean at the last rendered rung, plus its standard error, plus as much
+    again as it changed from the rung below.
+    """
     mean = fmean(last_values)
     drift = abs(mean - fmean(values_below))
     standard_error = _compute_deviation(last_values) / math.sqrt(len(last_values))
-    max_mean = abs(mean) + drift + standard_error
-    # standard deviation of 2 m - m' for a single render of each
-    single_render_error = math.hypot(
+    return abs(mean) + drift + standard_error
+
+
+def _forecast_error(
+    values: Sequence[list[float]], ladder: Sequence[int], last_rung: int, rung: int
+) -> float:
+    """Return the standard deviation of 2 m - m' for a single render of each.
+
+    Let m be the mean at the rung, and m' the one at the rung below. To settle, 2 m - m'
+    has to exceed its error (`_is_settled`). It is assumed here that m = m', so that m
+    has to exceed the error. The arguments are those of `_estimate_deviation`.
+    """
+    return math.hypot(
         2.0 * _estimate_deviation(values, ladder, last_rung, rung),
         _estimate_deviation(values, ladder, last_rung, rung - 1),
     )
-    quantile = _compute_quantile(count, looks)
-    min_mean = single_render_error * quantile / math.sqrt(count)
-    return min_mean <= max_mean
 
 
 def _estimate_deviation(
@@ -570,23 +663,23 @@ def choose_rate_spp(
     table = list[Rung]()
     # Nothing settles at the rung with index 0, which has none below.
     highest_rung = 1
-    have_settled = True
-    seeds = [
-        derive_seed(seed, "sample count", number) for number in range(N_CONDITIONS)
-    ]
+    seeds = _derive_look_seeds(seed, N_CONDITIONS)
     for name, render in margins.items():
         rungs = _climb_until_settled(name, render, seeds, ladder)
         table += rungs
-        have_settled = rungs[-1].is_settled
-        if not have_settled:
-            break
+        if not rungs[-1].is_settled:
+            return _count_rate_samples(ladder[-1], table, converged=False)
         highest_rung = max(highest_rung, len(rungs) - 1)
-    return SampleCount(
-        ladder[highest_rung] if have_settled else ladder[-1],
-        converged=have_settled,
-        table=tuple(table),
-        renders=N_CONDITIONS * len(table),  # each rung has one under each condition
-    )
+    return _count_rate_samples(ladder[highest_rung], table, converged=True)
+
+
+def _count_rate_samples(
+    spp: int, table: Sequence[Rung], *, converged: bool
+) -> SampleCount:
+    """Return a sample count for a failure rate, with the rows that it was chosen by."""
+    # each row has one render under each condition
+    renders = N_CONDITIONS * len(table)
+    return SampleCount(spp, converged, tuple(table), renders)
 
 
 def _climb_until_settled(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
 
@@ -229,18 +229,24 @@ class VerificationRule:
             return search_ending
         if self.is_already_wrong(clean):
             return Ending.ALREADY_WRONG
-        is_verified = adversarial.n_successes >= self.count_needed_successes(
-            adversarial.n_trials
-        )
-        is_control_right = (
+        n_needed = self.count_needed_successes(adversarial.n_trials)
+        is_verified = adversarial.n_successes >= n_needed
+        if is_verified and self._is_control_right(clean):
+            return Ending.FOUND
+        was_claimed = search_ending is Ending.FOUND
+        return Ending.NOT_VERIFIED if was_claimed else search_ending
+
+    def _is_control_right(self, clean: TrialCounts) -> bool:
+        """Return whether enough clean trials are right.
+
+        Without a control group nothing is needed; nor if conditions vary, as trials
+        with a wrong clean prediction are left out already.
+        """
+        return (
             not self.has_control
             or self.has_varying_conditions
             or clean.n_successes >= self.count_needed_successes(clean.n_trials)
         )
-        if is_control_right and is_verified:
-            return Ending.FOUND
-        was_claimed = search_ending is Ending.FOUND
-        return Ending.NOT_VERIFIED if was_claimed else search_ending
 
 
 WORST_CASE = VerificationRule()
@@ -343,7 +349,6 @@ def run_trials(
         raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
-    done: list[Judgement] = []
     queries = [
         Query(
             u,
@@ -355,6 +360,22 @@ def run_trials(
         )
         for number in range(first_index + n_done, first_index + trials)
     ]
+    return _judge_queries(evaluate, queries, is_decided)
+
+
+def _judge_queries(
+    evaluate: Evaluate,
+    queries: Sequence[Query],
+    is_decided: Callable[[Sequence[Judgement]], bool] | None,
+) -> tuple[Judgement, ...]:
+    """Return the judgements of queries, until no more are needed.
+
+    Args:
+        evaluate: renders the queries and yields their evaluations, one by one.
+        queries: queries of the trials.
+        is_decided: whether no more trials follow, by those so far; None for never.
+    """
+    done: list[Judgement] = []
     for evaluation in evaluate(queries):
         done.append(evaluation.required_judgement)
         # Leaving the loop means that the remaining queries are not evaluated.
@@ -427,77 +448,175 @@ def verify(
             the configuration, the new ones must begin after these.
     """
     looks = (trials,) if isinstance(trials, int) else tuple(trials)
-    has_several_looks = len(looks) > 1
-    # As many adversarial trials are made at least, even if too many have failed sooner.
-    min_trials = rule.min_trials if has_several_looks and not curtailed else 0
     u = domain.project(u)
-    clean_trials = list(clean)
-    done = list[Judgement]()
-
-    def has_failed(new_trials: Sequence[Judgement]) -> bool:
-        """Return whether too many trials fail for the claim to hold at any look."""
-        all_trials = [*done, *new_trials]
-        # largest number of trials that may count in the end
-        n_total = looks[-1] if has_several_looks else rule.count_valid(clean_trials)
-        has_too_many = _fails_too_often(rule, all_trials, clean_trials, n_total)
-        return len(all_trials) >= min_trials and has_too_many
-
+    groups = _Groups(rule, looks, spp, curtailed, list(clean))
     run = partial(run_trials, evaluate, spp=spp, seed=seed, first_index=first_index)
-    run_clean = partial(run, domain.start, kind=control_kind)
-    is_decided = has_failed if curtailed or has_several_looks else None
-    for look in looks:
-        # Clean trials come first: they say which adversarial trials will count.
-        # `count` is the number of trials of each group at this look.
-        count = _extend_clean_trials(clean_trials, run_clean, rule, look, looks[-1])
-        done += run(
-            u,
-            trials=count,
-            n_done=len(done),
-            kind=kind,
-            n_images=n_images,
-            is_decided=is_decided,
-        )
-        is_early = count < looks[-1]  # whether trials may follow
-        is_success = _is_found(
-            rule, done, clean_trials, count, spp=spp, is_early=is_early
-        )
-        # `run` stops before `count` trials if too many of them failed.
-        was_curtailed = len(done) < count
-        if was_curtailed or has_failed(()) or is_success or not is_early:
-            break
-    # as many trials as were requested, and no look before
-    is_complete = not has_several_looks and len(done) == looks[0]
-    return _summarize_trials(
-        rule,
-        claim,
-        u,
-        clean_trials,
-        done,
-        spp=spp,
-        confidence=_choose_confidence(rule, has_several_looks=has_several_looks),
-        renders=len(done) + len(clean_trials) - len(clean),  # without those of `clean`
-        stop_reason="asked for" if is_complete else "decided",
-        is_early=is_success and is_early,
-        first_index=first_index,
+    groups.run_until_verdict(
+        run_clean=partial(run, domain.start, kind=control_kind),
+        run_adversarial=partial(run, u, kind=kind, n_images=n_images),
     )
+    verification = _summarize_trials(groups, claim, u)
+    # without those of `clean`
+    renders = len(groups.trials) + len(groups.clean_trials) - len(clean)
+    return replace(verification, renders=renders, first_index=first_index)
 
 
-def _fails_too_often(
-    rule: VerificationRule,
-    trials: Sequence[Judgement],
-    clean_trials: Sequence[Judgement],
-    n_total: int,
-) -> bool:
-    """Return whether more trials have failed than the rule allows of `n_total` trials.
+@dataclass(eq=False)
+class _Groups:
+    """The trials of the adversarial and of the clean configuration, while they are run.
 
-    Args:
-        rule: says what a failure is, and how many are allowed.
-        trials: trials of the adversarial configuration so far.
-        clean_trials: clean trials of the same seeds, or more.
-        n_total: number of trials that there may be in the end.
+    Attributes:
+        rule: decides what counts as a success.
+        looks: numbers of trials after which there may be a verdict, ascending.
+        spp: samples per pixel of the trials.
+        curtailed: whether trials end early once too many have failed.
+        clean_trials: trials of the clean configuration so far.
+        trials: trials of the adversarial configuration so far, of the same seeds.
+        min_trials: as many adversarial trials are made at least, even if too many have
+            failed sooner.
+        is_found_early: whether the claim was found at a look before the last one.
     """
-    n_failures = _list_outcomes(rule, trials, clean_trials).count(False)
-    return n_failures > rule.count_allowed_failures(n_total)
+
+    rule: VerificationRule
+    looks: tuple[int, ...]
+    spp: int
+    curtailed: bool
+    clean_trials: list[Judgement]
+    trials: list[Judgement] = field(default_factory=list)
+    min_trials: int = 0
+    is_found_early: bool = False
+
+    def __post_init__(self) -> None:
+        """Compute the smallest number of trials."""
+        if self.has_several_looks and not self.curtailed:
+            self.min_trials = self.rule.min_trials
+
+    @property
+    def has_several_looks(self) -> bool:
+        return len(self.looks) > 1
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there are as many trials as were requested, and no look before."""
+        return not self.has_several_looks and len(self.trials) == self.looks[0]
+
+    def run_until_verdict(
+        self,
+        run_clean: Callable[..., Iterable[Judgement]],
+        run_adversarial: Callable[..., Iterable[Judgement]],
+    ) -> None:
+        """Run trials of both groups until there is a verdict.
+
+        Args:
+            run_clean: runs trials of the clean configuration (`run_trials`).
+            run_adversarial: runs trials of the adversarial configuration.
+        """
+        for look in self.looks:
+            # Clean trials come first: they say which adversarial trials will count.
+            # `count` is the number of trials of each group at this look.
+            count = self._extend_clean_trials(run_clean, look)
+            self._extend_adversarial_trials(run_adversarial, count)
+            if self._has_verdict(count):
+                break
+
+    def _extend_adversarial_trials(
+        self, run_adversarial: Callable[..., Iterable[Judgement]], count: int
+    ) -> None:
+        """Run the missing ones of `count` adversarial trials.
+
+        If trials may end early, there are fewer if too many of them fail.
+
+        Args:
+            run_adversarial: runs trials of the adversarial configuration.
+            count: number of trials in all.
+        """
+        ends_early = self.curtailed or self.has_several_looks
+        is_decided = self.has_failed if ends_early else None
+        n_done = len(self.trials)
+        self.trials += run_adversarial(
+            trials=count, n_done=n_done, is_decided=is_decided
+        )
+
+    def _has_verdict(self, count: int) -> bool:
+        """Return whether no more trials follow a look; set `is_found_early`.
+
+        Args:
+            count: number of trials of each group at this look. There are fewer
+                adversarial trials if too many of them have failed.
+        """
+        is_early = count < self.looks[-1]  # whether trials may follow
+        is_success = self._is_found(count, is_early=is_early)
+        self.is_found_early = is_success and is_early
+        was_curtailed = len(self.trials) < count
+        is_lost = was_curtailed or self.has_failed(())
+        return is_lost or is_success or not is_early
+
+    def has_failed(self, new_trials: Sequence[Judgement]) -> bool:
+        """Return whether too many trials fail for the claim to hold at any look.
+
+        Args:
+            new_trials: trials of the adversarial configuration that are not in `trials`
+                yet.
+        """
+        all_trials = [*self.trials, *new_trials]
+        # largest number of trials that may count in the end
+        n_total = self.looks[-1]
+        if not self.has_several_looks:
+            n_total = self.rule.count_valid(self.clean_trials)
+        outcomes = _list_outcomes(self.rule, all_trials, self.clean_trials)
+        n_allowed = self.rule.count_allowed_failures(n_total)
+        has_too_many = outcomes.count(False) > n_allowed
+        return len(all_trials) >= self.min_trials and has_too_many
+
+    def _extend_clean_trials(
+        self, run_clean: Callable[..., Iterable[Judgement]], look: int
+    ) -> int:
+        """Run clean trials until `look` of them count, or there are as many as the last
+        look allows.
+
+        If conditions vary (weather, viewpoints, ...), a clean trial that is wrong does
+        not count, so another one is run instead.
+
+        Args:
+            run_clean: runs trials of the clean configuration. Like `run_trials` it
+                takes `trials`, the total number, and `n_done`, how many of these are
+                done.
+            look: number of trials that have to count.
+
+        Returns:
+            The number of trials that this look needs, including those that do not
+            count. `clean_trials` may have more than these, from another verification.
+        """
+        # number of trials, of which `look` have to count
+        count = look
+        max_trials = self.looks[-1]
+        while True:
+            # This runs those that are missing, so none if there are enough already.
+            n_done = len(self.clean_trials)
+            self.clean_trials += run_clean(trials=count, n_done=n_done)
+            n_missing = look - self.rule.count_valid(self.clean_trials[:count])
+            if n_missing <= 0 or count >= max_trials:
+                return count
+            count = min(count + n_missing, max_trials)
+
+    def _is_found(self, count: int, *, is_early: bool) -> bool:
+        """Return whether a claim holds at a look.
+
+        Enough trials have to succeed, and the model must not be wrong about the clean
+        configuration already.
+
+        Args:
+            count: number of trials at this look; further clean trials are ignored.
+            is_early: whether more trials could follow.
+        """
+        clean_trials = self.clean_trials[:count]
+        n_valid = self.rule.count_valid(clean_trials)
+        n_needed = self.rule.count_needed_successes(n_valid, early=is_early)
+        outcomes = _list_outcomes(self.rule, self.trials, clean_trials)
+        # wrong in more than half of these trials
+        clean_counts = count_right(clean_trials, self.spp)
+        is_clean_wrong = self.rule.is_already_wrong(clean_counts)
+        return outcomes.count(True) >= n_needed and not is_clean_wrong
 
 
 def _choose_confidence(rule: VerificationRule, *, has_several_looks: bool) -> float:
@@ -511,74 +630,6 @@ def _choose_confidence(rule: VerificationRule, *, has_several_looks: bool) -> fl
         if rule.has_varying_conditions and has_several_looks
         else CONFIDENCE
     )
-
-
-def _extend_clean_trials(
-    clean_trials: list[Judgement],
-    run_clean: Callable[..., Iterable[Judgement]],
-    rule: VerificationRule,
-    look: int,
-    max_trials: int,
-) -> int:
-    """Run clean trials until `look` of them count, or there are `max_trials`.
-
-    If conditions vary (weather, viewpoints, ...), a clean trial that is wrong does not
-    count, so another one is run in its place.
-
-    Args:
-        clean_trials: clean trials so far; new ones are appended.
-        run_clean: runs trials of the clean configuration. Like `run_trials` it takes
-            `trials`, the total number, and `n_done`, how many of these are done.
-        rule: decides which trials count.
-        look: number of trials that have to count.
-        max_trials: maximum number of trials.
-
-    Returns:
-        The number of trials that this look needs, including those that do not count.
-        `clean_trials` may have more than these, from another verification.
-    """
-    # number of trials, of which `look` have to count
-    count = look
-    # `run_clean` runs those that are missing, so none if there are enough already.
-    clean_trials += run_clean(trials=count, n_done=len(clean_trials))
-    n_missing = look - rule.count_valid(clean_trials[:count])
-    while n_missing > 0 and count < max_trials:
-        count = min(count + n_missing, max_trials)
-        clean_trials += run_clean(trials=count, n_done=len(clean_trials))
-        n_missing = look - rule.count_valid(clean_trials[:count])
-    return count
-
-
-def _is_found(
-    rule: VerificationRule,
-    trials: Sequence[Judgement],
-    clean_trials: Sequence[Judgement],
-    count: int,
-    *,
-    spp: int,
-    is_early: bool,
-) -> bool:
-    """Return whether a claim holds at a look.
-
-    Enough trials have to succeed, and the model must not be wrong about the clean
-    configuration already.
-
-    Args:
-        rule: decides how many have to succeed.
-        trials: trials of the adversarial configuration, at most `count`.
-        clean_trials: clean trials of the same seeds, or more.
-        count: number of trials at this look; further clean trials are ignored.
-        spp: samples per pixel of the trials.
-        is_early: whether more trials could follow.
-    """
-    clean_trials_of_look = clean_trials[:count]
-    n_valid = rule.count_valid(clean_trials_of_look)
-    n_needed = rule.count_needed_successes(n_valid, early=is_early)
-    outcomes = _list_outcomes(rule, trials, clean_trials_of_look)
-    n_successes = outcomes.count(True)
-    # wrong in more than half of these trials
-    is_clean_wrong = rule.is_already_wrong(count_right(clean_trials_of_look, spp))
-    return n_successes >= n_needed and not is_clean_wrong
 
 
 def _list_outcomes(
@@ -606,61 +657,60 @@ def _list_outcomes(
     return tuple(outcomes)
 
 
-def _summarize_trials(
-    rule: VerificationRule,
-    claim: Ending,
-    u: Tensor,
-    clean_trials: Sequence[Judgement],
-    trials: Sequence[Judgement],
-    *,
-    spp: int,
-    confidence: float,
-    renders: int,
-    stop_reason: str,
-    is_early: bool,
-    first_index: int,
-) -> Verification:
+def _summarize_trials(groups: _Groups, claim: Ending, u: Tensor) -> Verification:
     """Return the verification of a configuration by the trials of both groups.
 
-    It has their counts, the ending, and a sentence with the reason for it.
+    It has their counts, the ending, and a sentence with the reason for it. It counts
+    the renders of all trials.
 
     Args:
-        rule: says what a success is, and how many are needed.
+        groups: trials of both groups.
         claim: how the search ended.
         u: (d,) the configuration that was verified.
-        clean_trials, trials: clean trials and trials of both groups, in the order of
-            their seeds.
-        spp: samples per pixel.
-        confidence: confidence of the interval of the success rate.
-        renders: number of renders that the trials took.
-        stop_reason: why there are no more trials: "asked for" or "decided".
-        is_early: whether the claim was found at an early look. Then the reason states
-            the larger number of successes that this look needs.
-        first_index: index of the first trial.
     """
-    outcomes = _list_outcomes(rule, trials, clean_trials)
-    # None marks a trial that does not count. `TrialCounts` needs at least 1, as the
-    # rate of no trials would be 0 / 0.
-    n_counted = max(1, len(outcomes) - outcomes.count(None))
-    clean_counts = count_right(clean_trials, spp)
-    counts = TrialCounts(outcomes.count(True), n_counted, spp, confidence)
+    rule = groups.rule
+    outcomes = _list_outcomes(rule, groups.trials, groups.clean_trials)
+    counts = _count_adversarial(groups, outcomes)
+    clean_counts = count_right(groups.clean_trials, groups.spp)
+    # At an early look, the sentence states the larger number that this look needs.
+    n_needed = rule.count_needed_successes(counts.n_trials, early=groups.is_found_early)
     ending = rule.decide_ending(claim, clean_counts, counts)
-    n_needed = rule.count_needed_successes(n_counted, early=is_early)
-    reason = (
-        f"{ending.explanation} A success in {counts.n_successes} of {n_counted} "
-        f"trials, {n_needed} are needed; clean right in "
-        f"{clean_counts.n_successes} of {clean_counts.n_trials}."
-    )
     return Verification(
         ending,
-        reason,
+        _explain_ending(ending, counts, clean_counts, n_needed),
         u,
         clean_counts,
         adversarial_counts=counts,
-        clean_trials=tuple(clean_trials),
-        adversarial_trials=tuple(trials),
-        renders=renders,
-        stop_reason=stop_reason,
+        clean_trials=tuple(groups.clean_trials),
+        adversarial_trials=tuple(groups.trials),
+        renders=len(groups.trials) + len(groups.clean_trials),
+        stop_reason="asked for" if groups.is_complete else "decided",
         trial_successes=outcomes,
-        first_index=first_index,
+    )
+
+
+def _count_adversarial(groups: _Groups, outcomes: Sequence[bool | None]) -> TrialCounts:
+    """Return the counts of adversarial successes among the trials that count.
+
+    Args:
+        groups: trials of both groups.
+        outcomes: for each adversarial trial, whether it is a success; None if it does
+            not count.
+    """
+    # `TrialCounts` needs at least 1, as the rate of no trials would be 0 / 0.
+    n_counted = max(1, len(outcomes) - outcomes.count(None))
+    confidence = _choose_confidence(
+        groups.rule, has_several_looks=groups.has_several_looks
+    )
+    return TrialCounts(outcomes.count(True), n_counted, groups.spp, confidence)
+
+
+def _explain_ending(
+    ending: Ending, counts: TrialCounts, clean_counts: TrialCounts, n_needed: int
+) -> str:
+    """Return a sentence with the ending and the counts behind it."""
+    return (
+        f"{ending.explanation} A success in {counts.n_successes} of "
+        f"{counts.n_trials} trials, {n_needed} are needed; clean right in "
+        f"{clean_counts.n_successes} of {clean_counts.n_trials}."
     )

@@ -23,13 +23,13 @@ import time
 import urllib.error
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import wait as futures_wait
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, TypeAlias
-from urllib.parse import urlunsplit
+from urllib.parse import SplitResult, urlunsplit
 
 import numpy as np
 import numpy.typing as npt
@@ -109,11 +109,40 @@ def load(spec: str, purpose: models.Purpose) -> Model:
         ModelError: it cannot do the task, or there is no answer.
     """
     address = models.check_address(spec)
+    _check_sending_allowed(spec)
+    module = _make_network(address, spec, purpose)
+    return Model(
+        module=module,
+        name=module.name,
+        labels=module.names,
+        # The model takes images of any size: they are sent as they are rendered.
+        preprocessing=models.Preprocessing(
+            (models.DEFAULT_SIZE, models.DEFAULT_SIZE), resizes=False
+        ),
+        batch_limits=(1, MAX_BATCH),
+        differentiable=False,
+    )
+
+
+def _check_sending_allowed(spec: str) -> None:
+    """Raise CodeNotAllowedError if only a file, and not the user, names the address."""
     if not models.is_fetch_allowed(spec):
         raise models.CodeNotAllowedError(
             f"a file names the model {spec}, to which pictures would be sent, and the "
             f"key in {models.KEY}; {models.explain_how_to_allow(spec)}"
         )
+
+
+def _make_network(
+    address: SplitResult, spec: str, purpose: models.Purpose
+) -> AddressModel:
+    """Return the network behind an address, which knows its names.
+
+    Args:
+        address: the address in its parts.
+        spec: what the user wrote.
+        purpose: task, names of classes and limits of the model.
+    """
     is_chat = address.path.endswith(CHAT_SUFFIX)
     name = address.fragment or address.netloc  # what stands after a #, or the host
     is_free, question = purpose.parse_question(name, "is behind an address")
@@ -132,22 +161,17 @@ def load(spec: str, purpose: models.Purpose) -> Model:
     # A free answer is in words: such a model has no names.
     if not is_free:
         module.names = purpose.names or _request_names(module)
-        if len(module.names) < 2:
-            raise errors.ModelError(
-                f"model {name}: expected scores of two names at "
-                f"least, got {len(module.names)}"
-            )
-    return Model(
-        module=module,
-        name=name,
-        labels=module.names,
-        # The model takes images of any size: they are sent as they are rendered.
-        preprocessing=models.Preprocessing(
-            (models.DEFAULT_SIZE, models.DEFAULT_SIZE), resizes=False
-        ),
-        batch_limits=(1, MAX_BATCH),
-        differentiable=False,
-    )
+        _check_two_names(module)
+    return module
+
+
+def _check_two_names(module: AddressModel) -> None:
+    """Raise ModelError if a model with scores has fewer than two names."""
+    if len(module.names) < 2:
+        raise errors.ModelError(
+            f"model {module.name}: expected scores of two names at "
+            f"least, got {len(module.names)}"
+        )
 
 
 def _check_chat(spec: str, name: str, *, is_free: bool, is_named: bool) -> None:
@@ -192,20 +216,9 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
             without a price.
     """
     for name, value in ask.items():
-        if name not in LIMITS:
-            raise errors.UnknownNameError("name in `ask`", name, LIMITS)
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not is_number or not value >= 0:  # NaN is not either
-            raise InputError(
-                f"`ask` {name}: expected a number of at least 0, got {value!r}"
-            )
+        _check_limit(name, value)
     limits = {**LIMITS, **ask}
-    at_once = limits["at_once"]
-    if not 1 <= at_once <= MAX_CONCURRENT or at_once != int(at_once):
-        raise InputError(
-            "`ask` at_once: expected a whole number from 1 to "
-            f"{MAX_CONCURRENT}, got {at_once:g}"
-        )
+    _check_concurrency(limits["at_once"])
     has_price = any(
         limits[name] for name in ("per_call", "per_million_in", "per_million_out")
     )
@@ -216,6 +229,26 @@ def resolve_limits(ask: Mapping[str, float]) -> dict[str, float]:
             "per_million_in and per_million_out"
         )
     return limits
+
+
+def _check_limit(name: str, value: float) -> None:
+    """Raise InputError if a limit is unknown, or no number of at least 0."""
+    if name not in LIMITS:
+        raise errors.UnknownNameError("name in `ask`", name, LIMITS)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not value >= 0:  # NaN is not either
+        raise InputError(
+            f"`ask` {name}: expected a number of at least 0, got {value!r}"
+        )
+
+
+def _check_concurrency(at_once: float) -> None:
+    """Raise InputError if a number of requests at once is not allowed."""
+    if not 1 <= at_once <= MAX_CONCURRENT or at_once != int(at_once):
+        raise InputError(
+            "`ask` at_once: expected a whole number from 1 to "
+            f"{MAX_CONCURRENT}, got {at_once:g}"
+        )
 
 
 @dataclass(frozen=True)
@@ -391,21 +424,16 @@ class AddressModel(models.RemoteNetwork):
         If an answer has scores in place of a text, its text is the name with the
         highest score.
         """
+        n_turns = self.n_answers_per_image
         # turn: the number of the request about the same image
-        requests = [
-            (image, turn)
-            for image in images
-            for turn in range(self.n_answers_per_image)
-        ]
+        requests = [(image, turn) for image in images for turn in range(n_turns)]
         texts = []
         for answer in self._get_answers(requests):
             scores: dict[str, float] = answer.get("scores") or {answer["text"]: 1.0}
             texts.append(max(scores, key=scores.__getitem__))
         # The texts about one image follow each other.
-        return [
-            texts[start : start + self.n_answers_per_image]
-            for start in range(0, len(texts), self.n_answers_per_image)
-        ]
+        starts = range(0, len(texts), n_turns)
+        return [texts[start : start + n_turns] for start in starts]
 
     def request_scores(self, images: Sequence[Image8Bit]) -> list[dict[str, float]]:
         """Return the scores by name in the answer to each image.
@@ -417,19 +445,23 @@ class AddressModel(models.RemoteNetwork):
         turn = 0
         rows = []
         for answer in self._get_answers([(image, turn) for image in images]):
-            if "scores" not in answer:
-                raise errors.ModelError(
-                    f"model {self.name}: answers in words ({answer['text'][:60]!r}), "
-                    "and not with scores; use "
-                    "`task=answer`, and set the right `label`"
-                )
-            if self.names and (other := answer["scores"].keys() - set(self.names)):
-                raise errors.ModelError(
-                    f"model {self.name}: has a score for {min(other)!r}, "
-                    "which is not among the `labels`"
-                )
+            self._check_scored(answer)
             rows.append(answer["scores"])
         return rows
+
+    def _check_scored(self, answer: Mapping[str, Any]) -> None:
+        """Raise ModelError if an answer is in words, or has other names than labels."""
+        if "scores" not in answer:
+            raise errors.ModelError(
+                f"model {self.name}: answers in words ({answer['text'][:60]!r}), "
+                "and not with scores; use "
+                "`task=answer`, and set the right `label`"
+            )
+        if self.names and (other := answer["scores"].keys() - set(self.names)):
+            raise errors.ModelError(
+                f"model {self.name}: has a score for {min(other)!r}, "
+                "which is not among the `labels`"
+            )
 
     def store_answers_in(self, store: AnswerStore) -> None:
         """Store answers and what is spent in a run from now on.
@@ -458,23 +490,32 @@ class AddressModel(models.RemoteNetwork):
         new_bodies = dict[str, dict[str, Any]]()
         for image, turn in requests:
             body = self._make_body(image)
-            # The key is a hash of all that the answer depends on.
-            request = json.dumps([body, turn, self.spec]).encode()
-            key = f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
+            key = self._make_answer_key(body, turn)
             keys.append(key)
             stored_answer = self._read_stored_answer(key)
             if isinstance(stored_answer, dict):
                 answers[key] = stored_answer
             else:  # there is none, or it is corrupt
                 new_bodies[key] = body
-        new_keys = list(new_bodies)
-        read_answer = self._read_chat if self.chat_model_name else self._read_plain
-        for index, response in self._send(list(new_bodies.values())):
-            self._count_tokens(response)
-            key = new_keys[index]
-            answers[key] = read_answer(response)
-            self._store_answer(key, answers[key])
+        answers.update(self._request_answers(new_bodies))
         return [answers[key] for key in keys]
+
+    def _make_answer_key(self, body: Mapping[str, Any], turn: int) -> str:
+        """Return the key of an answer: a hash of all that the answer depends on."""
+        request = json.dumps([body, turn, self.spec]).encode()
+        return f"answer {hashlib.blake2b(request, digest_size=16).hexdigest()}"
+
+    def _request_answers(
+        self, body_by_key: Mapping[str, Mapping[str, Any]]
+    ) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Request new answers; yield the key and the answer of each once it is stored."""
+        keys = list(body_by_key)
+        read_answer = self._read_chat if self.chat_model_name else self._read_plain
+        for index, response in self._send(list(body_by_key.values())):
+            self._count_tokens(response)
+            answer = read_answer(response)
+            self._store_answer(keys[index], answer)
+            yield keys[index], answer
 
     def _read_stored_answer(self, key: str) -> Any:
         """Return the answer that is stored under a key; None if there is none."""
@@ -501,12 +542,14 @@ class AddressModel(models.RemoteNetwork):
             if self.question:
                 body["prompt"] = self.question
             return body
+        return self._make_chat_body(encoded)
+
+    def _make_chat_body(self, encoded: str) -> dict[str, Any]:
+        """Return the JSON body of a chat's request about an image, a PNG in base64."""
+        image_url = {"url": f"data:image/png;base64,{encoded}"}
         content = [
             {"type": "text", "text": self.question},
-            {
-                "type": "image_url",
-                "image_url": {"url": f"data:image/png;base64,{encoded}"},
-            },
+            {"type": "image_url", "image_url": image_url},
         ]
         return {
             "model": self.chat_model_name,
@@ -525,21 +568,24 @@ class AddressModel(models.RemoteNetwork):
         scores = response.get("scores")
         text = response.get("text")
         if isinstance(scores, dict) and scores:
-            values = list(scores.values())
-            not_numbers = [
-                value
-                for value in values
-                if isinstance(value, bool) or not isinstance(value, (int, float))
-            ]
-            if not_numbers or not all(0.0 <= value <= 1.0 for value in values):
-                got = not_numbers or [min(values), max(values)]
-                raise self._make_error("scores from 0 to 1", f"{got}")
+            self._check_fractions(list(scores.values()))
             return {"scores": scores}
         if isinstance(text, str):
             return {"text": text[:MAX_ANSWER_CHARACTERS]}
         raise self._make_error(
             '{"scores": {NAME: FRACTION}} or {"text": WORDS}', response
         )
+
+    def _check_fractions(self, values: Sequence[Any]) -> None:
+        """Raise ModelError if the scores of a response are no numbers from 0 to 1."""
+        not_numbers = [
+            value
+            for value in values
+            if isinstance(value, bool) or not isinstance(value, (int, float))
+        ]
+        if not_numbers or not all(0.0 <= value <= 1.0 for value in values):
+            got = not_numbers or [min(values), max(values)]
+            raise self._make_error("scores from 0 to 1", f"{got}")
 
     def _read_chat(self, response: Mapping[str, Any]) -> dict[str, Any]:
         """Return the answer in a response of a chat, as ``{"text": answer}``.
@@ -555,13 +601,9 @@ class AddressModel(models.RemoteNetwork):
             content = message.get("content")
             refusal = message.get("refusal")
         except (KeyError, IndexError, TypeError, AttributeError):
-            raise self._make_error(
-                "choices with a message, as a chat answers", response
-            ) from None
-        if isinstance(content, list):  # a text in pieces
-            content = " ".join(
-                str(part.get("text", "")) for part in content if isinstance(part, dict)
-            )
+            expected = "choices with a message, as a chat answers"
+            raise self._make_error(expected, response) from None
+        content = _join_pieces(content)
         if not content:  # None, or empty
             is_filtered = choice.get("finish_reason") == "content_filter"
             if refusal or is_filtered:
@@ -582,6 +624,16 @@ class AddressModel(models.RemoteNetwork):
         The keys are the names of their limits: "calls", "tokens" and "money". Money is
         in the currency in which the user stated the prices.
         """
+        spent = self.spent
+        return {
+            "calls": spent["calls"],
+            "tokens": spent["tokens_in"] + spent["tokens_out"],
+            "money": self._spent_money,
+        }
+
+    @property
+    def _spent_money(self) -> float:
+        """The cost of all calls and tokens so far."""
         prices = self.limits  # it has the prices, too
         spent = self.spent
         # the cost of all tokens, times a million
@@ -589,12 +641,7 @@ class AddressModel(models.RemoteNetwork):
             prices["per_million_in"] * spent["tokens_in"]
             + prices["per_million_out"] * spent["tokens_out"]
         )
-        money = prices["per_call"] * spent["calls"] + token_cost / 1e6
-        return {
-            "calls": spent["calls"],
-            "tokens": spent["tokens_in"] + spent["tokens_out"],
-            "money": money,
-        }
+        return prices["per_call"] * spent["calls"] + token_cost / 1e6
 
     @property
     def spending_sentence(self) -> str:
@@ -640,33 +687,41 @@ class AddressModel(models.RemoteNetwork):
             count = self._reserve(min(max_concurrent, len(pending)))
             batch = pending[:count]
             del pending[:count]
-            responses = self._send_together(
-                [json.dumps(bodies[request.index]).encode() for request in batch]
-            )
-            failures = list[str]()
-            retries = list[_Request]()
-            # `_reserve` has already counted the calls of this batch. If the connection
-            # is refused in the first one, there is no server, and another try is
-            # pointless.
-            is_first_batch = self.spent["calls"] <= len(batch)
-            for request, response in zip(batch, responses, strict=True):
-                if isinstance(response, dict):
-                    yield request.index, response
-                    continue
-                reason, retry = self._plan_retry(
-                    request, response, first=is_first_batch
-                )
-                if retry is None:
-                    failures.append(reason)
-                else:
-                    retries.append(retry)
-            # Raised only after the loop, so that no response of the batch is lost.
-            if failures:
-                raise errors.ModelError(failures[0])
+            retries = yield from self._send_batch(batch, bodies)
             self._wait_for_longest(retries)
             # twice the delay, for the case that they fail again
             retries = [replace(request, delay=2 * request.delay) for request in retries]
             pending = retries + pending
+
+    def _send_batch(
+        self, batch: Sequence[_Request], bodies: Sequence[Mapping[str, Any]]
+    ) -> Generator[tuple[int, dict[str, Any]], None, list[_Request]]:
+        """Send requests at the same time, and return those to send again.
+
+        Args:
+            batch: the requests.
+            bodies: bodies of these and of other requests, by `_Request.index`.
+
+        Yields:
+            The index of each request that succeeded, and the response to it.
+
+        Raises:
+            ModelError: a request failed, and another try is pointless.
+        """
+        contents = [json.dumps(bodies[request.index]).encode() for request in batch]
+        responses = self._send_together(contents)
+        # `_reserve` has already counted the calls of this batch. If the connection is
+        # refused in the first one, there is no server, and another try is pointless.
+        is_first_batch = self.spent["calls"] <= len(batch)
+        plans = list[tuple[str, _Request | None]]()
+        for request, response in zip(batch, responses, strict=True):
+            if isinstance(response, dict):
+                yield request.index, response
+            else:
+                plan = self._plan_retry(request, response, first=is_first_batch)
+                plans.append(plan)
+        # This may raise, so it follows the loop: no response of the batch is lost.
+        return _select_retries(plans)
 
     def _wait_for_longest(self, retries: Sequence[_Request]) -> None:
         """Wait for the longest delay of requests that are sent again, if there are any."""
@@ -728,19 +783,21 @@ class AddressModel(models.RemoteNetwork):
         """
         count = 0
         while count < max_count:
-            spent = self._spent_by_limit
-            reached_limits = [
-                name for name in spent if spent[name] >= self.limits[name]
-            ]
-            if reached_limits and count:
+            name = self._find_reached_limit()
+            if name is not None and count:
                 break  # the calls that are counted so far may be made
-            if reached_limits:
-                name = reached_limits[0]
-                raise self._make_limit_error(name, spent[name])
+            if name is not None:
+                raise self._make_limit_error(name, self._spent_by_limit[name])
             self.spent["calls"] += 1
             count += 1
         self._store_spent()
         return count
+
+    def _find_reached_limit(self) -> str | None:
+        """Return the name of the first limit that is reached; None if none is."""
+        spent = self._spent_by_limit
+        reached_limits = [name for name in spent if spent[name] >= self.limits[name]]
+        return reached_limits[0] if reached_limits else None
 
     def _make_limit_error(self, name: str, spent: float) -> errors.ModelError:
         """Return the error for a limit that is reached, by its name."""
@@ -857,10 +914,8 @@ class AddressModel(models.RemoteNetwork):
             problem = "is not accepted" if models.read_key() else "is missing"
             return f"status {status}: the key in {models.KEY} {problem}"
         body = error.read(MAX_ERROR_BYTES).decode(errors="replace")
-        return (
-            f"status {status} {self._clean(str(error.reason))}: "
-            f"{self._clean(body)[:300]}"
-        )
+        reason = self._clean(str(error.reason))
+        return f"status {status} {reason}: {self._clean(body)[:300]}"
 
     def _send_body(
         self, body: bytes, deadline: float, connections: list[_Connection]
@@ -883,17 +938,7 @@ class AddressModel(models.RemoteNetwork):
         if key:
             # urllib does not send this header to the target of a redirect.
             request.add_unredirected_header("Authorization", f"Bearer {key}")
-        handlers: list[Any] = [
-            models.NoRedirect,
-            _PlainHandler(deadline, connections),
-            _SecureHandler(deadline, connections),
-        ]
-        # the host without the port, and without the brackets of an IPv6 address
-        host = request.host.rpartition(":")[0].strip("[]") or request.host
-        if models.is_local(host):
-            # A proxy in the environment cannot reach a server on this machine.
-            handlers.append(urllib.request.ProxyHandler({}))
-        opener = urllib.request.build_opener(*handlers)
+        opener = _make_opener(request.host, deadline, connections)
         with opener.open(request, timeout=self.limits["seconds"]) as response:
             content = self._read_limited(response)
         return self._parse_object(content)
@@ -958,13 +1003,9 @@ class AddressModel(models.RemoteNetwork):
         if not isinstance(usage, Mapping):
             usage = {}
         counts = [usage.get(name) for name in ("prompt_tokens", "completion_tokens")]
-        is_stated = all(
-            isinstance(count, int) and not isinstance(count, bool) and count >= 0
-            for count in counts
-        )
         # Tokens may be unknown if neither a limit nor a price depends on them.
         needs_tokens = self._has_token_limit or self._priced_by_token
-        if is_stated:
+        if all(map(_is_count, counts)):
             tokens_in, tokens_out = counts
             # `spent` is a Counter: `update` adds.
             self.spent.update({"tokens_in": tokens_in, "tokens_out": tokens_out})
@@ -975,3 +1016,60 @@ class AddressModel(models.RemoteNetwork):
                 "`ask` counts tokens",
                 "none",
             )
+
+
+def _select_retries(plans: Sequence[tuple[str, _Request | None]]) -> list[_Request]:
+    """Return the requests to send again, from what is planned for those that failed.
+
+    Args:
+        plans: for each, why it failed, and the request to send next, or None.
+
+    Raises:
+        ModelError: another try of one of them is pointless; it states the reason.
+    """
+    retries = list[_Request]()
+    final_reasons = list[str]()
+    for reason, retry in plans:
+        if retry is None:
+            final_reasons.append(reason)
+        else:
+            retries.append(retry)
+    if final_reasons:
+        raise errors.ModelError(final_reasons[0])
+    return retries
+
+
+def _join_pieces(content: Any) -> Any:
+    """Return the content of a chat's message, as one text if it is a text in pieces."""
+    if not isinstance(content, list):
+        return content
+    pieces = [part for part in content if isinstance(part, dict)]
+    return " ".join(str(piece.get("text", "")) for piece in pieces)
+
+
+def _make_opener(
+    address_host: str, deadline: float, connections: list[_Connection]
+) -> urllib.request.OpenerDirector:
+    """Return what opens a tracked connection to a host, and follows no redirect.
+
+    Args:
+        address_host: the host of an address, perhaps with its port.
+        deadline: deadline of the connection, as `time.monotonic` counts.
+        connections: list that the connection is added to.
+    """
+    handlers: list[Any] = [
+        models.NoRedirect,
+        _PlainHandler(deadline, connections),
+        _SecureHandler(deadline, connections),
+    ]
+    # the host without the port, and without the brackets of an IPv6 address
+    host = address_host.rpartition(":")[0].strip("[]") or address_host
+    if models.is_local(host):
+        # A proxy in the environment cannot reach a server on this machine.
+        handlers.append(urllib.request.ProxyHandler({}))
+    return urllib.request.build_opener(*handlers)
+
+
+def _is_count(value: object) -> bool:
+    """Return whether a value is an integer of at least 0."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple, final
 
 import torch
@@ -97,6 +98,11 @@ def features_of(model: Model) -> Features:
                 size = read(x).shape[1]
                 description = f"the {layer_description}, {size} numbers"
                 return Features(model, read, size, description)
+    return _make_logit_features(model)
+
+
+def _make_logit_features(model: Model) -> Features:
+    """Return the logits of a model as its features, less their mean over the classes."""
     description = (
         f"the logits, {model.classes} numbers: no layer before them can be read in "
         f"a {type(model.module).__name__}"
@@ -171,18 +177,29 @@ def _find_last_layer(
     has_features = getattr(last, attribute) is not None  # an input may be a weight
     if not has_features:
         return None
-
-    def read(batch: Tensor) -> Tensor:
-        """Return the features (N, F) of a batch, by running the network on it."""
-        # The last call counts if the network calls the layer several times.
-        call = trace_calls(model.module, batch, last.layer)[-1]
-        value: Tensor = getattr(call, attribute)
-        channels_last = value.movedim(last.axis, -1)
-        if value.dim() > 2:
-            return channels_last.flatten(1, -2).mean(dim=1)
-        return channels_last
-
+    read = partial(_read_layer_features, trace_calls, model.module, last, attribute)
     return read, f"{attribute} of {last.name}"
+
+
+def _read_layer_features(
+    trace_calls: Calls, network: Any, layer_call: _Call, attribute: str, batch: Tensor
+) -> Tensor:
+    """Return the features (N, F) of a batch, by running the network on it.
+
+    Args:
+        trace_calls: runs the network, and returns the calls of a layer.
+        network: the network.
+        layer_call: any call of the layer.
+        attribute: attribute of a call that holds the features, "input" or "output".
+        batch: batch to run the network on.
+    """
+    # The last call counts if the network calls the layer several times.
+    call = trace_calls(network, batch, layer_call.layer)[-1]
+    value: Tensor = getattr(call, attribute)
+    channels_last = value.movedim(layer_call.axis, -1)
+    if value.dim() > 2:
+        return channels_last.flatten(1, -2).mean(dim=1)
+    return channels_last
 
 
 def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Call]:
@@ -194,42 +211,56 @@ def _trace_modules(network: Any, x: Tensor, only: nn.Module | None) -> list[_Cal
         x: a batch to run it on.
         only: if set, only calls of this layer are recorded; a layer of the network.
     """
-    calls: list[_Call] = []
     is_program = isinstance(network, torch.jit.ScriptModule)
     if is_program or not isinstance(network, nn.Module):
-        return calls
+        return []
     names: dict[nn.Module, str] = {
         layer: name
         for name, layer in network.named_modules()
         if isinstance(layer, LAYERS)
     }
+    recorder = _CallRecorder(names)
+    with ExitStack() as hooks:
+        for layer in names if only is None else [only]:
+            handle = layer.register_forward_hook(recorder, with_kwargs=True)
+            hooks.callback(handle.remove)
+        network(x)
+    return recorder.calls
 
-    def record_call(
+
+@dataclass(eq=False)
+class _CallRecorder:
+    """Records the calls of layers, as a hook that PyTorch calls after each of them.
+
+    Attributes:
+        names: name of each layer in its network; empty for the network itself.
+        calls: the calls so far.
+    """
+
+    names: Mapping[nn.Module, str]
+    calls: list[_Call] = field(default_factory=list)
+
+    def __call__(
+        self,
         layer: nn.Module,
         args: tuple[Tensor, ...],
         kwargs: dict[str, Tensor],
         output: Tensor,
     ) -> None:
-        """Record a call of a layer; PyTorch calls this after each of them.
+        """Record a call of a layer.
 
-        A call is left out if its output has another number of rows than its input: it
-        does not work on the images of the batch.
+        It is left out if its output has another number of rows than its input: it does
+        not work on the images of the batch.
         """
         input = args[0] if args else kwargs["input"]
         keeps_batch = len(input) == len(output) and input.dim() > 1
         if keeps_batch:
             # The name is "" if the network itself is a layer.
-            name = f"{names[layer] or 'the network'} ({type(layer).__name__})"
+            layer_name = self.names[layer] or "the network"
+            name = f"{layer_name} ({type(layer).__name__})"
             # Convolutions have (N, channels, ...).
             channel_axis = -1 if isinstance(layer, nn.Linear) else 1
-            calls.append(_Call(layer, name, input, output, channel_axis))
-
-    with ExitStack() as hooks:
-        for layer in names if only is None else [only]:
-            handle = layer.register_forward_hook(record_call, with_kwargs=True)
-            hooks.callback(handle.remove)
-        network(x)
-    return calls
+            self.calls.append(_Call(layer, name, input, output, channel_axis))
 
 
 def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
@@ -241,38 +272,52 @@ def _trace_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
         x: a batch to run it on.
         only: if set, only calls of this node are recorded.
     """
-    calls: list[_Call] = []
+    if not isinstance(network, fx.GraphModule):
+        return []
+    reader = _GraphReader(network, only)
+    reader.run(x)
+    return reader.calls
 
-    class Reader(fx.Interpreter):
-        """Records the calls while it runs the graph."""
 
-        def run_node(self, n: fx.Node) -> Any:
-            """Run a node, and record its call if it is a layer."""
-            value = super().run_node(n)
-            is_layer = n.op == "call_function" and n.target in OPERATORS
-            is_traced = only is None or n is only
-            if is_layer and is_traced and isinstance(value, Tensor):
-                activation_index = OPERATORS[n.target]
-                source = n.args[activation_index]
-                # Weights come from `get_attr` nodes, activations from other nodes.
-                activation = None
-                if isinstance(source, fx.Node) and source.op != "get_attr":
-                    # `env` has the values of all nodes that are still needed. Those of
-                    # this node's arguments are deleted after this method.
-                    activation = self.env[source]
-                call = _Call(
+class _GraphReader(fx.Interpreter):
+    """Records the calls of the layers of a graph while it runs the graph.
+
+    Attributes:
+        only: if not None, only calls of this node are recorded.
+        calls: the calls so far.
+    """
+
+    def __init__(self, network: fx.GraphModule, only: fx.Node | None) -> None:
+        super().__init__(network)
+        self.only = only
+        self.calls: list[_Call] = []
+
+    def run_node(self, n: fx.Node) -> Any:
+        """Run a node, and record its call if it is a layer."""
+        value = super().run_node(n)
+        is_layer = n.op == "call_function" and n.target in OPERATORS
+        is_traced = self.only is None or n is self.only
+        if is_layer and is_traced and isinstance(value, Tensor):
+            self.calls.append(
+                _Call(
                     layer=n,
                     name=f"the operator {n.name}",
-                    input=activation,
+                    input=self._find_activation(n),
                     output=value,
                     axis=-1 if n.target in CHANNELS_LAST else 1,
                 )
-                calls.append(call)
-            return value
+            )
+        return value
 
-    if isinstance(network, fx.GraphModule):
-        Reader(network).run(x)
-    return calls
+    def _find_activation(self, layer: fx.Node) -> Any:
+        """Return the activation that a layer gets; None if that is a weight."""
+        source = layer.args[OPERATORS[layer.target]]
+        # Weights come from `get_attr` nodes, activations from other nodes.
+        if isinstance(source, fx.Node) and source.op != "get_attr":
+            # `env` has the values of all nodes that are still needed. Those of this
+            # node's arguments are deleted after `run_node`.
+            return self.env[source]
+        return None
 
 
 # names of the features in an output of transformers, the most suitable first
@@ -289,16 +334,24 @@ def pooled(returned: Any, *, token: bool) -> Tensor | None:
             in networks with a class token; otherwise they are the mean over tokens.
     """
     for part in PARTS:
-        value = (
-            returned.get(part)
-            if isinstance(returned, Mapping)
-            else getattr(returned, part, None)
-        )
-        if not isinstance(value, Tensor):
-            continue
-        if value.dim() == 3:  # tokens
-            return value[:, 0] if token else value.mean(dim=1)
-        if value.dim() == 4:  # maps
-            return value.flatten(2).mean(dim=2)
-        return value
+        if isinstance(returned, Mapping):
+            value = returned.get(part)
+        else:
+            value = getattr(returned, part, None)
+        if isinstance(value, Tensor):
+            return _average_positions(value, token=token)
     return returned if isinstance(returned, Tensor) else None
+
+
+def _average_positions(value: Tensor, *, token: bool) -> Tensor:
+    """Return the features (N, D) of images from those of their tokens or positions.
+
+    Args:
+        value: features of tokens (N, T, D), maps (N, D, H, W), or features (N, D).
+        token: whether to return those of the first token instead of the mean.
+    """
+    if value.dim() == 3:  # tokens
+        return value[:, 0] if token else value.mean(dim=1)
+    if value.dim() == 4:  # maps
+        return value.flatten(2).mean(dim=2)
+    return value

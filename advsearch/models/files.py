@@ -13,11 +13,11 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, BinaryIO, cast
 
 import torch
 from torch import Tensor, nn
@@ -77,17 +77,7 @@ def load_file(path: Path) -> Source:
             another kind; the message names it.
         ModelError: the program does not take one floating-point image.
     """
-    try:
-        opened = open_regular(path, "a model file", MAX_ARCHIVE_BYTES)
-    except FileNotFoundError:
-        raise FileFormatError(
-            f"model file {path}: no such file.{_make_missing_hint(path)}"
-        ) from None
-    except OSError as error:
-        raise FileFormatError(
-            f"model file {path}: cannot be read ({error.strerror or error})"
-        ) from None
-    with opened as file:
+    with _open_file(path) as file:
         head = file.read(16)  # enough to recognize the kind of a file
         if not head:
             raise FileFormatError(
@@ -104,6 +94,20 @@ def load_file(path: Path) -> Source:
         return _load_exported(archive)
 
 
+def _open_file(path: Path) -> BinaryIO:
+    """Open a model file; raise FileFormatError if it is missing or cannot be read."""
+    try:
+        return open_regular(path, "a model file", MAX_ARCHIVE_BYTES)
+    except FileNotFoundError:
+        raise FileFormatError(
+            f"model file {path}: no such file.{_make_missing_hint(path)}"
+        ) from None
+    except OSError as error:
+        raise FileFormatError(
+            f"model file {path}: cannot be read ({error.strerror or error})"
+        ) from None
+
+
 def _load_exported(archive: Archive) -> Source:
     """Load the network in an archive of torch.export.
 
@@ -111,19 +115,29 @@ def _load_exported(archive: Archive) -> Source:
     """
     path = archive.path
     checked = exported_programs.rewrite_program(archive)
-    logger = logging.getLogger("torch.export")
     with (
         _report_corrupt(path, "torch.export"),
         without_unpickling(),
-        ExitStack() as stack,
+        _silence_logger("torch.export"),
     ):
-        # torch logs the traceback of an error. The user gets a message instead, so that
-        # its logger is silent in this block, and gets its level back after it.
-        stack.callback(logger.setLevel, logger.level)
-        logger.setLevel(logging.CRITICAL)
         program = torch.export.load(checked)
         module = program.module()
     return _apply_signature(make_source(module, path.stem), program)
+
+
+@contextmanager
+def _silence_logger(name: str) -> Iterator[None]:
+    """Silence a logger inside the context, and give it its level back afterwards.
+
+    torch logs the traceback of an error, and the user gets a message instead.
+    """
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _make_missing_hint(path: Path) -> str:
@@ -156,12 +170,9 @@ def _load_torchscript(archive: Archive) -> Source:
     with warnings.catch_warnings(), _report_corrupt(path, "TorchScript"):
         # Older versions of torch warn that TorchScript is deprecated by the first
         # category; 2.14 and later by the second one.
+        message = r".*torch\.jit\.\w+.* is deprecated"
         for category in (DeprecationWarning, FutureWarning):
-            warnings.filterwarnings(
-                "ignore",
-                message=r".*torch\.jit\.\w+.* is deprecated",
-                category=category,
-            )
+            warnings.filterwarnings("ignore", message=message, category=category)
         module = torch.jit.load(checked, map_location="cpu")
     return make_source(module, path.stem)
 
@@ -174,7 +185,6 @@ def _find_archive_kind(archive: Archive) -> str:
     Raises:
         FileFormatError: it is of another kind, such as a pickle that `torch.save` made.
     """
-    path = archive.path
     names = archive.members
     if any(name.startswith("models/") and name.endswith(".json") for name in names):
         _check_no_code(archive)
@@ -184,12 +194,18 @@ def _find_archive_kind(archive: Archive) -> str:
         return "exported"
     if "constants.pkl" in names and any(name.startswith("code/") for name in names):
         return "torchscript"
-    if "data.pkl" in names:
-        raise FileFormatError(
+    raise _make_archive_kind_error(archive)
+
+
+def _make_archive_kind_error(archive: Archive) -> FileFormatError:
+    """Return the error of an archive that is neither torch.export nor TorchScript."""
+    path = archive.path
+    if "data.pkl" in archive.members:
+        return FileFormatError(
             f"model file {path}: is a pickle (made by torch.save), which is never "
             f"opened. {EXPORT_HINT}"
         )
-    raise FileFormatError(
+    return FileFormatError(
         f"model file {path}: a zip archive, but neither torch.export "
         f"nor TorchScript. {EXPORT_HINT}"
     )
@@ -223,11 +239,7 @@ def _describe_file(path: Path, head: bytes) -> str:
         head: its first 16 bytes.
     """
     suffix = path.suffix.lower()
-    # A safetensors file begins with the length of its header in eight bytes, then the
-    # header, a JSON object.
-    header_length = int.from_bytes(head[:8], "little")
-    is_safetensors = head[8:9] == b"{" and header_length < 1 << 30
-    if is_safetensors:
+    if _is_safetensors(head):
         return (
             "safetensors hold weights but no network; name what builds it: "
             "'package.module:callable@weights.safetensors' or "
@@ -247,6 +259,16 @@ def _describe_file(path: Path, head: bytes) -> str:
         "expected a torch.export archive (.pt2) or TorchScript, got other bytes. "
         f"{EXPORT_HINT}"
     )
+
+
+def _is_safetensors(head: bytes) -> bool:
+    """Return whether a file is of safetensors, by its first 16 bytes.
+
+    It begins with the length of its header in eight bytes, then the header, a JSON
+    object.
+    """
+    header_length = int.from_bytes(head[:8], "little")
+    return head[8:9] == b"{" and header_length < 1 << 30
 
 
 def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
@@ -271,23 +293,35 @@ def _apply_signature(source: Source, program: torch.export.ExportedProgram) -> S
     examples = [nodes[name].meta.get("val") for name in names]
     takes_rigs = _check_inputs(source, names, examples)
     images = examples[0]
-    # A second input (N, 2) with such a name is the size of each image.
-    takes_sizes = (
-        len(names) == 2 and names[1] in SIZE_INPUTS and examples[1].shape[1] == 2
-    )
-    if takes_sizes:
-        # The size of each image is known, so that it can be passed too.
-        source = replace(source, size_type=examples[1].dtype)
-    else:
-        # Any other second input must come from the user as a `state` (`takes_more`).
-        # `make_source` may have guessed from the names of inputs that sizes are taken.
-        source = replace(source, takes_more=len(examples) > 1, size_type=None)
+    source = _apply_second_input(source, names, examples)
     source = _apply_image_input(source, images, is_rig=takes_rigs)
     min_batch, max_batch = _find_batch_limits(program, images.shape[0])
     source = replace(source, batch_limits=(min_batch, max_batch))
     if takes_rigs:
         return _wrap_rig_network(source, cameras=int(images.shape[1]))
     return source
+
+
+def _apply_second_input(
+    source: Source, names: list[str], examples: list[Any]
+) -> Source:
+    """Return the source with what the input after the images is, if there is one.
+
+    Args:
+        source: source of the network.
+        names: names of all inputs.
+        examples: example values of all inputs.
+    """
+    # A second input (N, 2) with such a name is the size of each image.
+    takes_sizes = (
+        len(names) == 2 and names[1] in SIZE_INPUTS and examples[1].shape[1] == 2
+    )
+    if takes_sizes:
+        # The size of each image is known, so that it can be passed too.
+        return replace(source, size_type=examples[1].dtype)
+    # Any other second input must come from the user as a `state` (`takes_more`).
+    # `make_source` may have guessed from the names of inputs that sizes are taken.
+    return replace(source, takes_more=len(examples) > 1, size_type=None)
 
 
 def _wrap_rig_network(source: Source, cameras: int) -> Source:
@@ -331,14 +365,12 @@ def _apply_image_input(source: Source, images: Any, *, is_rig: bool) -> Source:
     is_channels_last = image_shape[2] == 3 and image_shape[0] != 3
     height, width = image_shape[:2] if is_channels_last else image_shape[1:]
     is_fixed_size = isinstance(height, int) and isinstance(width, int)
-    source = replace(
-        source,
-        input_size=(height, width) if is_fixed_size else None,
-        layout="NHWC" if is_channels_last else "NCHW",
-    )
-    return (
-        make_eight_bit(source) if is_eight_bit else replace(source, dtype=images.dtype)
-    )
+    input_size = (height, width) if is_fixed_size else None
+    layout = "NHWC" if is_channels_last else "NCHW"
+    source = replace(source, input_size=input_size, layout=layout)
+    if is_eight_bit:
+        return make_eight_bit(source)
+    return replace(source, dtype=images.dtype)
 
 
 def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
@@ -357,13 +389,7 @@ def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
         ModelError: it takes something else.
     """
     are_tensors = bool(inputs) and all(isinstance(value, Tensor) for value in inputs)
-    takes_rigs = (
-        are_tensors
-        and len(inputs) == 1
-        and inputs[0].dim() == 5
-        # the number of cameras is fixed; a free size is no int but a symbol
-        and isinstance(inputs[0].shape[1], int)
-    )
+    takes_rigs = are_tensors and _takes_rigs(inputs)
     takes_images = (
         are_tensors
         and inputs[0].dim() == 4
@@ -375,6 +401,14 @@ def _check_inputs(source: Source, names: list[str], inputs: list[Any]) -> bool:
             f"images of 4 dimensions{_advise_on_second_input(names)}"
         )
     return takes_rigs
+
+
+def _takes_rigs(inputs: list[Any]) -> bool:
+    """Return whether tensors are one input of rigs, (N, K, ...) with 5 axes."""
+    if len(inputs) != 1 or inputs[0].dim() != 5:
+        return False
+    # the number of cameras is fixed; a free size is no int but a symbol
+    return isinstance(inputs[0].shape[1], int)
 
 
 def _find_batch_limits(
@@ -514,18 +548,13 @@ def load_onnx(path: Path) -> Source:
     is_eight_bit = images.type == "tensor(uint8)"
     batch_size = images.shape[0]  # an int, or a name if it is free; so are other sizes
     has_fixed_batch = isinstance(batch_size, int)
-    is_channels_last = images.shape[3] == 3 and images.shape[1] != 3
-    input_size = images.shape[1:3] if is_channels_last else images.shape[2:4]
+    is_channels_last = _is_channels_last(images)
     # Files that YOLO exports state the image size (`imgsz`) and the class names.
     metadata = session.get_modelmeta().custom_metadata_map
-    has_fixed_size = all(isinstance(size, int) for size in input_size)
-    if not has_fixed_size:
-        # empty if the file does not state it
-        input_size = _parse_image_size(metadata.get("imgsz", ""))
     source = Source(
         OnnxNetwork(session, runtime.RunOptions),
         path.stem,
-        input_size=(input_size[0], input_size[1]) if input_size else None,
+        input_size=_find_onnx_size(images, metadata.get("imgsz", "")),
         layout="NHWC" if is_channels_last else "NCHW",
         labels=parse_names(metadata.get("names", "")),
         batch_limits=(batch_size, batch_size) if has_fixed_batch else (1, MAX_BATCH),
@@ -535,6 +564,29 @@ def load_onnx(path: Path) -> Source:
         size_type=SIZE_TYPES[inputs[1].type] if len(inputs) > 1 else None,
     )
     return make_eight_bit(source) if is_eight_bit else source
+
+
+def _is_channels_last(images: Any) -> bool:
+    """Return whether the channels of an input of images are the last axis.
+
+    `images` is the input as onnxruntime describes it.
+    """
+    return bool(images.shape[3] == 3 and images.shape[1] != 3)
+
+
+def _find_onnx_size(images: Any, stated_size: str) -> tuple[int, int] | None:
+    """Return the size (height, width) of images that a network takes; None for any.
+
+    Args:
+        images: the input as onnxruntime describes it.
+        stated_size: the size as metadata states it, for a network whose sizes are free;
+            empty if it is not stated.
+    """
+    input_size = images.shape[1:3] if _is_channels_last(images) else images.shape[2:4]
+    has_fixed_size = all(isinstance(size, int) for size in input_size)
+    if not has_fixed_size:
+        input_size = _parse_image_size(stated_size)
+    return (input_size[0], input_size[1]) if input_size else None
 
 
 def _open_session(path: Path) -> tuple[Any, Any]:
@@ -548,16 +600,8 @@ def _open_session(path: Path) -> tuple[Any, Any]:
         FileFormatError: the file is corrupt.
     """
     runtime = import_library("onnxruntime", str(path), "onnx")
-    release = re.match(r"(\d+)\.(\d+)", runtime.__version__)
-    if release is None or (int(release[1]), int(release[2])) < MIN_VERSION:
-        raise ModelError(
-            f"model {path}: needs onnxruntime {'.'.join(map(str, MIN_VERSION))} or "
-            f"newer, got {runtime.__version__}, which may read weights from anywhere "
-            "that a file names: pip install -U 'advsearch[onnx]'"
-        )
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
-    options.log_severity_level = 4  # errors are raised as well
+    _check_version(runtime.__version__, path)
+    options = _make_session_options(runtime)
     problem = (
         f"model file {path}: cannot be read as ONNX with onnxruntime "
         f"{runtime.__version__}"
@@ -576,6 +620,30 @@ def _open_session(path: Path) -> tuple[Any, Any]:
     return session, runtime
 
 
+def _make_session_options(runtime: Any) -> Any:
+    """Return onnxruntime's options: as many threads as torch has, and no log."""
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 4  # errors are raised as well
+    return options
+
+
+def _check_version(version: str, path: Path) -> None:
+    """Raise ModelError if onnxruntime is older than `MIN_VERSION`.
+
+    Args:
+        version: its version.
+        path: path of the model, for the message.
+    """
+    release = re.match(r"(\d+)\.(\d+)", version)
+    if release is None or (int(release[1]), int(release[2])) < MIN_VERSION:
+        raise ModelError(
+            f"model {path}: needs onnxruntime {'.'.join(map(str, MIN_VERSION))} or "
+            f"newer, got {version}, which may read weights from anywhere "
+            "that a file names: pip install -U 'advsearch[onnx]'"
+        )
+
+
 def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
     """Check that a network takes images with 4 axes, perhaps with their sizes (N, 2).
 
@@ -586,23 +654,9 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
     Raises:
         ModelError: it takes something else.
     """
-    # A size is an integer if it is fixed. If it is free, it is a name, or None.
-    image_shape = inputs[0].shape if inputs else []
-    fixed_sizes = [size for size in image_shape if isinstance(size, int)]
-    takes_images = (
-        len(image_shape) == 4
-        and (inputs[0].type == "tensor(uint8)" or inputs[0].type in FLOATS)
-        and all(size > 0 for size in fixed_sizes)
-    )
     other_inputs = inputs[1:]
-    takes_sizes = (
-        len(other_inputs) == 1
-        and other_inputs[0].name in SIZE_INPUTS
-        and other_inputs[0].type in SIZE_TYPES
-        and len(other_inputs[0].shape) == 2
-        and other_inputs[0].shape[1] in (2, None)
-    )
-    if takes_images and (not other_inputs or takes_sizes):
+    takes_images = bool(inputs) and _takes_onnx_images(inputs[0])
+    if takes_images and (not other_inputs or _takes_onnx_sizes(other_inputs)):
         return
     got = ", ".join(f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in inputs)
     advice = _advise_on_second_input([tensor.name for tensor in inputs])
@@ -610,6 +664,26 @@ def _check_onnx_inputs(path: Path, inputs: list[Any]) -> None:
         f"model file {path}: expected one input, a batch of floating-point images of 4 "
         f"dimensions (or of uint8), got {got or 'none'}{advice}"
     )
+
+
+def _takes_onnx_images(tensor: Any) -> bool:
+    """Return whether an input, as onnxruntime describes it, is a batch of images."""
+    # A size is an integer if it is fixed. If it is free, it is a name, or None.
+    fixed_sizes = [size for size in tensor.shape if isinstance(size, int)]
+    return (
+        len(tensor.shape) == 4
+        and (tensor.type == "tensor(uint8)" or tensor.type in FLOATS)
+        and all(size > 0 for size in fixed_sizes)
+    )
+
+
+def _takes_onnx_sizes(inputs: list[Any]) -> bool:
+    """Return whether the inputs after the images are one, the sizes (N, 2) of these."""
+    if len(inputs) != 1:
+        return False
+    sizes = inputs[0]
+    is_known = sizes.name in SIZE_INPUTS and sizes.type in SIZE_TYPES
+    return is_known and len(sizes.shape) == 2 and sizes.shape[1] in (2, None)
 
 
 def _parse_image_size(text: str) -> list[int]:

@@ -100,16 +100,21 @@ def list_required_inputs(network: nn.Module) -> list[str]:
             argument.name for argument in arguments if not argument.has_default_value()
         ]
     try:
-        parameters = list(inspect.signature(network.forward).parameters.values())
+        signature = inspect.signature(network.forward)
     except (TypeError, ValueError):  # it is not written in Python
         return []
-    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return [
         parameter.name
-        for parameter in parameters
-        if parameter.kind not in variadic
-        and parameter.default is inspect.Parameter.empty
+        for parameter in signature.parameters.values()
+        if is_required(parameter)
     ]
+
+
+def is_required(parameter: inspect.Parameter) -> bool:
+    """Return whether a call has to pass a parameter."""
+    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    has_default = parameter.default is not inspect.Parameter.empty
+    return parameter.kind not in variadic and not has_default
 
 
 def takes_image_size(network: nn.Module) -> bool:

@@ -98,9 +98,8 @@ def find_label_set(
             f"label: expected at least one label name or class index, got {text!r}"
         )
     table = _make_name_table(labels)
-    indices = tuple(
-        dict.fromkeys(_find_class(term, table, labels, named) for term in terms)
-    )
+    found_indices = (_find_class(term, table, labels, named) for term in terms)
+    indices = tuple(dict.fromkeys(found_indices))
     return LabelSet(tuple(labels[index] for index in indices), indices)
 
 
@@ -126,23 +125,44 @@ def find_similar_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str
         for name, indices in _make_name_table(labels).items()
         if "," not in name
     }
+    synonyms = [name for name in _list_synonyms(word) if name in indices_of_name]
+    similar = find_similar_names(word, indices_of_name)  # keys of the mapping
+    key = _normalize_name(word)
+    contains_word = any(key in name for name in similar)  # as a part of the name
+    if synonyms and not contains_word:
+        # A synonym is a better suggestion than a name that is only spelled alike.
+        similar = []
+    return _list_classes_of_names((*similar, *synonyms), indices_of_name)
+
+
+def _list_classes_of_names(
+    names: Sequence[str], indices_of_name: Mapping[str, Sequence[int]]
+) -> list[tuple[int, str]]:
+    """Return index and name of each class that has one of the names, in their order.
+
+    A class with several of the names gets the first of them.
+
+    Args:
+        names: names of classes.
+        indices_of_name: indices of the classes that have a name.
+    """
+    name_of_index: dict[int, str] = {}
+    for name in names:
+        for index in indices_of_name[name]:
+            name_of_index.setdefault(index, name)
+    return list(name_of_index.items())
+
+
+def _list_synonyms(word: str) -> list[str]:
+    """Return the names of the table of everyday things that mean the same as a word."""
     synonym_groups = json.loads((DATA / "synonyms.json").read_text("utf-8"))
     key = _normalize_name(word)
     synonyms = []
     for group in synonym_groups:
         names = [_normalize_name(name) for name in group]
         if key in names:
-            synonyms += [name for name in names if name in indices_of_name]
-    similar = find_similar_names(word, indices_of_name)  # keys of the mapping
-    contains_word = any(key in name for name in similar)  # as a part of the name
-    if synonyms and not contains_word:
-        # A synonym is a better suggestion than a name that is only spelled alike.
-        similar = []
-    name_of_index: dict[int, str] = {}
-    for name in (*similar, *synonyms):
-        for index in indices_of_name[name]:
-            name_of_index.setdefault(index, name)
-    return list(name_of_index.items())
+            synonyms += names
+    return synonyms
 
 
 def _find_class(
@@ -160,28 +180,46 @@ def _find_class(
         InputError: there is no such class, or several.
     """
     indices = table.get(_normalize_name(term), [])
-    # "#504" is always an index, "504" only if no label has that name.
-    index_match = re.fullmatch(r"#\s*(-?\d+)", term)
-    if not index_match and not indices:
-        index_match = re.fullmatch(r"(-?\d+)", term)
-    if index_match:
-        index = int(index_match[1])
-        if not 0 <= index < len(labels):
-            raise InputError(
-                "label: expected a class index from 0 to "
-                f"{len(labels) - 1}, got {index}"
-            )
+    index = _parse_index(term, is_name=bool(indices))
+    if index is not None:
+        _check_index(index, len(labels))
         return index
     if len(indices) == 1:
         return indices[0]
     if indices:
-        classes = ", ".join(f"#{index} ({labels[index]})" for index in indices)
-        raise InputError(
-            f"label {term!r} names {len(indices)} classes: {classes}. Give "
-            f"the index, e.g. '#{indices[0]}'"
-        )
+        raise _make_ambiguous_label_error(term, indices, labels)
     hint = _hint_of_labels(term, labels, named)
     raise InputError(f"the model has no label {term!r}. {hint}")
+
+
+def _make_ambiguous_label_error(
+    term: str, indices: Sequence[int], labels: Sequence[str]
+) -> InputError:
+    """Return the error of a term that names several classes, by their indices."""
+    classes = ", ".join(f"#{index} ({labels[index]})" for index in indices)
+    return InputError(
+        f"label {term!r} names {len(indices)} classes: {classes}. Give "
+        f"the index, e.g. '#{indices[0]}'"
+    )
+
+
+def _parse_index(term: str, *, is_name: bool) -> int | None:
+    """Return the index that a term states; None if it states none.
+
+    "#504" is always an index, "504" only if no label has that name (`is_name`).
+    """
+    index_match = re.fullmatch(r"#\s*(-?\d+)", term)
+    if not index_match and not is_name:
+        index_match = re.fullmatch(r"(-?\d+)", term)
+    return int(index_match[1]) if index_match else None
+
+
+def _check_index(index: int, n_classes: int) -> None:
+    """Raise InputError if a model does not have the class with an index."""
+    if not 0 <= index < n_classes:
+        raise InputError(
+            f"label: expected a class index from 0 to {n_classes - 1}, got {index}"
+        )
 
 
 def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
@@ -193,9 +231,8 @@ def _hint_of_labels(term: str, labels: Sequence[str], named: bool) -> str:
         named: whether the labels are names; else they are placeholders ("class 0").
     """
     if not named:
-        sets_of_names = "".join(
-            f" or `labels={name}`" for name in list_sets_of_size(len(labels))
-        )
+        sets = list_sets_of_size(len(labels))
+        sets_of_names = "".join(f" or `labels={name}`" for name in sets)
         return (
             f"Its {len(labels)} classes have no names: give a label file "
             f"(`labels`){sets_of_names}, or an index such as '#0'"
@@ -271,18 +308,23 @@ def parse_names(names: Any) -> tuple[str, ...] | None:
         The names; None if they have another form.
     """
     if isinstance(names, str):
-        if len(names) > MAX_METADATA_CHARACTERS or not _FLAT.fullmatch(names):
-            return None
-        try:
-            names = ast.literal_eval(names)
-        except (ValueError, SyntaxError, MemoryError):
-            return None
+        names = _parse_literal(names)
     if isinstance(names, Mapping):
         has_index_keys = list(names) == list(range(len(names)))
         names = list(names.values()) if has_index_keys else None
     if isinstance(names, (list, tuple)) and not _find_problem(names):
         return read_labels(names)
     return None
+
+
+def _parse_literal(text: str) -> Any:
+    """Return the flat mapping or list in a text as Python writes it; None for others."""
+    if len(text) > MAX_METADATA_CHARACTERS or not _FLAT.fullmatch(text):
+        return None
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, MemoryError):
+        return None
 
 
 _TEXT = r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")"""
@@ -431,16 +473,7 @@ def _read_file(path: Path) -> tuple[str, ...]:
         FileFormatError: it cannot be read, or holds something else than names.
     """
     where = f"label file {path}"
-    try:
-        text = read_text(path, "a label file", MAX_FILE_BYTES)
-    except OSError as error:
-        # A text without a suffix may have been meant as a single name.
-        advice = ""
-        if not path.suffix:
-            advice = ", and several names have commas between them, such as 'mug,cup'"
-        raise FileFormatError(
-            f"{where}: cannot be read ({error.strerror or error}){advice}"
-        ) from None
+    text = _read_label_text(path, where)
     if not text.strip():
         raise FileFormatError(f"{where}: expected label names, got an empty file")
     is_json = path.suffix.lower() == ".json" or text.lstrip()[0] in "[{"
@@ -449,6 +482,20 @@ def _read_file(path: Path) -> tuple[str, ...]:
     else:  # a name on each line, even on an empty one within the text
         names = [line.strip() for line in text.strip("\r\n").splitlines()]
     return _check_names(names, FileFormatError, where)
+
+
+def _read_label_text(path: Path, where: str) -> str:
+    """Return the text of a label file; raise FileFormatError if it cannot be read."""
+    try:
+        return read_text(path, "a label file", MAX_FILE_BYTES)
+    except OSError as error:
+        # A text without a suffix may have been meant as a single name.
+        advice = ""
+        if not path.suffix:
+            advice = ", and several names have commas between them, such as 'mug,cup'"
+        raise FileFormatError(
+            f"{where}: cannot be read ({error.strerror or error}){advice}"
+        ) from None
 
 
 def _parse_json_names(text: str, where: str) -> list[Any]:
@@ -461,14 +508,7 @@ def _parse_json_names(text: str, where: str) -> list[Any]:
     Raises:
         FileFormatError: it is anything else.
     """
-    try:
-        names = parse_json(text)
-    except json.JSONDecodeError as error:
-        raise FileFormatError(
-            f"{where}: not valid JSON (line {error.lineno}: {error.msg})"
-        ) from None
-    except ValueError as error:
-        raise FileFormatError(f"{where}: expected label names, got {error}") from None
+    names = _parse_json_text(text, where)
     if isinstance(names, dict):
         return _order_by_index(names, where)
     if not isinstance(names, list):
@@ -476,6 +516,18 @@ def _parse_json_names(text: str, where: str) -> list[Any]:
             f"{where}: expected a list of names or an object from index to name"
         )
     return names
+
+
+def _parse_json_text(text: str, where: str) -> Any:
+    """Return the JSON value in a label file; raise FileFormatError if it is invalid."""
+    try:
+        return parse_json(text)
+    except json.JSONDecodeError as error:
+        raise FileFormatError(
+            f"{where}: not valid JSON (line {error.lineno}: {error.msg})"
+        ) from None
+    except ValueError as error:
+        raise FileFormatError(f"{where}: expected label names, got {error}") from None
 
 
 def _check_names(
@@ -497,15 +549,19 @@ def _find_problem(names: Sequence[Any]) -> str:
     """Return what is wrong with label names as a clause; "" if nothing is."""
     if not names:
         return "expected label names, got an empty list"
-    for index, name in enumerate(names):
-        if not isinstance(name, str) or not name.strip():
-            return (
-                f"expected a name (non-empty text) for class {index}, got "
-                f"{repr(name)[:60]}"
-            )
-        if len(name) > MAX_NAME_CHARACTERS:
-            return (
-                f"expected a name of at most {MAX_NAME_CHARACTERS} characters for "
-                f"class {index}, got {len(name):,}"
-            )
+    problems = (_find_name_problem(name, index) for index, name in enumerate(names))
+    return next(filter(None, problems), "")
+
+
+def _find_name_problem(name: Any, index: int) -> str:
+    """Return what is wrong with the name of a class as a clause; "" if nothing is."""
+    if not isinstance(name, str) or not name.strip():
+        return (
+            f"expected a name (non-empty text) for class {index}, got {repr(name)[:60]}"
+        )
+    if len(name) > MAX_NAME_CHARACTERS:
+        return (
+            f"expected a name of at most {MAX_NAME_CHARACTERS} characters for "
+            f"class {index}, got {len(name):,}"
+        )
     return ""

@@ -147,16 +147,13 @@ def load_model(
     read = read or (task and task.output_reader)
     names = None if labels is None else read_labels(labels)
     origin = find_labels_origin(labels)
-    if names is not None and task and task.names_source:
-        raise InputError(
-            f"labels: the names of task {task.name} are those of "
-            f"{task.names_source}; leave `labels` out"
-        )
+    _check_names_source(names, task)
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
     source = _find_source(spec, _state_purpose(task, names, prompts, ask))
     switches = find_expected_torch_state()
     if prompts is not None:
         _check_reads_text(source, spec)
+    # `switches` are those of torch that the code of the network expects.
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
         use_torch_state_in_calls(source.module, switches)
     if task:
@@ -164,9 +161,7 @@ def load_model(
     if isinstance(source, Model):
         model = _adapt_model(source, options, read, name, names, origin)
     else:
-        _check_takes_images_alone(source)
-        if read is not None and isinstance(source.module, nn.Module):
-            source = _add_training_arguments(source)
+        source = _complete_source(source, read)
         _check_max_batch(max_batch)
         model = _probe_source(source, options, read, name, names, origin)
     # The model can be loaded again from its name alone, such as in a resumed run, only
@@ -175,6 +170,27 @@ def load_model(
     if isinstance(spec, (str, os.PathLike)) and is_defined_by_spec:
         return replace(model, spec=os.fspath(spec))
     return model
+
+
+def _check_names_source(names: tuple[str, ...] | None, task: Any) -> None:
+    """Raise InputError if a user gave names to a task that has names of its own."""
+    if names is not None and task and task.names_source:
+        raise InputError(
+            f"labels: the names of task {task.name} are those of "
+            f"{task.names_source}; leave `labels` out"
+        )
+
+
+def _complete_source(source: Source, read: Read | None) -> Source:
+    """Return a source with what it stores of its training, if its outputs are read.
+
+    Raises:
+        ModelError: the network takes more than images.
+    """
+    _check_takes_images_alone(source)
+    if read is not None and isinstance(source.module, nn.Module):
+        return _add_training_arguments(source)
+    return source
 
 
 def _state_purpose(
@@ -299,19 +315,30 @@ def _adapt_model(
     # `spec` alone does not load the model with another name or other labels. Another
     # `read` does not matter, since it usually follows from the task.
     has_same_names = names is None and name is None
-    adapted_model = replace(
-        model,
-        name=name or model.name,
-        read=read or model.read,
-        spec=model.spec if has_same_names else None,
-    )
-    if names is None:
-        return adapted_model
-    returns_logits = adapted_model.read is None
+    spec = model.spec if has_same_names else None
+    read = read or model.read
+    model = replace(model, name=name or model.name, read=read, spec=spec)
+    return model if names is None else _replace_labels(model, names, origin)
+
+
+def _replace_labels(
+    model: Model, names: tuple[str, ...], origin: LabelsOrigin
+) -> Model:
+    """Return a model with other names of its classes.
+
+    Args:
+        model: the model.
+        names: names of classes.
+        origin: where the names come from, for messages.
+
+    Raises:
+        InputError: the number of names is not that of classes.
+    """
+    returns_logits = model.read is None
     if returns_logits:
         # Only logits have a known number of classes, which the names must fit.
-        names = fit_labels(adapted_model.classes, names, origin, adapted_model.name)
-    return replace(adapted_model, labels=names, named=True)
+        names = fit_labels(model.classes, names, origin, model.name)
+    return replace(model, labels=names, named=True)
 
 
 def _probe_source(
@@ -332,24 +359,30 @@ def _probe_source(
         names: names of classes; None for those of the source.
         origin: where the names come from, for messages.
     """
-    min_batch, max_batch = source.batch_limits
-    requested_max_batch = options.get("max_batch")
-    if requested_max_batch:
-        max_batch = min(max_batch, requested_max_batch)
     preprocessing = _make_preprocessing(source, options)
     model = Model(
         module=_adapt_to_images_alone(source, preprocessing),
         name=name or source.name,
         labels=(),  # `probe_model` sets them, when the number of classes is known
         preprocessing=preprocessing,
-        # The option `max_batch` cannot go below what the network needs.
-        batch_limits=(min_batch, max(min_batch, max_batch)),
+        batch_limits=_limit_batch_size(source, options.get("max_batch")),
         dtype=source.dtype,
         device=source.device,
         read=read,
     )
     class_names = source.labels if names is None else names
     return probe_model(model, class_names, origin)
+
+
+def _limit_batch_size(source: Source, max_batch: int | None) -> tuple[int, int]:
+    """Return the minimum and maximum batch size of a network.
+
+    The option `max_batch` cannot go below what the network needs.
+    """
+    min_size, max_size = source.batch_limits
+    if max_batch:
+        max_size = min(max_size, max_batch)
+    return min_size, max(min_size, max_size)
 
 
 def _adapt_to_images_alone(
@@ -403,15 +436,14 @@ def _find_source(spec: object, purpose: Purpose) -> Source | Model:
         return library_source or make_source(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
-    if not isinstance(spec, str):
-        got = type(spec).__name__
-        if isinstance(spec, type):
-            got = f"the class {spec.__name__} (pass an instance)"
-        raise InputError(
-            "model: expected a name, a path, an nn.Module or a Model, "
-            f"got {got}. {FORMS}"
-        )
-    return _find_named_source(spec.strip(), purpose)
+    if isinstance(spec, str):
+        return _find_named_source(spec.strip(), purpose)
+    got = type(spec).__name__
+    if isinstance(spec, type):
+        got = f"the class {spec.__name__} (pass an instance)"
+    raise InputError(
+        f"model: expected a name, a path, an nn.Module or a Model, got {got}. {FORMS}"
+    )
 
 
 def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
@@ -443,15 +475,19 @@ def _find_named_source(text: str, purpose: Purpose) -> Source | Model:
         # If there is no such package, it may be a misspelt source: the message of the
         # error then has similar names of `SOURCES`.
         return load_callable(text, SOURCES)
-    is_path = (
+    if _is_model_path(text):
+        return files.load_file(Path(text))
+    raise _make_unknown_error(text)
+
+
+def _is_model_path(text: str) -> bool:
+    """Return whether a text is meant as the path of a model file."""
+    return (
         Path(text).suffix.lower() in files.SUFFIXES
         or "/" in text
         or os.sep in text
         or os.path.exists(text)
     )
-    if is_path:
-        return files.load_file(Path(text))
-    raise _make_unknown_error(text)
 
 
 def _make_unknown_error(text: str) -> UnknownNameError:
@@ -544,25 +580,11 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
         InputError: an option is out of range, or the source's processor excludes it.
     """
     _check_processor(source, options)
-    fields: dict[str, Any] = {
-        "mean": source.mean,
-        "std": source.std,
-        "layout": source.layout,
-        "channels": source.channels,
-        "processor": source.processor,
-        "input_size": source.input_size or DEFAULT_INPUT_SIZE,
-    }
+    fields = _list_source_fields(source)
     if "input_size" in options:
         fields["input_size"] = _parse_input_size(options["input_size"])
-    if source.value_range is not None:
-        fields["value_range"] = source.value_range
     fields |= _parse_normalization(options)
-    std = fields["std"] or ()  # None if it is not stated
-    if any(number <= 0 for number in std):
-        raise InputError(
-            "std: expected numbers greater than 0, got "
-            f"{options.get('std', fields['std'])!r}"
-        )
+    _check_std(fields["std"], options)
     if "value_range" in options:
         fields["value_range"] = _parse_value_range(options["value_range"])
     if isinstance(source.module, EightBitInput):
@@ -574,6 +596,34 @@ def _make_preprocessing(source: Source, options: Mapping[str, Any]) -> Preproces
     # `Preprocessing` has defaults.
     stated_fields = {key: value for key, value in fields.items() if value}
     return Preprocessing(**stated_fields)
+
+
+def _list_source_fields(source: Source) -> dict[str, Any]:
+    """Return the fields of `Preprocessing` as a source states them, by name."""
+    fields: dict[str, Any] = {
+        "mean": source.mean,
+        "std": source.std,
+        "layout": source.layout,
+        "channels": source.channels,
+        "processor": source.processor,
+        "input_size": source.input_size or DEFAULT_INPUT_SIZE,
+    }
+    if source.value_range is not None:
+        fields["value_range"] = source.value_range
+    return fields
+
+
+def _check_std(std: Any, options: Mapping[str, Any]) -> None:
+    """Raise InputError if a standard deviation is not over 0.
+
+    Args:
+        std: three numbers, or None if they are not stated.
+        options: options of `load_model`, for the message.
+    """
+    if any(number <= 0 for number in std or ()):
+        raise InputError(
+            f"std: expected numbers greater than 0, got {options.get('std', std)!r}"
+        )
 
 
 def _parse_input_size(value: Any) -> tuple[int, int]:
@@ -603,18 +653,22 @@ def _parse_normalization(options: Mapping[str, Any]) -> dict[str, Any]:
     for key in ("mean", "std"):
         value = options.get(key)
         if isinstance(value, str) and value.strip().lower() in PRESETS:
-            preset_mean, preset_std = PRESETS[value.strip().lower()]
-            # The preset does not replace the other option, if the user stated it.
-            if key == "mean" or "mean" not in options:
-                fields["mean"] = preset_mean
-            if key == "std" or "std" not in options:
-                fields["std"] = preset_std
+            preset = PRESETS[value.strip().lower()]
+            for preset_key, numbers in zip(("mean", "std"), preset, strict=True):
+                # The preset does not replace the other option, if the user stated it.
+                if preset_key == key or preset_key not in options:
+                    fields[preset_key] = numbers
         elif value is not None:
-            expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
-            numbers = _parse_numbers(key, value, (1, 3), expected)
-            is_single = len(numbers) == 1  # for all channels
-            fields[key] = (numbers * 3) if is_single else numbers
+            fields[key] = _parse_channels(key, value)
     return fields
+
+
+def _parse_channels(key: str, value: Any) -> tuple[float, ...]:
+    """Parse three numbers, one for each channel, from one number or three."""
+    expected = f"one number, three numbers, or one of {', '.join(PRESETS)}"
+    numbers = _parse_numbers(key, value, (1, 3), expected)
+    is_single = len(numbers) == 1  # for all channels
+    return numbers * 3 if is_single else numbers
 
 
 def _parse_value_range(value: Any) -> tuple[float, float]:
@@ -663,11 +717,7 @@ def _parse_numbers(
         InputError: they are no numbers, or their count is none of `counts`.
     """
     problem = InputError(f"{key}: expected {expected}, got {value!r}")
-    if isinstance(value, str):
-        value = value.split(",")
-    elif hasattr(value, "tolist"):  # a tensor or an array
-        value = value.tolist()
-    items = list(value) if isinstance(value, Sequence) else [value]
+    items = _split_into_items(value)
     try:
         numbers = tuple(float(item) for item in items)
     except (TypeError, ValueError):
@@ -675,3 +725,14 @@ def _parse_numbers(
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
         raise problem
     return numbers
+
+
+def _split_into_items(value: Any) -> list[Any]:
+    """Return the items of a sequence, a tensor or a string with commas; for any other
+    value a list with this value.
+    """
+    if isinstance(value, str):
+        value = value.split(",")
+    elif hasattr(value, "tolist"):  # a tensor or an array
+        value = value.tolist()
+    return list(value) if isinstance(value, Sequence) else [value]

@@ -77,24 +77,41 @@ class _Recomputed(torch.autograd.Function):
                 # The graph of this computation begins at the images.
                 images = images.detach().requires_grad_()
             tensors, _ = tree_flatten(ctx.function(images))
-        outputs = []
-        output_gradients = []
-        for tensor, gradient in zip(tensors, gradients, strict=True):
-            if tensor.requires_grad and gradient is not None:
-                outputs.append(tensor)
-                output_gradients.append(gradient)
-        if not outputs:
-            return None, None, torch.zeros_like(images)
-        (image_gradient,) = torch.autograd.grad(
-            outputs,
-            images,
-            output_gradients,
-            create_graph=create_graph,
-            allow_unused=True,
+        image_gradient = _propagate_gradients(
+            tensors, images, gradients, create_graph=create_graph
         )
         if image_gradient is None:
             image_gradient = torch.zeros_like(images)
         return None, None, image_gradient
+
+
+def _propagate_gradients(
+    tensors: Sequence[Tensor],
+    images: Tensor,
+    gradients: Sequence[Tensor | None],
+    *,
+    create_graph: bool,
+) -> Tensor | None:
+    """Return the gradient by images for the gradients of tensors; None if it is zero.
+
+    Args:
+        tensors: tensors that were computed from the images.
+        images: (N, H, W, 3).
+        gradients: gradient of each tensor; None if it is zero.
+        create_graph: whether the result has a graph, for a gradient of it.
+    """
+    outputs = []
+    output_gradients = []
+    for tensor, gradient in zip(tensors, gradients, strict=True):
+        if tensor.requires_grad and gradient is not None:
+            outputs.append(tensor)
+            output_gradients.append(gradient)
+    if not outputs:
+        return None
+    (image_gradient,) = torch.autograd.grad(
+        outputs, images, output_gradients, create_graph=create_graph, allow_unused=True
+    )
+    return image_gradient
 
 
 def compute_checkpointed(function: Callable[[Tensor], Any], images: Tensor) -> Any:
@@ -230,15 +247,7 @@ class Preprocessing:
         Returns:
             (N, 3, H, W), or (N, H, W, 3) for the layout NHWC, at `input_size`.
         """
-        x = images.permute(0, 3, 1, 2)
-        if self.resizes and (x.shape[2], x.shape[3]) != self.input_size:
-            x = F.interpolate(
-                x,
-                size=self.input_size,
-                mode="bilinear",
-                align_corners=False,
-                antialias=True,
-            )
+        x = self._resize_to_input(images.permute(0, 3, 1, 2))
         if self.processor:
             # a copy, as the processor may write into its argument
             x = self.processor(x.clone())
@@ -247,6 +256,18 @@ class Preprocessing:
         if self.layout == "NCHW":
             return x.contiguous()
         return x.permute(0, 2, 3, 1).contiguous()
+
+    def _resize_to_input(self, x: Tensor) -> Tensor:
+        """Return images (N, 3, H, W) at `input_size`, if the network needs that size."""
+        if not self.resizes or (x.shape[2], x.shape[3]) == self.input_size:
+            return x
+        return F.interpolate(
+            x,
+            size=self.input_size,
+            mode="bilinear",
+            align_corners=False,
+            antialias=True,
+        )
 
     def _normalize(self, x: Tensor) -> Tensor:
         """Apply value range, channel order and normalization to images (N, 3, H, W).
@@ -266,9 +287,8 @@ class Preprocessing:
         is_identity = gain == [1.0] * 3 and offset == [0.0] * 3
         if is_identity:
             return x
-        return torch.addcmul(
-            x.new_tensor(offset).view(3, 1, 1), x, x.new_tensor(gain).view(3, 1, 1)
-        )
+        gain_of_channel = x.new_tensor(gain).view(3, 1, 1)
+        return torch.addcmul(x.new_tensor(offset).view(3, 1, 1), x, gain_of_channel)
 
 
 @final
@@ -362,30 +382,20 @@ class Model:
         images = self._split_cameras(check_images(images))
         # whether activations are computed again for the gradient, and not stored
         recomputes = self._must_recompute(images)
-
-        def return_to_device(output: Tensor) -> Tensor:
-            """Return an output on the device of the images.
-
-            It is a copy, because the network may write its next output into the same
-            memory. An output with a gradient is a new tensor in each call.
-            """
-            returned = output.to(images.device)
-            may_be_overwritten = returned is output and not output.requires_grad
-            return returned.clone() if may_be_overwritten else returned
-
-        def run_batch(batch: Tensor) -> Any:
-            """Return the output for a batch of images (N, H, W, 3)."""
-            # `prepare` fills up a batch that is too small with copies of an image: the
-            # outputs for these are cut off.
-            output = self.run_network(self.prepare(batch))[: len(batch)]
-            return map_tensors(output, return_to_device)
-
+        run = partial(self._run_batch, device=images.device)
         outputs = [
-            compute_checkpointed(run_batch, batch) if recomputes else run_batch(batch)
+            compute_checkpointed(run, batch) if recomputes else run(batch)
             for batch in images.split(self._find_max_batch(recomputes=recomputes))
         ]
         output = outputs[0] if len(outputs) == 1 else join_outputs(outputs)
         return output if self.cameras == 1 else self._group_by_image(output)
+
+    def _run_batch(self, batch: Tensor, device: torch.device) -> Any:
+        """Return the output for a batch of images (N, H, W, 3), on a device."""
+        # `prepare` fills up a batch that is too small with copies of an image: the
+        # outputs for these are cut off.
+        output = self.run_network(self.prepare(batch))[: len(batch)]
+        return map_tensors(output, partial(_copy_to_device, device=device))
 
     def _split_cameras(self, images: Tensor) -> Tensor:
         """Return the images of all cameras, (N * cameras, H, W, 3).
@@ -515,15 +525,7 @@ class Model:
             The output as `Model` returns it; with `raw`, the network's own return
             value.
         """
-        INTERRUPTS.raise_pending()  # ends here after Ctrl-C
-        computes_gradients = torch.is_grad_enabled()
-        # For an `attached` model, `detach` does nothing, so that gradients pass it.
-        ignores_detach = self.attached and computes_gradients
-        detach_mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
-        # The network may switch gradients on or off as it runs: this context restores
-        # the switch at its end.
-        with detach_mode, torch.set_grad_enabled(computes_gradients):
-            returned = self.module(x)
+        returned = self._call_network(x)
         if raw:
             return returned
         if self.read is not None:
@@ -532,6 +534,29 @@ class Model:
         if self.probabilities:
             return logits.clamp_min(MIN_PROBABILITY).log()
         return logits
+
+    def _call_network(self, x: Tensor) -> Any:
+        """Return the network's own return value for a batch that `prepare` returned."""
+        INTERRUPTS.raise_pending()  # ends here after Ctrl-C
+        computes_gradients = torch.is_grad_enabled()
+        # For an `attached` model, `detach` does nothing, so that gradients pass it.
+        ignores_detach = self.attached and computes_gradients
+        detach_mode = DetachMode(ignored=True) if ignores_detach else nullcontext()
+        # The network may switch gradients on or off as it runs: this context restores
+        # the switch at its end.
+        with detach_mode, torch.set_grad_enabled(computes_gradients):
+            return self.module(x)
+
+
+def _copy_to_device(output: Tensor, device: torch.device) -> Tensor:
+    """Return an output on a device.
+
+    It is a copy, because the network may write its next output into the same memory. An
+    output with a gradient is a new tensor in each call.
+    """
+    returned = output.to(device)
+    may_be_overwritten = returned is output and not output.requires_grad
+    return returned.clone() if may_be_overwritten else returned
 
 
 def copy_sharing_weights(module: nn.Module) -> nn.Module:
@@ -622,8 +647,20 @@ def check_images(images: Tensor) -> Tensor:
         )
     if not images.is_floating_point():
         raise InputError(f"{expected}, got {images.dtype}; divide 8-bit values by 255")
+    _check_unit_range(images, expected)
+    return images if images.dim() == 4 else images.unsqueeze(0)
+
+
+def _check_unit_range(images: Tensor, expected: str) -> None:
+    """Raise InputError if a value is outside of [0, 1] by more than `RANGE_TOLERANCE`.
+
+    NaN and infinity pass: the search handles them.
+
+    Args:
+        images: tensor of any shape, not empty.
+        expected: beginning of the message.
+    """
     low, high = (float(limit) for limit in images.detach().aminmax())
-    # NaN and infinity pass: the search handles them.
     is_too_low = -math.inf < low < -RANGE_TOLERANCE
     is_too_high = 1 + RANGE_TOLERANCE < high < math.inf
     if is_too_low or is_too_high:
@@ -631,7 +668,6 @@ def check_images(images: Tensor) -> Tensor:
             f"{expected}, got values from {low:.4g} to {high:.4g}; `value_range` is "
             "for the network's side"
         )
-    return images if images.dim() == 4 else images.unsqueeze(0)
 
 
 def read_output(read: Read, returned: Any, count: int, name: str) -> Any:
@@ -757,6 +793,16 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
         if output.requires_grad:
             correct_batch_norm_gradients(output)
         return output.float()
+    return _find_checked_logits(output, count, classes, name)
+
+
+def _find_checked_logits(
+    output: Any, count: int, classes: int | None, name: str
+) -> Tensor:
+    """Return the logits in a network's return value of any accepted form.
+
+    The arguments and errors are those of `read_logits`.
+    """
     tensor = _find_logits(output)
     expected = (
         f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
@@ -767,6 +813,22 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
             f"{expected}, got {type(output).__name__}; wrap the network "
             "so that it returns one tensor"
         )
+    _check_logits(tensor, count, classes, expected)
+    correct_batch_norm_gradients(tensor)
+    return tensor.float()
+
+
+def _check_logits(
+    tensor: Tensor, count: int, classes: int | None, expected: str
+) -> None:
+    """Raise ModelError if a tensor is not of the shape or the type of logits.
+
+    Args:
+        tensor: tensor in the output of a network.
+        count: number of images.
+        classes: number of classes; None if it is unknown.
+        expected: beginning of the message.
+    """
     shape = tuple(tensor.shape)
     has_rows = len(shape) == 2 and shape[0] == count and shape[1] >= 2
     if not has_rows or (classes is not None and shape[1] != classes):
@@ -776,8 +838,6 @@ def read_logits(output: Any, count: int, classes: int | None, name: str) -> Tens
             f"{expected} and floating type, got {tensor.dtype}; return "
             "scores, not the predicted class"
         )
-    correct_batch_norm_gradients(tensor)
-    return tensor.float()
 
 
 def _check_is_classifier(output: Any, tensor: Tensor | None, expected: str) -> None:
@@ -819,25 +879,6 @@ def correct_batch_norm_gradients(output: Any) -> None:
     Args:
         output: output of a network, whose graph gets hooks.
     """
-
-    def with_strides(
-        strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]
-    ) -> tuple[Tensor | None, ...]:
-        """Return the gradients that reach a batch norm, the first with these strides.
-
-        Args:
-            strides: strides of the input of the batch norm.
-            gradients: gradients with respect to each output of the batch norm. The
-                first output is the normalized images; the others are statistics.
-        """
-        gradient, *rest = gradients
-        if gradient is None or gradient.stride() == strides:
-            return gradients
-        strided = torch.empty_strided(
-            gradient.shape, strides, dtype=gradient.dtype, device=gradient.device
-        )
-        return strided.copy_(gradient), *rest
-
     # Walk back through the graph of the output, and hook every batch norm in it.
     pending: list[Any] = [tensor.grad_fn for tensor in list_tensors(output)]
     visited = {None}  # a tensor without a graph has the node None
@@ -851,7 +892,26 @@ def correct_batch_norm_gradients(output: Any) -> None:
             # `empty_like` keeps the order of axes in memory; a "meta" tensor takes
             # none.
             strides = torch.empty_like(node._saved_input, device="meta").stride()
-            node.register_prehook(partial(with_strides, strides))
+            node.register_prehook(partial(_apply_strides, strides))
+
+
+def _apply_strides(
+    strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]
+) -> tuple[Tensor | None, ...]:
+    """Return the gradients that reach a batch norm, the first with these strides.
+
+    Args:
+        strides: strides of the input of the batch norm.
+        gradients: gradients with respect to each output of the batch norm. The first
+            output is the normalized images; the others are statistics.
+    """
+    gradient, *rest = gradients
+    if gradient is None or gradient.stride() == strides:
+        return gradients
+    strided = torch.empty_strided(
+        gradient.shape, strides, dtype=gradient.dtype, device=gradient.device
+    )
+    return strided.copy_(gradient), *rest
 
 
 def _find_logits(output: Any) -> Tensor | None:
@@ -914,9 +974,7 @@ def _guess_task(returned: Any) -> str | None:
     """
     if _looks_like_boxes(returned):
         return "detection"
-    if isinstance(returned, Mapping) and any(
-        word in str(key) for key in returned for word in ("depth", "disparity")
-    ):
+    if _looks_like_depth(returned):
         return "depth"
     # an encoder of transformers
     if hasattr(returned, "last_hidden_state") and not hasattr(returned, "logits"):
@@ -931,6 +989,14 @@ def _guess_task(returned: Any) -> str | None:
     # scores are (N, classes), or for each pixel (N, classes, H, W)
     task_of_dimensions = {2: "classification", 4: "segmentation"}
     return task_of_dimensions.get(scores.dim())
+
+
+def _looks_like_depth(returned: Any) -> bool:
+    """Return whether an output of a network is a mapping that names depths."""
+    if not isinstance(returned, Mapping):
+        return False
+    names = [str(key) for key in returned]
+    return any("depth" in name or "disparity" in name for name in names)
 
 
 def _looks_like_boxes(returned: Any) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
@@ -18,7 +18,12 @@ from torch import Tensor, nn
 
 from advsearch.errors import ModelError
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
+from advsearch.models.inputs import (
+    EightBitInput,
+    WithImageSize,
+    WithState,
+    is_required,
+)
 from advsearch.models.labels import LabelsOrigin, fit_labels
 from advsearch.models.model import (
     PROGRAMS,
@@ -112,13 +117,10 @@ def probe_model(
             batch; or no gradient reaches the image.
     """
     _check_batch_size(model)
-    height, width = model.input_size
-    gray = torch.full((1, height, width, 3), 0.5)
-    noise = torch.rand(gray.shape, generator=torch.Generator().manual_seed(0))
+    gray, noise = _make_probe_images(*model.input_size)
     with torch.no_grad():
-        rows = torch.cat(
-            [_compute_output_rows(model, gray), _compute_output_rows(model, noise)]
-        )
+        rows_of_images = [_compute_output_rows(model, image) for image in (gray, noise)]
+        rows = torch.cat(rows_of_images)
         repeated_rows = _compute_output_rows(model, gray)
     _check_finite(model, rows)
     returns_logits = model.read is None
@@ -134,26 +136,33 @@ def probe_model(
     if repeatable and returns_logits and not probabilities:
         _warn_of_odd_scores(model, rows)
     if repeatable:
-        black = torch.zeros_like(gray)
-        white = torch.ones_like(gray)
-        _check_range(model, torch.cat([black, white, noise]))
+        _check_range(model, _make_unlike_images(noise))
     else:
         warn(
             f"model {model.name} differs each time on the same image: results hold "
             "for single draws only"
         )
+    probed = _probe_gradient(model, noise, repeatable)
+    # The outputs for a batch are compared with those of single images.
+    compared_rows = rows if repeatable else None
     return dataclasses.replace(
-        _probe_gradient(model, noise, repeatable),
+        probed,
         labels=names,
         named=labels is not None,
         probabilities=probabilities,
-        batch_limits=_find_batch_limits(
-            model,
-            torch.cat([gray, noise]),
-            # The outputs for a batch are compared with these of single images.
-            rows if repeatable else None,
-        ),
+        batch_limits=_find_batch_limits(model, torch.cat([gray, noise]), compared_rows),
     )
+
+
+def _make_unlike_images(noise: Tensor) -> Tensor:
+    """Return a black and a white image, and one of noise, from the latter (1, H, W, 3).
+
+    Returns:
+        (3, H, W, 3).
+    """
+    black = torch.zeros_like(noise)
+    white = torch.ones_like(noise)
+    return torch.cat([black, white, noise])
 
 
 def _check_batch_size(model: Model) -> None:
@@ -184,6 +193,13 @@ def _check_finite(model: Model, rows: Tensor) -> None:
         f"{image} image; "
         "check its weights and the value range and normalization that it expects"
     )
+
+
+def _make_probe_images(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Return a gray image and one of uniform noise, (1, height, width, 3) each."""
+    gray = torch.full((1, height, width, 3), 0.5)
+    noise = torch.rand(gray.shape, generator=torch.Generator().manual_seed(0))
+    return gray, noise
 
 
 def _find_probabilities(model: Model, rows: Tensor) -> bool:
@@ -238,16 +254,22 @@ def _compute_output_rows(model: Model, images: Tensor) -> Tensor:
         returned, batch_size = _run_network(model, images)
         logits = read_logits(returned, batch_size, classes=None, name=model.name)
         return logits[: len(images)].cpu()
-    rows = []
-    for output in _run_and_read(model, images):
-        # `cat` needs at least one tensor, but an output may have none: an empty one is
-        # added.
-        tensors = [torch.zeros(0, device="cpu")]
-        tensors += [tensor.float().flatten().cpu() for tensor in list_tensors(output)]
-        values = torch.cat(tensors)
-        size = torch.tensor(float(len(values))).to(values)
-        rows.append(torch.stack([size, values.sum(), values.abs().sum()]))
-    return torch.stack(rows)
+    return torch.stack(
+        [_summarize_output(output) for output in _run_and_read(model, images)]
+    )
+
+
+def _summarize_output(output: Any) -> Tensor:
+    """Return the count of an output's numbers, their sum, and that of their magnitudes,
+    (3,).
+    """
+    # `cat` needs at least one tensor, but an output may have none: an empty one is
+    # added.
+    tensors = [torch.zeros(0, device="cpu")]
+    tensors += [tensor.float().flatten().cpu() for tensor in list_tensors(output)]
+    values = torch.cat(tensors)
+    size = torch.tensor(float(len(values))).to(values)
+    return torch.stack([size, values.sum(), values.abs().sum()])
 
 
 def _run_and_read(model: Model, images: Tensor) -> Any:
@@ -323,10 +345,7 @@ def _explain_failed_call(
         The reason, to follow the model's name; and advice, a further sentence or "".
     """
     if isinstance(model.module, WithState) and model.module.state:
-        sizes = ", ".join(
-            f"{name} (N, {len(numbers)})"
-            for name, numbers in model.module.state.items()
-        )
+        sizes = _list_state_sizes(model.module.state)
         reason = f"cannot be called with pictures and a state of {sizes[:200]}"
         return reason, ". Give the `state` that it was made for"
     reason = _describe_other_inputs(network, str(error))
@@ -356,6 +375,11 @@ LABEL_ARGUMENTS = {
     "ground_truth",
 }
 """Names of arguments that take the right labels, for networks that compute a loss."""
+
+
+def _list_state_sizes(state: Mapping[str, Sequence[float]]) -> str:
+    """Return the names of a state's inputs with their shapes, as text."""
+    return ", ".join(f"{name} (N, {len(numbers)})" for name, numbers in state.items())
 
 
 def _describe_other_inputs(network: object, error: str) -> str:
@@ -401,18 +425,11 @@ def _list_missing_inputs(network: nn.Module, error: str) -> list[str]:
         parameters = list(inspect.signature(network.forward).parameters.values())[1:]
     except (TypeError, ValueError):  # it is not written in Python
         return []
-    variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    required = {
-        parameter.name
-        for parameter in parameters
-        if parameter.kind not in variadic
-        and parameter.default is inspect.Parameter.empty
-    }
     named_in_error = LABEL_ARGUMENTS & set(re.findall(r"\w+", error))
     return [
         parameter.name
         for parameter in parameters
-        if parameter.name in required | named_in_error
+        if is_required(parameter) or parameter.name in named_in_error
     ]
 
 
@@ -493,20 +510,8 @@ def _check_range(model: Model, images: Tensor) -> None:
     outputs = _collect_numbers(model, images)
     if outputs is None or _follows_images(outputs):
         return
-    wide_preprocessing = dataclasses.replace(model.preprocessing, value_range=EIGHT_BIT)
-    wide_model = dataclasses.replace(model, preprocessing=wide_preprocessing)
-    wide_outputs = _collect_numbers(wide_model, images)
-    if (
-        wide_outputs is None
-        or wide_outputs.shape != outputs.shape
-        or not _follows_images(wide_outputs)
-    ):
-        return
-    magnitude = outputs.abs().amax(dim=0).mean()
-    wide_magnitude = wide_outputs.abs().amax(dim=0).mean()
-    growth = float(wide_magnitude / magnitude)  # infinite or NaN if all outputs are 0
-    # Outputs of untrained networks grow with the colors in any case: no warning.
-    if 1.0 / MAX_GROWTH < growth < MAX_GROWTH:
+    wide_outputs = _find_wide_outputs(model, images, outputs)
+    if wide_outputs is not None:
         warn(
             f"outputs of model {model.name} hardly follow the picture: they differ by "
             f"{_compute_relative_change(outputs):.1%} "
@@ -514,6 +519,31 @@ def _check_range(model: Model, images: Tensor) -> None:
             f"{_compute_relative_change(wide_outputs):.0%} if colors go from 0 to "
             "255. If it is made for these, give `value_range=0,255`"
         )
+
+
+def _find_wide_outputs(model: Model, images: Tensor, outputs: Tensor) -> Tensor | None:
+    """Return outputs for colors from 0 to 255, if a network seems made for these.
+
+    Args:
+        model: model that is probed.
+        images: (K, H, W, 3) unlike images.
+        outputs: (K, n) numbers for colors from 0 to 1, which hardly differ.
+
+    Returns:
+        (K, n); None if these outputs do not differ either, or have another magnitude.
+    """
+    wide_preprocessing = dataclasses.replace(model.preprocessing, value_range=EIGHT_BIT)
+    wide_model = dataclasses.replace(model, preprocessing=wide_preprocessing)
+    wide_outputs = _collect_numbers(wide_model, images)
+    if wide_outputs is None or wide_outputs.shape != outputs.shape:
+        return None
+    if not _follows_images(wide_outputs):
+        return None
+    magnitude = outputs.abs().amax(dim=0).mean()
+    wide_magnitude = wide_outputs.abs().amax(dim=0).mean()
+    growth = float(wide_magnitude / magnitude)  # infinite or NaN if all outputs are 0
+    # Outputs of untrained networks grow with the colors in any case.
+    return wide_outputs if 1.0 / MAX_GROWTH < growth < MAX_GROWTH else None
 
 
 def _is_program(network: object) -> bool:
@@ -557,13 +587,7 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
         except ModelError:
             # A network may reject colors of another range, such as 255.
             return None
-        numbers = [
-            tensor.float().flatten().cpu()
-            for tensor in list_tensors(returned)
-            if tensor.is_floating_point()
-        ]
-        # `cat` needs at least one tensor, but there may be none: an empty one is added.
-        rows.append(torch.cat([torch.zeros(0, device="cpu"), *numbers]))
+        rows.append(_join_numbers(returned))
     if len({len(row) for row in rows}) > 1 or len(rows[0]) == 0:
         return None
     outputs = torch.stack(rows)
@@ -571,6 +595,17 @@ def _collect_numbers(model: Model, images: Tensor) -> Tensor | None:
         return None
     are_scores = float(outputs.min()) >= 0.0 and float(outputs.max()) <= 1.0
     return torch.logit(outputs, eps=1e-6) if are_scores else outputs
+
+
+def _join_numbers(returned: Any) -> Tensor:
+    """Return all floating-point numbers that a network returned, (n,) on the CPU."""
+    numbers = [
+        tensor.float().flatten().cpu()
+        for tensor in list_tensors(returned)
+        if tensor.is_floating_point()
+    ]
+    # `cat` needs at least one tensor, but there may be none: an empty one is added.
+    return torch.cat([torch.zeros(0, device="cpu"), *numbers])
 
 
 def _compute_relative_change(outputs: Tensor) -> float:
@@ -609,16 +644,11 @@ def _find_batch_limits(
     """
     min_batch, max_batch = model.batch_limits
     if isinstance(model.module, AllAtOnce):
-        # The images of a rig stay together: the maximum is a multiple of their number.
-        cameras = model.module.cameras
-        max_batch = max(min_batch, max_batch - max_batch % cameras)
-        return max(min_batch, cameras), max_batch
+        return _fit_limits_to_rigs(min_batch, max_batch, model.module.cameras)
     if max_batch < 2:
         return min_batch, max_batch
-    try:
-        with torch.no_grad():
-            batch_rows = _compute_output_rows(model, pair)
-    except ModelError:  # it takes only one image at a time
+    batch_rows = _compute_rows_if_accepted(model, pair)
+    if batch_rows is None:  # it takes only one image at a time
         return 1, 1
     if rows is not None and not _are_equal(model, rows, batch_rows):
         warn(
@@ -626,6 +656,31 @@ def _find_batch_limits(
             "in training mode? Call .eval() before exporting"
         )
     return min_batch, max_batch
+
+
+def _fit_limits_to_rigs(
+    min_batch: int, max_batch: int, cameras: int
+) -> tuple[int, int]:
+    """Return batch limits with which the images of a rig stay together.
+
+    The maximum is a multiple of the number of images of a rig, if that is possible.
+
+    Args:
+        min_batch: minimum batch size.
+        max_batch: maximum batch size.
+        cameras: number of images of a rig.
+    """
+    max_batch = max(min_batch, max_batch - max_batch % cameras)
+    return max(min_batch, cameras), max_batch
+
+
+def _compute_rows_if_accepted(model: Model, images: Tensor) -> Tensor | None:
+    """Return a model's rows for a batch of images; None if the model fails on it."""
+    try:
+        with torch.no_grad():
+            return _compute_output_rows(model, images)
+    except ModelError:
+        return None
 
 
 def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
@@ -665,18 +720,23 @@ def _probe_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
             _check_gradient(model, images, gradient, detached=is_cut_by_detach)
     except (RuntimeError, ModelError) as error:
         has_gradient = False
-        reason = get_first_line(error)
-        if _rounds_to_eight_bit(model.module):
-            reason = (
-                "it takes whole numbers from 0 to 255, uint8, and rounding to these "
-                "has none"
-            )
+        reason = _explain_missing_gradient(model, error)
     if not has_gradient:
         warn(
             f"no gradient of model {model.name} reaches its image ({reason}): use "
             "`auto` or a policy without gradients"
         )
     return dataclasses.replace(model, differentiable=has_gradient)
+
+
+def _explain_missing_gradient(model: Model, error: Exception) -> str:
+    """Return why a network has no gradient, by the error that it raised."""
+    if _rounds_to_eight_bit(model.module):
+        return (
+            "it takes whole numbers from 0 to 255, uint8, and rounding to these "
+            "has none"
+        )
+    return get_first_line(error)
 
 
 def _rounds_to_eight_bit(module: object) -> bool:
@@ -757,14 +817,19 @@ def _try_attached(
         for step_size in (STEP, SMALL_STEP):
             step = max(step_size, min_step) * (attached_gradient - gradient).sign()
             change = _measure_change(model, images, step, attached_gradient, gradient)
-            attached_change, detached_change = change.predicted
-            detached_error = abs(change.actual - detached_change)
-            attached_error = abs(change.actual - attached_change)
-            is_better = attached_error < detached_error
-            is_accurate = attached_error < MAX_ATTACHED_ERROR * abs(attached_change)
-            if is_better and is_accurate:
+            if _is_first_better(change):
                 return attached, attached_gradient
     return model, gradient
+
+
+def _is_first_better(change: _Change) -> bool:
+    """Return whether the first of two gradients predicts a change better, and well."""
+    attached_change, detached_change = change.predicted
+    detached_error = abs(change.actual - detached_change)
+    attached_error = abs(change.actual - attached_change)
+    is_better = attached_error < detached_error
+    is_accurate = attached_error < MAX_ATTACHED_ERROR * abs(attached_change)
+    return is_better and is_accurate
 
 
 def _compute_gradient(model: Model, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -869,24 +934,9 @@ def _check_gradient(
         gradient: (N, H, W, 3), the gradient of `_compute_checked_value`.
         detached: whether the network detaches tensors, for the message.
     """
-    returns_logits = model.read is None
-    for step_size in _choose_step_sizes(model):
-        step = step_size * gradient.sign()
-        change = _measure_change(model, images, step, gradient)
-        if not returns_logits:
-            discrete_values = {
-                _collect_discrete_values(model, image)
-                for image in (images, *change.ends)
-            }
-            if len(discrete_values) > 1:
-                return  # outputs that jump cannot be compared with a gradient
-        predicted = change.predicted[0]  # there is one gradient
-        size = max(abs(change.actual), abs(predicted))
-        may_be_rounding = size <= MIN_CHANGE * change.total
-        is_predicted = abs(change.actual - predicted) <= MAX_GRADIENT_ERROR * size
-        if may_be_rounding or is_predicted:
-            return
-    # The change for the last step size is reported.
+    change = _find_unpredicted_change(model, images, gradient)
+    if change is None:
+        return
     reason = "Steps that round, or a defence that masks gradients?"
     if detached:
         reason = (
@@ -895,10 +945,58 @@ def _check_gradient(
         )
     warn(
         f"the gradient of model {model.name} does not say how its outputs change: "
-        f"{predicted:.3g} expected, {change.actual:.3g} observed for a small step "
-        f"along it. {reason} A search by this gradient may find nothing: try a policy "
-        "without gradients, too"
+        f"{change.predicted[0]:.3g} expected, {change.actual:.3g} observed for a small "
+        f"step along it. {reason} A search by this gradient may find nothing: try a "
+        "policy without gradients, too"
     )
+
+
+def _find_unpredicted_change(
+    model: Model, images: Tensor, gradient: Tensor
+) -> _Change | None:
+    """Return the change of outputs for the last step size, if a gradient is wrong.
+
+    None if the gradient predicts the change for one of the step sizes, or if outputs
+    jump, so that they cannot be compared with a gradient.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3).
+        gradient: (N, H, W, 3), the gradient of `_compute_checked_value`.
+    """
+    returns_logits = model.read is None
+    for step_size in _choose_step_sizes(model):
+        step = step_size * gradient.sign()
+        change = _measure_change(model, images, step, gradient)
+        if not returns_logits and _jumps(model, images, change):
+            return None
+        if _is_predicted(change, change.predicted[0]):  # there is one gradient
+            return None
+    return change
+
+
+def _jumps(model: Model, images: Tensor, change: _Change) -> bool:
+    """Return whether a part of an output that no gradient changes differs over a step.
+
+    Args:
+        model: model that is probed.
+        images: (N, H, W, 3) images in the middle of the step.
+        change: change of the outputs over it.
+    """
+    discrete_values = {
+        _collect_discrete_values(model, image) for image in (images, *change.ends)
+    }
+    return len(discrete_values) > 1
+
+
+def _is_predicted(change: _Change, predicted: float) -> bool:
+    """Return whether a change of outputs is as predicted, or so small that it may be
+    rounding.
+    """
+    size = max(abs(change.actual), abs(predicted))
+    may_be_rounding = size <= MIN_CHANGE * change.total
+    is_predicted = abs(change.actual - predicted) <= MAX_GRADIENT_ERROR * size
+    return may_be_rounding or is_predicted
 
 
 def _choose_step_sizes(model: Model) -> tuple[float, ...]:
@@ -935,14 +1033,19 @@ def _collect_discrete_values(model: Model, images: Tensor) -> str:
     outputs = _run_and_read(model, images)
     if isinstance(outputs, Tensor):
         return ""
-    discrete_values = list[Any]()
-    for tensor in list_tensors(outputs):
-        columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
-        # Classes may be stored as floating-point numbers.
-        is_integer = (columns == columns.round()).all(dim=1)
-        discrete_values.append((tensor.shape, columns[is_integer].tolist()))
+    discrete_values = [
+        _find_discrete_columns(tensor) for tensor in list_tensors(outputs)
+    ]
     for output in outputs:
         if isinstance(output, Mapping):
             texts = [value for value in output.values() if type(value) is str]
             discrete_values += texts
     return str(discrete_values)
+
+
+def _find_discrete_columns(tensor: Tensor) -> Any:
+    """Return the shape of a tensor, and its columns of integers."""
+    columns = tensor.flatten(1).T if tensor.ndim > 1 else tensor[None]
+    # Classes may be stored as floating-point numbers.
+    is_integer = (columns == columns.round()).all(dim=1)
+    return tensor.shape, columns[is_integer].tolist()

@@ -64,6 +64,10 @@ class ReferenceNet(nn.Module):
         self.features = nn.Sequential(*layers)
         self.dropout = nn.Dropout(dropout)
         self.head = nn.Linear(width, classes)
+        self._initialize_weights()
+
+    def _initialize_weights(self) -> None:
+        """Draw random weights for an untrained network."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(
@@ -215,18 +219,7 @@ def load_network(
         FileFormatError: `weights` is missing or is not safetensors.
     """
     folder = folder or get_data_folder()
-    try:
-        metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
-        labels = tuple(str(label) for label in metadata["labels"])
-        state = safetensors.load((folder / WEIGHTS).read_bytes())
-    except FileNotFoundError as error:
-        raise ModelError(
-            f"the reference model is missing ({error.filename}); {REMEDY}"
-        ) from None
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
-        raise ModelError(
-            f"the reference model in {folder} cannot be read ({error}); {REMEDY}"
-        ) from None
+    labels, state = _read_reference_files(folder)
     net = build(len(labels))
     try:
         net.load_state_dict(state)
@@ -237,3 +230,23 @@ def load_network(
     if weights is not None:
         load_weights(net, weights, "reference")
     return net, labels
+
+
+def _read_reference_files(folder: Path) -> tuple[tuple[str, ...], dict[str, Tensor]]:
+    """Return the labels and the weights in a folder.
+
+    Raises:
+        ModelError: a file is missing or corrupt.
+    """
+    try:
+        metadata = json.loads((folder / METADATA).read_text(encoding="utf-8"))
+        labels = tuple(str(label) for label in metadata["labels"])
+        return labels, safetensors.load((folder / WEIGHTS).read_bytes())
+    except FileNotFoundError as error:
+        raise ModelError(
+            f"the reference model is missing ({error.filename}); {REMEDY}"
+        ) from None
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        raise ModelError(
+            f"the reference model in {folder} cannot be read ({error}); {REMEDY}"
+        ) from None

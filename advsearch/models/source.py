@@ -56,6 +56,9 @@ DEFAULT_SIZE = 448
 the sizes of patches of Qwen's networks.
 """
 
+# errors of `copy.deepcopy` for a module that cannot be copied
+COPY_ERRORS = (TypeError, AttributeError, RuntimeError, pickle.PickleError, copy.Error)
+
 
 @dataclass(frozen=True)
 class Purpose:
@@ -190,11 +193,8 @@ def _check_not_lazy(module: nn.Module, name: str) -> None:
         module: the network.
         name: name of the model, for the message.
     """
-    lazy_keys = [
-        key
-        for key, weights in (*module.named_parameters(), *module.named_buffers())
-        if is_lazy(weights)
-    ]
+    all_weights = (*module.named_parameters(), *module.named_buffers())
+    lazy_keys = [key for key, weights in all_weights if is_lazy(weights)]
     if not lazy_keys:
         return
     layer = lazy_keys[0].rpartition(".")[0]
@@ -246,13 +246,7 @@ def freeze_network(module: nn.Module, name: str) -> nn.Module:
     if not isinstance(module, PROGRAMS):
         try:
             module = copy_sharing_weights(module)
-        except (
-            TypeError,
-            AttributeError,
-            RuntimeError,
-            pickle.PickleError,
-            copy.Error,
-        ) as error:  # it holds a lock or an open file, for example
+        except COPY_ERRORS as error:  # it holds a lock or an open file, for example
             warn(
                 f"model {name} cannot be copied ({get_first_line(error)}): the module "
                 "itself is set to evaluation mode and its parameters are frozen"
@@ -330,18 +324,25 @@ def _describe_misfit(
         if key not in state and not key.endswith("num_batches_tracked")
     ]
     unexpected = [key for key in state if key not in expected]
-    shapes = [
-        f"{key} is {tuple(state[key].shape)} in the file and "
-        f"{tuple(expected[key].shape)} in the network"
-        for key in expected
-        if key in state and state[key].shape != expected[key].shape
-    ]
     problems = []
     for problem, keys in (("missing", missing), ("not in the network", unexpected)):
         if keys:
             suffix = ", ..." if len(keys) > 3 else ""
             problems.append(f"{len(keys)} {problem} ({', '.join(keys[:3])}{suffix})")
-    return [*problems, *shapes[:2]]  # two examples of wrong shapes are enough
+    # two examples of wrong shapes are enough
+    return [*problems, *_describe_wrong_shapes(expected, state)[:2]]
+
+
+def _describe_wrong_shapes(
+    expected: Mapping[str, Tensor], state: Mapping[str, Tensor]
+) -> list[str]:
+    """Describe which tensors of a file have another shape than those of a network."""
+    return [
+        f"{key} is {tuple(state[key].shape)} in the file and "
+        f"{tuple(tensor.shape)} in the network"
+        for key, tensor in expected.items()
+        if key in state and state[key].shape != tensor.shape
+    ]
 
 
 def split_weights(spec: str) -> tuple[str, Path | None]:
@@ -371,11 +372,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     """
     target, weights = split_weights(spec)
     check_import(target)
-    module_name, _, attribute = target.partition(":")
-    module = _import_module(module_name, spec, libraries)
-    value = _get_attribute(module, attribute, module_name)
-    if not isinstance(value, (nn.Module, Model)):  # a function or a class
-        value = _call_factory(value, spec)
+    value = _build_value(target, spec, libraries)
     if isinstance(value, Model):
         if weights is not None:
             raise ModelError(
@@ -393,6 +390,22 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     return make_source(value, spec)
 
 
+def _build_value(target: str, spec: str, libraries: Iterable[str]) -> Any:
+    """Return the attribute of a module, or what it returns if it is called.
+
+    Args:
+        target: ``package.module:callable``.
+        spec: what the user wrote, for messages.
+        libraries: names of model sources.
+    """
+    module_name, _, attribute = target.partition(":")
+    module = _import_module(module_name, spec, libraries)
+    value = _get_attribute(module, attribute, module_name)
+    if isinstance(value, (nn.Module, Model)):
+        return value
+    return _call_factory(value, spec)  # a function or a class
+
+
 def _get_attribute(module: ModuleType, attribute: str, module_name: str) -> Any:
     """Return an attribute of a module, or of a class in it.
 
@@ -407,18 +420,20 @@ def _get_attribute(module: ModuleType, attribute: str, module_name: str) -> Any:
     value: Any = module
     for name in attribute.split("."):
         if not hasattr(value, name):
-            public_callables = [
-                key
-                for key in vars(value)
-                if not key.startswith("_") and callable(getattr(value, key))
-            ]
-            raise UnknownNameError(
-                f"attribute of {module_name}",
-                name,
-                find_near_names(name, public_callables),
-            )
+            similar_names = find_near_names(name, _list_public_callables(value))
+            kind = f"attribute of {module_name}"
+            raise UnknownNameError(kind, name, similar_names)
         value = getattr(value, name)
     return value
+
+
+def _list_public_callables(value: Any) -> list[str]:
+    """Return the names of the public functions and classes of a module or class."""
+    return [
+        key
+        for key in vars(value)
+        if not key.startswith("_") and callable(getattr(value, key))
+    ]
 
 
 def _call_factory(factory: Any, spec: str) -> Any:
@@ -460,23 +475,36 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
         try:
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
-            missing = error.name
-            # Either the module itself, or a package that holds it, is missing; or
-            # another module that it imports.
-            is_module_itself = missing is not None and f"{name}.".startswith(
-                f"{missing}."
-            )
-            message = f"module {name!r} needs {missing!r}, which is not installed"
-            if is_module_itself:
-                message = (
-                    f"no module named {missing!r} on the Python path or in "
-                    f"{os.getcwd()}{_suggest_library(name, spec, libraries)}"
-                )
+            message = _explain_missing_module(error, name, spec, libraries)
             raise ModelError(f"model {spec}: {message}") from error
         except Exception as error:  # the user's code may raise anything
             raise ModelError(
                 f"model {spec}: importing {name!r} failed ({_where(error)})"
             ) from error
+
+
+def _explain_missing_module(
+    error: ModuleNotFoundError, name: str, spec: str, libraries: Iterable[str]
+) -> str:
+    """Return which module is missing.
+
+    Either that is the module itself or a package that holds it, or another module that
+    it imports.
+
+    Args:
+        error: error of the import.
+        name: name of the module that was to be imported.
+        spec: what the user wrote.
+        libraries: names of model sources.
+    """
+    missing = error.name
+    is_module_itself = missing is not None and f"{name}.".startswith(f"{missing}.")
+    if is_module_itself:
+        return (
+            f"no module named {missing!r} on the Python path or in "
+            f"{os.getcwd()}{_suggest_library(name, spec, libraries)}"
+        )
+    return f"module {name!r} needs {missing!r}, which is not installed"
 
 
 def _suggest_library(name: str, spec: str, libraries: Iterable[str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -95,38 +95,49 @@ class FunctionTask(Task):
         got = type(losses).__name__
         if is_tensor:
             got = f"{losses.dtype} {tuple(losses.shape)}"
-        plural = "" if n_outputs == 1 else "s"
-        raise InputError(
-            f"task {self.name}: expected the loss of each output, a tensor of "
-            f"{n_outputs} floating-point number{plural}, over 0 for a wrong output, got "
-            f"{got}; for example a distance minus a tolerance, or a wrong logit minus "
-            "the right one"
-        )
+        raise _make_loss_error(self.name, n_outputs, got)
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
-        """Return a prediction for each image.
+        """Return a prediction for each image (`_describe_values`)."""
+        return [(self._describe_values(values),) for values in output.detach()]
+
+    def _describe_values(self, values: Tensor) -> Prediction:
+        """Return the prediction for the output of an image.
 
         It is the class with the largest output if there is a number for each label.
         Otherwise it lists the numbers, or if there are many their shape and mean.
         """
-        predictions_of_images: list[tuple[Prediction, ...]] = []
-        for values in output.detach():
-            has_number_per_label = values.ndim == 1 and len(values) == len(self.labels)
-            if has_number_per_label:
-                index = int(values.argmax())
-                prediction = Prediction(self.labels[index], index)
-            elif values.numel() <= MAX_LISTED_NUMBERS:
-                numbers = [f"{value:.3g}" for value in values.flatten().tolist()]
-                prediction = Prediction(", ".join(numbers))
-            else:  # too many numbers to list
-                shape = " x ".join(map(str, values.shape))
-                mean = float(values.double().mean())
-                prediction = Prediction(f"{shape} numbers, mean {mean:.3g}")
-            predictions_of_images.append((prediction,))
-        return predictions_of_images
+        has_number_per_label = values.ndim == 1 and len(values) == len(self.labels)
+        if has_number_per_label:
+            index = int(values.argmax())
+            return Prediction(self.labels[index], index)
+        if values.numel() <= MAX_LISTED_NUMBERS:
+            numbers = [f"{value:.3g}" for value in values.flatten().tolist()]
+            return Prediction(", ".join(numbers))
+        # too many numbers to list
+        shape = " x ".join(map(str, values.shape))
+        mean = float(values.double().mean())
+        return Prediction(f"{shape} numbers, mean {mean:.3g}")
 
     def truth_names(self, truth: Facts) -> tuple[str, ...]:
         return (truth.label or truth.object_label or truth.object,)
+
+
+def _make_loss_error(name: str, n_outputs: int, got: str) -> InputError:
+    """Return the error of a user's function that returned no losses.
+
+    Args:
+        name: name of the task.
+        n_outputs: number of outputs that were passed.
+        got: what the function returned instead.
+    """
+    plural = "" if n_outputs == 1 else "s"
+    return InputError(
+        f"task {name}: expected the loss of each output, a tensor of "
+        f"{n_outputs} floating-point number{plural}, over 0 for a wrong output, got "
+        f"{got}; for example a distance minus a tolerance, or a wrong logit minus "
+        "the right one"
+    )
 
 
 def make_function_task(function: Callable[[Any, Facts], Tensor]) -> FunctionTask:
@@ -198,6 +209,11 @@ def make_task(task: AnyTask) -> Task:
     options = {key: value for key, value in setting.items() if key != "name"}
     if TASK_SEPARATOR in name:
         return _make_joint_task(name, options)
+    return _make_named_task(name, options)
+
+
+def _make_named_task(name: str, options: Mapping[str, Any]) -> Task:
+    """Create a task from its name and its options."""
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
@@ -222,6 +238,16 @@ def _make_joint_task(name: str, options: Mapping[str, Any]) -> EnsembleTask:
         InputError: options are no mapping.
     """
     names = [part.strip() for part in name.split(TASK_SEPARATOR)]
+    _check_joint_options(names, options)
+    parts = [
+        make_task({**options.get(task_name, {}), "name": task_name})
+        for task_name in names
+    ]
+    return EnsembleTask(parts=tuple(parts))
+
+
+def _check_joint_options(names: Sequence[str], options: Mapping[str, Any]) -> None:
+    """Raise an error if the options of a joint task are no mappings by its names."""
     for task_name, task_options in options.items():
         if task_name not in names:
             raise UnknownNameError(
@@ -232,11 +258,6 @@ def _make_joint_task(name: str, options: Mapping[str, Any]) -> EnsembleTask:
                 f"task {task_name}: expected its options as a mapping, got "
                 f"{task_options!r:.80}"
             )
-    parts = [
-        make_task({**options.get(task_name, {}), "name": task_name})
-        for task_name in names
-    ]
-    return EnsembleTask(parts=tuple(parts))
 
 
 def __getattr__(name: str) -> Any:

@@ -103,11 +103,8 @@ class FreeAnswer(Task):
             )
         if target is not None and minimise:
             raise InputError("minimise: seeks the right answer; leave `target` out")
-        return replace(
-            self,
-            target=None if target is None else _parse_words("target", target),
-            minimise=minimise,
-        )
+        target_words = None if target is None else _parse_words("target", target)
+        return replace(self, target=target_words, minimise=minimise)
 
     def read(
         self, returned: Any, count: int
@@ -161,30 +158,8 @@ class FreeAnswer(Task):
     def loss(
         self, output: Sequence[AnswerWithLogits | AnswersWithoutLogits], truth: Words
     ) -> Tensor:
-        """Compute the loss of each answer, (N,); over 0 for a wrong one.
-
-        Without logits it is 1 - 2 s, where s is the fraction of right texts about the
-        image. With logits, the text decides the sign of the loss, and the tokens its
-        size: it is log(1 - p) for a right answer and -log(p) for a wrong one. Here p is
-        sigmoid(m), and m is by how much the best token that begins a right word exceeds
-        all other tokens (`_compute_token_margin`).
-        """
-        losses = []
-        for answer in output:
-            if "texts" in answer:  # without logits
-                is_right = [
-                    float(has_word(text, truth)) for text in _list_texts(answer)
-                ]
-                losses.append(1.0 - 2.0 * torch.tensor(is_right).mean())
-                continue
-            margin = _compute_token_margin(answer["logits"], answer["begins"], truth)
-            # p = sigmoid(margin) is between 0 and 1: log(1 - p) < 0, and -log(p) > 0
-            if has_word(answer["text"], truth):
-                loss = functional.logsigmoid(-margin)  # log(1 - p)
-            else:
-                loss = -functional.logsigmoid(margin)  # -log(p)
-            losses.append(loss)
-        return torch.stack(losses)
+        """Compute the loss of each answer, (N,); over 0 for a wrong one."""
+        return torch.stack([_compute_loss(answer, truth) for answer in output])
 
     def predictions(
         self, output: Sequence[AnswerWithLogits | AnswersWithoutLogits], count: int = 1
@@ -220,12 +195,9 @@ class FreeAnswer(Task):
         results = list[tasks.PredictionWithPayload]()
         for answer, margin in zip(output, margins, strict=True):
             texts = _list_texts(answer)
-            is_right = margin >= 0.0
-            # those that agree with the judgement; if none does, all texts count
-            agreeing = [text for text in texts if has_word(text, truth) == is_right]
-            [(most_frequent, _)] = Counter(agreeing or texts).most_common(1)
+            text = _find_most_frequent_text(texts, truth, is_right=margin >= 0.0)
             payload: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
-            results.append((_make_prediction(most_frequent), payload))
+            results.append((_make_prediction(text), payload))
         return results
 
 
@@ -235,6 +207,27 @@ def _is_answer(value: Any) -> bool:
     return isinstance(value, Mapping) and (
         required_keys <= value.keys() or "texts" in value
     )
+
+
+def _compute_loss(
+    answer: AnswerWithLogits | AnswersWithoutLogits, right_words: Words
+) -> Tensor:
+    """Compute the loss of the answer about one image, (); over 0 if it is wrong.
+
+    Without logits it is 1 - 2 s, where s is the fraction of right texts about the
+    image. With logits, the text decides the sign of the loss, and the tokens its size:
+    it is log(1 - p) for a right answer and -log(p) for a wrong one. Here p is
+    sigmoid(m), and m is by how much the best token that begins a right word exceeds all
+    other tokens (`_compute_token_margin`).
+    """
+    if "texts" in answer:  # without logits
+        is_right = [float(has_word(text, right_words)) for text in _list_texts(answer)]
+        return 1.0 - 2.0 * torch.tensor(is_right).mean()
+    margin = _compute_token_margin(answer["logits"], answer["begins"], right_words)
+    # p = sigmoid(margin) is between 0 and 1: log(1 - p) < 0, and -log(p) > 0
+    if has_word(answer["text"], right_words):
+        return functional.logsigmoid(-margin)  # log(1 - p)
+    return -functional.logsigmoid(margin)  # -log(p)
 
 
 def _compute_token_margin(
@@ -302,3 +295,20 @@ def has_word(text: str, words: Words) -> bool:
     """
     text = " ".join(text.split()).casefold()
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)
+
+
+def _find_most_frequent_text(
+    texts: Sequence[str], truth: Words, *, is_right: bool
+) -> str:
+    """Return the most frequent of the texts that agree with a judgement.
+
+    If none agrees, all texts count.
+
+    Args:
+        texts: texts about an image.
+        truth: right words.
+        is_right: whether the image was judged right.
+    """
+    agreeing = [text for text in texts if has_word(text, truth) == is_right]
+    [(most_frequent, _)] = Counter(agreeing or texts).most_common(1)
+    return most_frequent

@@ -617,38 +617,47 @@ def most_frequent_judgement(judgements: Sequence[Judgement]) -> Judgement:
             one.
     """
     label_and_index = [(x.prediction.label, x.prediction.index) for x in judgements]
-    counts = Counter(label_and_index)
-
-    def sort_key(candidate: tuple[str, int | None]) -> tuple[int, int]:
-        """Return a key by which the most frequent comes first, then a low index."""
-        _, class_index = candidate
-        if (
-            class_index is None
-        ):  # without classes, equally frequent ones keep their order
-            class_index = 0
-        return -counts[candidate], class_index
-
-    most_frequent = min(counts, key=sort_key)
+    most_frequent = _find_most_frequent(label_and_index)
     matching = [
         judgement
         for judgement, candidate in zip(judgements, label_and_index, strict=True)
         if candidate == most_frequent
-    ]
-    probabilities = [
-        judgement.prediction.probability
-        for judgement in matching
-        if judgement.prediction.probability is not None
     ]
     label, index = most_frequent
     return Judgement(
         score=mean([judgement.score for judgement in matching]),
         margin=mean([judgement.margin for judgement in matching]),
         right=matching[0].right,
-        prediction=Prediction(
-            label, index, mean(probabilities) if probabilities else None
-        ),
+        prediction=Prediction(label, index, _average_probability(matching)),
         payload=matching[0].payload,
     )
+
+
+def _find_most_frequent(
+    label_and_index: Sequence[tuple[str, int | None]],
+) -> tuple[str, int | None]:
+    """Return the most frequent label with its class index; of several, the one with
+    the lowest index.
+    """
+    counts = Counter(label_and_index)
+
+    def sort_key(candidate: tuple[str, int | None]) -> tuple[int, int]:
+        """Return a key by which the most frequent comes first, then a low index."""
+        _, class_index = candidate
+        # without classes, equally frequent ones keep their order
+        return -counts[candidate], 0 if class_index is None else class_index
+
+    return min(counts, key=sort_key)
+
+
+def _average_probability(judgements: Sequence[Judgement]) -> float | None:
+    """Return the mean of those probabilities that are known; None if none is."""
+    probabilities = [
+        judgement.prediction.probability
+        for judgement in judgements
+        if judgement.prediction.probability is not None
+    ]
+    return mean(probabilities) if probabilities else None
 
 
 def mean(values: Sequence[float]) -> float:

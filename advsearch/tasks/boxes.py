@@ -108,17 +108,28 @@ def suppress_class(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
     ]
     # Row i, column j: whether box j, which is better (j < i), overlaps box i.
     is_overlapped = torch.cat(overlap_chunks).tril(-1)
-    undecided = torch.ones(len(sorted_boxes), dtype=torch.bool, device=boxes.device)
+    # from the order of scores back to the order of the arguments
+    result = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
+    result[order] = _find_survivors(is_overlapped)
+    return result
+
+
+def _find_survivors(is_overlapped: Tensor) -> Tensor:
+    """Return which of D boxes survive greedy suppression, (D,) bool, the best first.
+
+    Args:
+        is_overlapped: (D, D) bool, whether the box of a row is overlapped by that of a
+            column, which is better.
+    """
+    n_boxes = len(is_overlapped)
+    undecided = torch.ones(n_boxes, dtype=torch.bool, device=is_overlapped.device)
     survives = torch.zeros_like(undecided)
     while bool(undecided.any()):
         has_better_rival = (is_overlapped & undecided).any(dim=1)
         survives = survives | (undecided & ~has_better_rival)
         is_suppressed = (is_overlapped & survives).any(dim=1)
         undecided = undecided & ~survives & ~is_suppressed
-    # from the order of scores back to the order of the arguments
-    result = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
-    result[order] = survives
-    return result
+    return survives
 
 
 @dataclass(frozen=True)
@@ -392,18 +403,13 @@ class BoxFormat:
         formats help, those that differ from this one in the fewest options are
         suggested.
         """
-        alternatives = [
-            BoxFormat(form, unit, self.input_size)
-            for unit in UNITS
-            for form in FORMS
-            # With swapped axes, a plausible box is still plausible. So "yxyx" can't be
-            # distinguished from "xyxy", and is not suggested.
-            if form != "yxyx"
-        ]
         plausible = [
             alternative
-            for alternative in alternatives
-            if alternative.compute_plausible_fraction(boxes) >= PLAUSIBLE_FRACTION
+            for alternative in self._list_formats()
+            # With swapped axes, a plausible box is still plausible. So "yxyx" can't be
+            # distinguished from "xyxy", and is not suggested.
+            if alternative.box_layout != "yxyx"
+            and alternative.compute_plausible_fraction(boxes) >= PLAUSIBLE_FRACTION
         ]
         if not plausible:
             return ""
@@ -414,6 +420,12 @@ class BoxFormat:
             if self._count_different_options(alternative) == min_changes
         ]
         return f"; {' or '.join(suggestions)} would mend that"
+
+    def _list_formats(self) -> list[BoxFormat]:
+        """Return all formats of boxes in an image of this size."""
+        return [
+            BoxFormat(form, unit, self.input_size) for unit in UNITS for form in FORMS
+        ]
 
     def _count_different_options(self, other: BoxFormat) -> int:
         """Count the options in which another format differs from this one."""
@@ -446,10 +458,7 @@ class BoxFormat:
             return ""
         # `max` returns the first of several best formats, so this one is the first. (It
         # is among the others again, as an equal key.)
-        candidates = [self]
-        candidates += [
-            BoxFormat(form, unit, self.input_size) for unit in UNITS for form in FORMS
-        ]
+        candidates = [self, *self._list_formats()]
         best_overlap = {
             candidate: float(compute_iou(candidate.to_fractions(boxes), true_box).max())
             for candidate in candidates

@@ -64,17 +64,10 @@ class ClassTask(Task):
                 task reads.
         """
         self._check_output_kind(model)
-        if self.reads_logits:  # a classifier, whose labels were checked when loaded
-            labels = model.labels
-            named = model.named
-        else:
-            labels, named = self._get_model_labels(model)
+        labels, named = self._choose_labels(model)
         target_classes = None
         if target is not None:
-            try:
-                target_classes = find_label_set(target, labels, named=named).indices
-            except InputError as error:
-                raise InputError(f"target: {error}") from None
+            target_classes = _find_target_classes(target, labels, named=named)
         return replace(
             self,
             labels=labels,
@@ -82,6 +75,12 @@ class ClassTask(Task):
             target=target_classes,
             minimise=minimise,
         )
+
+    def _choose_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
+        """Return the labels of a model's classes, and whether they are names."""
+        if self.reads_logits:  # a classifier, whose labels were checked when loaded
+            return model.labels, model.named
+        return self._get_model_labels(model)
 
     def _check_output_kind(self, model: Model) -> None:
         """Check that a model returns logits if this task reads them, and only then.
@@ -148,17 +147,7 @@ class ClassTask(Task):
             raise InputError(
                 f"label: expected the right labels for {facts.object}, got none"
             )
-        try:
-            right_classes = find_label_set(
-                text, self.labels, named=self.has_class_names
-            ).indices
-        except InputError as error:
-            if facts.label is not None:  # from the user
-                raise InputError(f"label: {error}") from None
-            raise InputError(
-                f"label: the label in the file of {facts.object} does not fit "
-                f"the model ({error})"
-            ) from None
+        right_classes = self._find_classes_of_label(text, facts)
         common_classes = sorted(set(right_classes) & set(self.target or ()))
         if common_classes:
             raise InputError(
@@ -166,6 +155,24 @@ class ClassTask(Task):
                 f"{common_classes}, which `label` has too"
             )
         return right_classes
+
+    def _find_classes_of_label(self, text: str, facts: Facts) -> Labels:
+        """Return the indices of the classes that a label names.
+
+        Raises:
+            InputError: the model has no such class; the message says where the label
+                comes from.
+        """
+        try:
+            label_set = find_label_set(text, self.labels, named=self.has_class_names)
+        except InputError as error:
+            if facts.label is not None:  # from the user
+                raise InputError(f"label: {error}") from None
+            raise InputError(
+                f"label: the label in the file of {facts.object} does not fit "
+                f"the model ({error})"
+            ) from None
+        return label_set.indices
 
     def check(self, facts: Facts) -> None:
         self.find_right_classes(facts)
@@ -196,6 +203,25 @@ class ClassTask(Task):
     def get_class_name(self, index: int) -> str:
         """Return the name of a class."""
         return self.labels[index] if index < len(self.labels) else f"class {index}"
+
+
+def _find_target_classes(
+    target: str, labels: tuple[str, ...], *, named: bool
+) -> Labels:
+    """Return the indices of the classes that a target names.
+
+    Args:
+        target: one class, or several separated by commas.
+        labels: labels of the model.
+        named: whether these are names, and no placeholders.
+
+    Raises:
+        InputError: there is no such class.
+    """
+    try:
+        return find_label_set(target, labels, named=named).indices
+    except InputError as error:
+        raise InputError(f"target: {error}") from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,34 +281,39 @@ class Classification(ClassTask):
 
         A row with NaN has the only prediction `NOT_A_NUMBER`.
         """
-        probabilities = logits.detach().softmax(dim=1)
-        # For a single class `argmax` is used: of several largest values it returns the
-        # first, but `topk` any of them.
-        if count == 1:
-            top_classes = probabilities.argmax(dim=1, keepdim=True)
-            top_probabilities = probabilities.gather(1, top_classes)
-        else:
-            k = min(count, logits.shape[1])
-            top_probabilities, top_classes = probabilities.topk(k, dim=1)
+        top_probabilities, top_classes = _select_top_classes(logits.detach(), count)
         predictions_of_images: list[tuple[Prediction, ...]] = []
-        for classes, class_probabilities in zip(
+        for classes, probabilities in zip(
             top_classes.tolist(), top_probabilities.tolist(), strict=True
         ):
-            has_nan_logits = not math.isfinite(class_probabilities[0])
+            has_nan_logits = not math.isfinite(probabilities[0])
             if has_nan_logits:
                 predictions_of_images.append((Prediction(NOT_A_NUMBER),))
-                continue
-            predictions = tuple(
-                Prediction(self.get_class_name(class_id), class_id, probability)
-                for class_id, probability in zip(
-                    classes, class_probabilities, strict=True
+            else:
+                predictions = self._make_predictions(
+                    classes, probabilities, is_single=count == 1
                 )
-                # Classes that `as_logits` excludes have a probability of 0, and are left
-                # out. But a single prediction is always returned.
-                if probability > 0.0 or count == 1
-            )
-            predictions_of_images.append(predictions)
+                predictions_of_images.append(predictions)
         return predictions_of_images
+
+    def _make_predictions(
+        self, classes: Sequence[int], probabilities: Sequence[float], *, is_single: bool
+    ) -> tuple[Prediction, ...]:
+        """Return the predictions of the most probable classes of an image.
+
+        Classes that `as_logits` excludes have a probability of 0, and are left out. But
+        a single prediction is always returned.
+
+        Args:
+            classes: indices of the classes, the most probable first.
+            probabilities: their probabilities.
+            is_single: whether a single prediction is requested.
+        """
+        return tuple(
+            Prediction(self.get_class_name(class_id), class_id, probability)
+            for class_id, probability in zip(classes, probabilities, strict=True)
+            if probability > 0.0 or is_single
+        )
 
     def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
         """Judge each of N outputs.
@@ -295,34 +326,53 @@ class Classification(ClassTask):
             truth: indices of the right classes.
         """
         logits = self.as_logits(output, truth)
-        # true for a subclass that overrides it, whose methods are called
-        overrides_loss = type(self).loss is not Classification.loss
+        overrides_loss = type(self).loss is not Classification.loss  # in a subclass
         if overrides_loss:
             losses = self.loss(output, truth)
         else:
             # over 0 for a wrong prediction, as losses are
             losses = compute_misclassification_margin(logits, truth)
-        overrides_score = type(self).score is not Classification.score
-        if overrides_score or self.target is not None:
-            scores = self.score(output, truth)
-        else:  # as `Task.score`
-            scores = -losses if self.minimise else losses
+        scores = self._compute_scores_from(losses, output, truth)
         # A judgement's margin is over 0 for a right prediction. `-losses` would be -0.0
         # for 0.
         margins = 0.0 - losses
         # one prediction for each image
-        top_predictions = [
-            prediction for (prediction,) in self._rank_classes(logits, count=1)
-        ]
-        return [
-            Judgement.from_margin(score, margin, prediction)
-            for score, margin, prediction in zip(
-                scores.tolist(), margins.tolist(), top_predictions, strict=True
-            )
-        ]
+        predictions = [top for (top,) in self._rank_classes(logits, count=1)]
+        rows = zip(scores.tolist(), margins.tolist(), predictions, strict=True)
+        return [Judgement.from_margin(*row) for row in rows]
+
+    def _compute_scores_from(
+        self, losses: Tensor, output: Tensor, truth: Labels
+    ) -> Tensor:
+        """Return the scores (N,) of outputs whose losses (N,) are known.
+
+        They follow from the losses, as in `Task.score`. But if there is a target, or a
+        subclass overrides `score`, that method is called.
+        """
+        overrides_score = type(self).score is not Classification.score
+        if overrides_score or self.target is not None:
+            return self.score(output, truth)
+        return -losses if self.minimise else losses
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
         return self.get_class_names(truth)
+
+
+def _select_top_classes(logits: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return probabilities and indices of the most probable classes, (N, count) each.
+
+    Args:
+        logits: (N, classes).
+        count: number of classes, if there are as many.
+    """
+    probabilities = logits.softmax(dim=1)
+    # For a single class `argmax` is used: of several largest values it returns the
+    # first, but `topk` any of them.
+    if count == 1:
+        top_classes = probabilities.argmax(dim=1, keepdim=True)
+        return probabilities.gather(1, top_classes), top_classes
+    top = probabilities.topk(min(count, logits.shape[1]), dim=1)
+    return top.values, top.indices
 
 
 # ---- logits ----
@@ -378,22 +428,32 @@ def make_class_mask(
     n_classes = logits.shape[1]
     if isinstance(labels, Tensor):
         labels = tuple(dict.fromkeys(labels.flatten().tolist()))
+    _check_class_indices(labels, n_classes, setting)
+    is_member = torch.zeros(n_classes, dtype=torch.bool, device=logits.device)
+    is_member[list(labels)] = True
+    if bool(is_member.all()):
+        raise _make_all_classes_error(setting, n_classes)
+    return is_member
+
+
+def _check_class_indices(labels: Labels, n_classes: int, setting: str) -> None:
+    """Raise InputError if a label set is empty, or an index is out of range."""
     if not labels or not all(0 <= label < n_classes for label in labels):
         raise InputError(
             f"{setting}: expected class indices from 0 to {n_classes - 1}, "
             f"got {tuple(labels)}"
         )
-    is_member = torch.zeros(n_classes, dtype=torch.bool, device=logits.device)
-    is_member[list(labels)] = True
-    if bool(is_member.all()):
-        if setting == "label":
-            consequence = "no prediction could be wrong"
-        else:
-            consequence = "every prediction would be a success"
-        raise InputError(
-            f"{setting}: the label set holds all {n_classes} classes, so {consequence}"
-        )
-    return is_member
+
+
+def _make_all_classes_error(setting: str, n_classes: int) -> InputError:
+    """Return the error of a setting whose labels are all classes of the model."""
+    if setting == "label":
+        consequence = "no prediction could be wrong"
+    else:
+        consequence = "every prediction would be a success"
+    return InputError(
+        f"{setting}: the label set holds all {n_classes} classes, so {consequence}"
+    )
 
 
 def compute_largest_logit(logits: Tensor, class_mask: Tensor) -> Tensor:

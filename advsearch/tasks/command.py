@@ -89,12 +89,7 @@ class Command(Task):
                 f"{', '.join(self.names):.80}"
             )
         if self.envelope is not None:
-            set_field(self, "envelope", _parse_numbers("envelope", self.envelope))
-            if min(self.envelope) <= 0.0:
-                raise InputError(
-                    "task command: envelope: expected numbers over 0, got "
-                    f"{min(self.envelope):g}"
-                )
+            set_field(self, "envelope", _parse_envelope(self.envelope))
 
     def wrap_network(self, network: Callable[..., Any]) -> Callable[..., Any]:
         """Wrap a policy so that it gets the state of the robot together with images.
@@ -127,19 +122,7 @@ class Command(Task):
             ValueError: there are no actions, or their number of elements differs from
                 that of the options.
         """
-        actions = returned.get("action") if isinstance(returned, Mapping) else returned
-        # A named tuple has the type of its class, and is none of the forms.
-        if type(actions) in (tuple, list) and actions:
-            actions = actions[0]
-        if (
-            not isinstance(actions, Tensor)
-            or not actions.is_floating_point()
-            or actions.shape[:1] != (count,)
-        ):
-            raise ValueError(
-                "expected an action for each picture, (N, A), or a mapping with these "
-                "under action"
-            )
+        actions = _find_actions(returned, count)
         if actions.ndim == 1:
             actions = actions[:, None]
         if actions.ndim != 2 or not 1 <= actions.shape[1] <= MAX_NUMBERS:
@@ -183,22 +166,8 @@ class Command(Task):
             InputError: there is no envelope, the model was loaded for another task or
                 has names of classes, the target is no action, or `minimise` is set.
         """
-        if model.read is None:  # its outputs are logits, as those of a classifier
-            raise InputError(
-                f"model {model.name}: it was loaded for its logits; load "
-                'it with task="command"'
-            )
-        if model.labels:
-            raise InputError(
-                "labels: task command has no classes, and this model is a classifier; "
-                "set a policy as `model`"
-            )
-        if self.envelope is None:
-            raise InputError(
-                "task command: envelope: expected the allowed deviation of an action, "
-                "in its unit, or a list with a number for each element, got none; write "
-                "`task='command={envelope: 0.2}'`"
-            )
+        _check_is_policy(model)
+        self._check_has_envelope()
         if minimise:
             raise InputError(
                 "minimise: the clean action is already within its envelope; leave it "
@@ -206,6 +175,15 @@ class Command(Task):
             )
         parsed_target = None if target is None else self._parse_target(target)
         return replace(self, target=parsed_target)
+
+    def _check_has_envelope(self) -> None:
+        """Raise InputError if the user has set no envelope."""
+        if self.envelope is None:
+            raise InputError(
+                "task command: envelope: expected the allowed deviation of an action, "
+                "in its unit, or a list with a number for each element, got none; write "
+                "`task='command={envelope: 0.2}'`"
+            )
 
     def _parse_target(self, text: str) -> Tensor:
         """Parse a target action to numbers, (A,).
@@ -220,6 +198,13 @@ class Command(Task):
         element_names = [name.strip() for name, _, _ in assignments]
         if not any(element_names):
             return values
+        self._check_known_elements(element_names)
+        action = torch.full((len(self.names),), math.nan)
+        action[[self.names.index(name) for name in element_names]] = values
+        return action
+
+    def _check_known_elements(self, element_names: Sequence[str]) -> None:
+        """Raise InputError if `names` does not have one of the elements of a target."""
         unknown = [name for name in element_names if name not in self.names]
         if unknown:
             known = ", ".join(self.names) or "none; set `names`"
@@ -227,9 +212,6 @@ class Command(Task):
                 f"target: expected elements that `names` has ({known}), "
                 f"got {unknown[0]!r}"
             )
-        action = torch.full((len(self.names),), math.nan)
-        action[[self.names.index(name) for name in element_names]] = values
-        return action
 
     @property
     def calibrates(self) -> bool:
@@ -285,9 +267,7 @@ class Command(Task):
         if self.clean_action is None:
             return ()
         clean_action = self.clean_action.tolist()
-        envelope = list(self.envelope)
-        if len(envelope) == 1:  # the same for all elements
-            envelope = envelope * len(clean_action)
+        envelope = _expand_to_elements(self.envelope, len(clean_action))
         return (
             f"The clean action is {self._format_action(clean_action)}, from one picture of "
             f"the clean scene; its envelope is {self._format_action(envelope, sign='± ')}. "
@@ -364,23 +344,11 @@ class Command(Task):
             margins: margin of each action: 1 minus its largest deviation in envelopes.
         """
         assert truth is not None  # the task has been calibrated
-        results: list[tasks.PredictionWithPayload] = []
-        reaches_target = [False] * len(output)
-        if self.target is not None:
-            # a loss of at most 0: within the envelope of the target
-            reaches_target = (self.loss(output, self.target) <= 0.0).tolist()
-        deviations = self._compute_deviation(output, truth)
         clean_action = truth.tolist()
         clean_text = self._format_action(clean_action, with_names=False)
-        for row, (action, margin) in enumerate(
-            zip(output.tolist(), margins, strict=True)
-        ):
-            if reaches_target[row]:
-                label = REACHED
-            elif margin >= 0.0:
-                label = INSIDE
-            else:
-                label = self._make_outside_label(deviations[row])
+        labels = self._label_actions(output, truth, margins)
+        results: list[tasks.PredictionWithPayload] = []
+        for action, margin, label in zip(output.tolist(), margins, labels, strict=True):
             payload: tasks.JsonValue = {
                 "action": action,
                 "clean": clean_action,
@@ -389,6 +357,41 @@ class Command(Task):
             }
             results.append((tasks.Prediction(label), payload))
         return results
+
+    def _label_actions(
+        self, output: Tensor, clean_action: Tensor, margins: Sequence[float]
+    ) -> list[str]:
+        """Return the label of each action: `REACHED`, `INSIDE`, or how it is outside.
+
+        Args:
+            output: actions (N, A).
+            clean_action: (A,).
+            margins: margin of each action; below 0 if it is outside its envelope.
+        """
+        reaches_target = [False] * len(output)
+        if self.target is not None:
+            # a loss of at most 0: within the envelope of the target
+            reaches_target = (self.loss(output, self.target) <= 0.0).tolist()
+        deviations = self._compute_deviation(output, clean_action)
+        rows = zip(reaches_target, margins, deviations, strict=True)
+        return [
+            self._choose_label(margin, deviation, is_reached=is_reached)
+            for is_reached, margin, deviation in rows
+        ]
+
+    def _choose_label(
+        self, margin: float, deviation: Tensor, *, is_reached: bool
+    ) -> str:
+        """Return the label of an action.
+
+        Args:
+            margin: below 0 if it is outside its envelope.
+            deviation: deviation of each of its elements, (A,).
+            is_reached: whether it is within the envelope of the target.
+        """
+        if is_reached:
+            return REACHED
+        return INSIDE if margin >= 0.0 else self._make_outside_label(deviation)
 
     def _make_outside_label(self, deviation: Tensor) -> str:
         """Return the label of an action outside its envelope.
@@ -414,9 +417,7 @@ class Command(Task):
             sign: a text before each number.
             with_names: begin each element with its name.
         """
-        units = list(self.units)
-        if len(units) == 1:  # the same for all elements
-            units = units * len(action)
+        units = _expand_to_elements(self.units, len(action))
         elements = []
         for index, number in enumerate(action[:MAX_FORMATTED_ELEMENTS]):
             name = f"{self._get_element_name(index)} " if with_names else ""
@@ -426,6 +427,63 @@ class Command(Task):
         if len(action) > MAX_FORMATTED_ELEMENTS:
             text += f" and {len(action) - MAX_FORMATTED_ELEMENTS} more"
         return text
+
+
+def _check_is_policy(model: Model) -> None:
+    """Raise InputError if a model was loaded for another task, or has classes."""
+    if model.read is None:  # its outputs are logits, as those of a classifier
+        raise InputError(
+            f"model {model.name}: it was loaded for its logits; load "
+            'it with task="command"'
+        )
+    if model.labels:
+        raise InputError(
+            "labels: task command has no classes, and this model is a classifier; "
+            "set a policy as `model`"
+        )
+
+
+def _expand_to_elements(values: Any, count: int) -> list[Any]:
+    """Return a list of the values; a single one is repeated for all elements.
+
+    Args:
+        values: a value for each of `count` elements, one for all of them, or none.
+        count: number of elements of an action.
+    """
+    expanded = list(values)
+    return expanded * count if len(expanded) == 1 else expanded
+
+
+def _find_actions(returned: Any, count: int) -> Tensor:
+    """Find the actions in what a policy returned, (count,) or (count, ...).
+
+    Raises:
+        ValueError: there are none.
+    """
+    actions = returned.get("action") if isinstance(returned, Mapping) else returned
+    # A named tuple has the type of its class, and is none of the forms.
+    if type(actions) in (tuple, list) and actions:
+        actions = actions[0]
+    if (
+        not isinstance(actions, Tensor)
+        or not actions.is_floating_point()
+        or actions.shape[:1] != (count,)
+    ):
+        raise ValueError(
+            "expected an action for each picture, (N, A), or a mapping with these "
+            "under action"
+        )
+    return actions
+
+
+def _parse_envelope(value: Any) -> Numbers:
+    """Parse the numbers of an envelope, which are over 0."""
+    envelope = _parse_numbers("envelope", value)
+    if min(envelope) <= 0.0:
+        raise InputError(
+            f"task command: envelope: expected numbers over 0, got {min(envelope):g}"
+        )
+    return envelope
 
 
 def _parse_names(option: str, value: Any) -> tuple[str, ...]:
@@ -485,13 +543,7 @@ def _load_state(value: Any) -> dict[str, Numbers]:
         value = _read_state_file(Path(value).expanduser())
     if not value:
         return {}
-    if not isinstance(value, Mapping) or not all(
-        isinstance(name, str) and name for name in value
-    ):
-        raise InputError(
-            f"task command: state: expected numbers by name, such as {{speed: 1.5}}, "
-            f"or a JSON file, got {value!r:.80}"
-        )
+    _check_state_names(value)
     state = {
         name: _parse_numbers(f"state {name:.40}", numbers)
         for name, numbers in value.items()
@@ -501,6 +553,18 @@ def _load_state(value: Any) -> dict[str, Numbers]:
             f"task command: state: expected at most {MAX_NUMBERS:,} numbers in total"
         )
     return state
+
+
+def _check_state_names(value: Any) -> None:
+    """Raise InputError if a state is no mapping from names."""
+    has_names = isinstance(value, Mapping) and all(
+        isinstance(name, str) and name for name in value
+    )
+    if not has_names:
+        raise InputError(
+            f"task command: state: expected numbers by name, such as {{speed: 1.5}}, "
+            f"or a JSON file, got {value!r:.80}"
+        )
 
 
 def _read_state_file(path: Path) -> Any:

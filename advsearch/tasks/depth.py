@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -81,6 +81,11 @@ class DepthTruth:
     def is_visible(self) -> bool:
         """Whether any of the object is visible."""
         return bool(self.mask.any())
+
+    @cached_property
+    def object_distance(self) -> float:
+        """The geometric mean of the z-depth of the object's pixels, which are visible."""
+        return float(self.z_depth[self.mask].double().log().mean().exp())
 
     @cached_property
     def outside_object(self) -> Tensor:
@@ -224,12 +229,8 @@ class Depth(Task):
         kind, maps = _find_maps(returned)
         if isinstance(maps, Tensor) and maps.ndim == 4 and maps.shape[1] == 1:
             maps = maps[:, 0]
-        if (
-            not isinstance(maps, Tensor)
-            or maps.ndim != 3
-            or len(maps) != count
-            or 0 in maps.shape
-        ):
+        is_stack = isinstance(maps, Tensor) and maps.ndim == 3 and len(maps) == count
+        if not is_stack or 0 in maps.shape:
             raise ValueError(
                 "expected a number for each pixel, (N, height, width) or (N, 1, "
                 "height, width), or a mapping with these under predicted_depth or "
@@ -308,13 +309,7 @@ class Depth(Task):
                 f"`task='depth={{kind: {DISPARITY}}}'`"
             )
         if kind == METRIC:
-            has_scene_size = truth is not None and truth.size_in_metres is not None
-            if self.size or has_scene_size:
-                return ""
-            return (
-                "size: it predicts metres, and the size of the object is unknown; "
-                "set its longest side in metres, such as `size=0.1`"
-            )
+            return self._describe_missing_size(truth)
         # Nothing is missing if the pixels outside of the object determine the scale; or if
         # the object is out of view, when every prediction is right.
         if truth is None or not truth.is_visible or truth.determines_scale:
@@ -325,6 +320,18 @@ class Depth(Task):
             f"that differ by a factor of {MIN_DISTANCE_RATIO:g}, got "
             f"{int(truth.outside_object.sum())}; use a scene with a ground or a room, "
             "and a camera that sees it from the side"
+        )
+
+    def _describe_missing_size(self, truth: DepthTruth | None) -> str:
+        """Return a message if a model predicts metres and the object's size is unknown;
+        "" if it is known.
+        """
+        has_scene_size = truth is not None and truth.size_in_metres is not None
+        if self.size or has_scene_size:
+            return ""
+        return (
+            "size: it predicts metres, and the size of the object is unknown; "
+            "set its longest side in metres, such as `size=0.1`"
         )
 
     @property
@@ -396,30 +403,38 @@ class Depth(Task):
         )
 
     def score(self, output: Sequence[DepthMap], truth: DepthTruth) -> Tensor:
-        """Compute how near each output is to what is sought, (N,), over 0 for a success.
-
-        For "farther" it is the mean over pixels of log(predicted / true), minus the
-        tolerance; for "nearer" minus the mean, minus the tolerance. For "gone" it is the
-        smaller of two numbers: the loss, and by how much the remaining fraction of the
-        object's relief (`_compute_relief_fraction`) is below a half. So an object counts
-        as gone if its distance is wrong and less than half of its relief is left.
-        """
+        """Compute how near each output is to what is sought, (N,), over 0 for a success."""
         if self.minimise or not self.seek:
             return super().score(output, truth)
+        if self.seek == "gone":
+            score_gone = partial(self._score_gone, truth)
+            return self._map_images(output, truth, score_gone)
+        return self._map_images(output, truth, self._score_shift)
 
-        def score_gone(log_factors: Tensor) -> Tensor:
-            """Return how near the object is to being as far as the background, ()."""
-            excess = log_factors.abs().mean() - self._log_limit
-            lost_relief = 0.5 - self._compute_relief_fraction(log_factors, truth)
-            return torch.minimum(excess, lost_relief)
+    def _score_gone(self, truth: DepthTruth, log_factors: Tensor) -> Tensor:
+        """Return how near the object is to being as far as the background, ().
 
-        def score_signed(log_factors: Tensor) -> Tensor:
-            """Return by how much the object is too near, or too far, ()."""
-            sign = 1.0 if self.seek == "farther" else -1.0
-            return sign * log_factors.mean() - self._log_limit
+        It is the smaller of two numbers: the loss, and by how much the remaining
+        fraction of the object's relief (`_compute_relief_fraction`) is below a half. So
+        an object counts as gone if its distance is wrong and less than half of its
+        relief is left.
 
-        score_image = score_gone if self.seek == "gone" else score_signed
-        return self._map_images(output, truth, score_image)
+        Args:
+            truth: truth of the image.
+            log_factors: log(predicted / true) of the object's pixels, (P,).
+        """
+        excess = log_factors.abs().mean() - self._log_limit
+        lost_relief = 0.5 - self._compute_relief_fraction(log_factors, truth)
+        return torch.minimum(excess, lost_relief)
+
+    def _score_shift(self, log_factors: Tensor) -> Tensor:
+        """Return by how much the object is too near, or too far, ().
+
+        For "farther" it is the mean of `log_factors` over pixels, log(predicted /
+        true), minus the tolerance; for "nearer" minus the mean, minus the tolerance.
+        """
+        sign = 1.0 if self.seek == "farther" else -1.0
+        return sign * log_factors.mean() - self._log_limit
 
     @property
     def _log_limit(self) -> float:
@@ -488,25 +503,24 @@ class Depth(Task):
         """
         kind = self._get_kind(depth_map)
         (values,) = depth_map.values()  # the only map
-        size = (truth.mask.shape[0], truth.mask.shape[1])
-        if values.shape != size:
-            values = F.interpolate(
-                values[None, None], size=size, mode="bicubic", align_corners=False
-            )[0, 0]
+        values = _resize_depth_map(values, (truth.mask.shape[0], truth.mask.shape[1]))
         if kind == METRIC:
-            scale = 1.0
-            if self.size:
-                # The model predicts metres for an object of the real size, the option
-                # `size`. They are converted to the units of the scene, in which the
-                # object has this size: in metres, or 1 object size if that is unknown.
-                scene_size = truth.size_in_metres or 1.0
-                scale = scene_size / self.size
-            return values * scale, False
+            return values * self._find_metric_scale(truth), False
         z = truth.z_depth.to(values.device)
         fit_mask = truth.fit_mask.to(values.device)
         if kind == DISPARITY:
             return _fit_scale_and_shift(values, z.reciprocal(), fit_mask), True
         return _fit_scale_and_shift(values, z, fit_mask), False
+
+    def _find_metric_scale(self, truth: DepthTruth) -> float:
+        """Return the factor from a model's metres to the units of the scene."""
+        if not self.size:
+            return 1.0
+        # The model predicts metres for an object of the real size, the option `size`.
+        # They are converted to the units of the scene, in which the object has this
+        # size: in metres, or 1 object size if that is unknown.
+        scene_size = truth.size_in_metres or 1.0
+        return scene_size / self.size
 
     def _compute_relief_fraction(
         self, log_factors: Tensor, truth: DepthTruth
@@ -561,10 +575,6 @@ class Depth(Task):
     ) -> list[tasks.PredictionWithPayload]:
         """Return whether the object's distance is right in each image, and a payload.
 
-        The payload has the true and the predicted distance (geometric means over the
-        object's pixels), the mean factor of an error in either direction, the remaining
-        fraction of the relief, and the pixels on which scale and shift were fitted.
-
         Args:
             output: maps of N images.
             truth: truth of the scene.
@@ -572,30 +582,39 @@ class Depth(Task):
         """
         if not truth.is_visible:
             return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
-        results: list[tasks.PredictionWithPayload] = []
-        # a geometric mean, like that of the factors
-        distance = float(truth.z_depth[truth.mask].double().log().mean().exp())
-        for depth_map, margin in zip(output, margins, strict=True):
-            log_factors = self._compute_log_factors(depth_map, truth)
-            mean_log_factor = float(log_factors.mean())
-            relief = float(self._compute_relief_fraction(log_factors, truth))
-            payload: dict[str, tasks.JsonValue] = {
-                "distance": round(distance, 4),
-                # the predicted distance
-                "judged": round(distance * math.exp(mean_log_factor), 4),
-                "factor": round(math.exp(float(log_factors.abs().mean())), 4),
-                "relief": round(relief, 4),
-            }
-            is_fitted = self._get_kind(depth_map) != METRIC
-            if is_fitted and truth.determines_scale:
-                payload["fitted"] = "beside the object"
-            elif is_fitted:
-                payload["fitted"] = "in the whole picture"
-            label = AS_FAR
-            if margin < 0.0:
-                label = self._choose_error_label(mean_log_factor, relief)
-            results.append((tasks.Prediction(label), payload))
-        return results
+        return [
+            self._describe_map(depth_map, truth, is_right=not margin < 0.0)
+            for depth_map, margin in zip(output, margins, strict=True)
+        ]
+
+    def _describe_map(
+        self, depth_map: DepthMap, truth: DepthTruth, *, is_right: bool
+    ) -> tasks.PredictionWithPayload:
+        """Return whether the object's distance is right in an image, and a payload.
+
+        The payload has the true and the predicted distance (geometric means over the
+        object's pixels), the mean factor of an error in either direction, the remaining
+        fraction of the relief, and the pixels on which scale and shift were fitted.
+        """
+        log_factors = self._compute_log_factors(depth_map, truth)
+        mean_log_factor = float(log_factors.mean())
+        relief = float(self._compute_relief_fraction(log_factors, truth))
+        distance = truth.object_distance
+        payload: dict[str, tasks.JsonValue] = {
+            "distance": round(distance, 4),
+            # the predicted distance
+            "judged": round(distance * math.exp(mean_log_factor), 4),
+            "factor": round(math.exp(float(log_factors.abs().mean())), 4),
+            "relief": round(relief, 4),
+        }
+        if self._get_kind(depth_map) != METRIC:
+            has_scale = truth.determines_scale
+            fitted = "beside the object" if has_scale else "in the whole picture"
+            payload["fitted"] = fitted
+        label = AS_FAR
+        if not is_right:
+            label = self._choose_error_label(mean_log_factor, relief)
+        return tasks.Prediction(label), payload
 
     def _choose_error_label(self, mean_log_factor: float, relief: float) -> str:
         """Return the label of a wrong distance.
@@ -631,16 +650,21 @@ class Depth(Task):
         marks_of_images = []
         for depth_map in output:
             marks = [true_mark]
-            kind = self._get_kind(depth_map)
-            # A map whose kind or size is unknown is not drawn. The truth is needed for the
-            # size of a map in metres only. Without the truth it is not checked whether
-            # scale and shift are determined: maps of relative values are always drawn.
-            truth_with_size = truth if kind == METRIC else None
-            missing = self._describe_missing_option(kind, truth_with_size)
-            if truth.is_visible and not missing:
+            if truth.is_visible and self._can_draw(depth_map, truth):
                 marks.append(self._make_predicted_mark(depth_map, truth))
             marks_of_images.append(marks)
         return marks_of_images
+
+    def _can_draw(self, depth_map: DepthMap, truth: DepthTruth) -> bool:
+        """Return whether kind and size of a map are known, so that it can be drawn.
+
+        The truth is needed for the size of a map in metres only. It is not checked
+        whether scale and shift are determined: maps of relative values are always
+        drawn.
+        """
+        kind = self._get_kind(depth_map)
+        truth_with_size = truth if kind == METRIC else None
+        return not self._describe_missing_option(kind, truth_with_size)
 
     def _make_predicted_mark(
         self, depth_map: DepthMap, truth: DepthTruth
@@ -651,14 +675,20 @@ class Depth(Task):
         is_right_pixel = log_factors.abs() <= self._log_limit
         right_mask = torch.zeros_like(truth.mask)
         right_mask[truth.mask] = is_right_pixel.to(right_mask.device)
-        predicted, is_inverse = self._align_to_truth(depth_map, truth)
-        if is_inverse:  # the inverse of a distance is the disparity
-            disparity = predicted
-        else:
-            disparity = predicted.clamp_min(MIN_MAP_DISTANCE).reciprocal()
-        return tasks.Mark(
-            "disparity", true=False, mask=right_mask, map=disparity.detach().cpu()
-        )
+        disparity, is_inverse = self._align_to_truth(depth_map, truth)
+        if not is_inverse:  # the inverse of a distance is the disparity
+            disparity = disparity.clamp_min(MIN_MAP_DISTANCE).reciprocal()
+        disparity = disparity.detach().cpu()
+        return tasks.Mark("disparity", true=False, mask=right_mask, map=disparity)
+
+
+def _resize_depth_map(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return a map (h, w) at a size (height, width)."""
+    if values.shape == size:
+        return values
+    return F.interpolate(
+        values[None, None], size=size, mode="bicubic", align_corners=False
+    )[0, 0]
 
 
 def _find_maps(returned: Any) -> tuple[str, Any]:
@@ -680,9 +710,8 @@ def _find_maps(returned: Any) -> tuple[str, Any]:
         first = returned[0]
         # A tuple that begins with boxes is that of a detector, and has no maps.
         is_boxes = isinstance(first, Tensor) and first.shape[-1:] == (4,)
-        if is_boxes and len(returned) > 1:
-            return "", None
-        return "", first
+        has_maps = not (is_boxes and len(returned) > 1)
+        return "", first if has_maps else None
     return "", returned
 
 

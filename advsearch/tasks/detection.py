@@ -177,16 +177,26 @@ class Detection(ClassTask):
         self.check_numbers(
             lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "suppression"
         )
+        self._check_stated_order()
+        self._check_choice("boxes", ("", *FORMS))
+        self._check_choice("unit", ("", *UNITS))
+        self._check_choice("seek", tuple(GOALS))
+        self._check_goal()
+
+    def _check_stated_order(self) -> None:
+        """Raise InputError if the order of an output's components is invalid."""
         if self.order:
             try:
                 outputs.parse_order(self.order)
             except ValueError as error:
                 raise InputError(f"task detection: order: {error}") from None
-        self._check_choice("boxes", ("", *FORMS))
-        self._check_choice("unit", ("", *UNITS))
-        self._check_choice("seek", tuple(GOALS))
-        # Users set the option `seek` by the setting `objective` of a run. So messages call
-        # it the objective.
+
+    def _check_goal(self) -> None:
+        """Raise InputError if the target or `minimise` does not fit the goal.
+
+        Users set the option `seek` by the setting `objective` of a run. So messages
+        call it the objective.
+        """
         if self.target is not None and self.seek not in ("mislabel", "create"):
             raise InputError(
                 f"target: the objective {self.seek} has none; set `objective` to "
@@ -228,19 +238,23 @@ class Detection(ClassTask):
         # Rows of NaN, which are counted as "n_nan_rows", are no error in the output for
         # noise: the model leaves them in unused rows.
         fills_with_nan = any("n_nan_rows" in detections for detections in output)
-        # The network may declare the format of its boxes by an attribute. Options of the
-        # user take precedence.
-        has_format_options = bool(self.boxes or self.unit)
-        is_declared = not has_format_options and getattr(
-            model.module, DECLARED_FORMAT_ATTRIBUTE, False
-        )
         task = replace(
             task,
             input_size=model.input_size,
             fills_with_nan=fills_with_nan,
-            has_declared_format=is_declared,
+            has_declared_format=self._is_format_declared(model),
         )
         return task._infer_format(output)
+
+    def _is_format_declared(self, model: Model) -> bool:
+        """Return whether the network declares the format of its boxes by an attribute.
+
+        Options of the user take precedence.
+        """
+        if self.boxes or self.unit:
+            return False
+        is_declared: bool = getattr(model.module, DECLARED_FORMAT_ATTRIBUTE, False)
+        return is_declared
 
     @property
     def calibrates(self) -> bool:
@@ -311,23 +325,10 @@ class Detection(ClassTask):
         earlier output. The first output is for noise (see `on`), the next for the clean
         image (see `after_calibration`).
         """
-        order = self._infer_order(output)
-        grids = [detections["grid"] for detections in output if "grid" in detections]
-        has_pairs = any("score_or_label" in detections for detections in output)
-        has_masks = self.ignores_masks or self._has_mask_coefficients(output, order)
         # The order is needed to read the boxes below.
-        task_with_order = replace(
-            self,
-            inferred_order=order or self.inferred_order,
-            is_order_ambiguous=self.is_order_ambiguous or has_pairs,
-            head_shape=tuple(grids[0].shape) if grids else self.head_shape,
-            ignores_masks=has_masks,
-        )
+        task_with_order = self._resolve_order(output)
         resolved = task_with_order._resolve_grids(output)
-        if self.has_declared_format:
-            unit = "pixels"  # the meaning of `DECLARED_FORMAT_ATTRIBUTE`
-        else:
-            unit = infer_unit(select_best_boxes(resolved)) or self.inferred_unit
+        unit = self._infer_unit_of_boxes(resolved)
         # An output with boxes and rows of NaN shows that the model fills unused rows with
         # NaN.
         has_nan_rows = any(
@@ -338,6 +339,26 @@ class Detection(ClassTask):
             task_with_order,
             inferred_unit=unit,
             fills_with_nan=self.fills_with_nan or has_nan_rows,
+        )
+
+    def _infer_unit_of_boxes(self, resolved: Sequence[Detections]) -> str:
+        """Return the unit of the boxes in an output; the one before if it shows none."""
+        if self.has_declared_format:
+            return "pixels"  # the meaning of `DECLARED_FORMAT_ATTRIBUTE`
+        return infer_unit(select_best_boxes(resolved)) or self.inferred_unit
+
+    def _resolve_order(self, output: Sequence[Detections]) -> Detection:
+        """Return the task with the order that an output of its model shows."""
+        order = self._infer_order(output)
+        grids = [detections["grid"] for detections in output if "grid" in detections]
+        has_pairs = any("score_or_label" in detections for detections in output)
+        has_masks = self.ignores_masks or self._has_mask_coefficients(output, order)
+        return replace(
+            self,
+            inferred_order=order or self.inferred_order,
+            is_order_ambiguous=self.is_order_ambiguous or has_pairs,
+            head_shape=tuple(grids[0].shape) if grids else self.head_shape,
+            ignores_masks=has_masks,
         )
 
     def _infer_order(self, output: Sequence[Detections]) -> str:
@@ -360,13 +381,8 @@ class Detection(ClassTask):
         try:
             return outputs.infer_order(output, n_classes, stated_order)
         except ValueError as error:
-            grids = [
-                detections["grid"] for detections in output if "grid" in detections
-            ]
-            shape = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
-            has_pairs = any("score_or_label" in detections for detections in output)
-            hint = f"; {ORDER_ADVICE}" if has_pairs else ""
-            raise InputError(f"task detection: {shape}{error}{hint}") from None
+            message = _explain_order_error(error, output)
+            raise InputError(f"task detection: {message}") from None
 
     def _has_mask_coefficients(self, output: Sequence[Detections], order: str) -> bool:
         """Return whether an output has mask coefficients in addition to boxes and scores.
@@ -432,33 +448,44 @@ class Detection(ClassTask):
         They report the order that was inferred, if the user states none, masks that are
         not read, and doubts about the format of boxes.
         """
-        remarks = []
-        is_order_inferred = not self.order and bool(self.inferred_order)
-        # the option that states the inferred order
-        order_option = format_detection_option(f"order: {self.inferred_order}")
-        if not self.order and self.head_shape:
-            remarks.append(
-                f"The detector's output of {self.head_shape} is read as a YOLO's: "
-                f"{order_option}."
-            )
-        if is_order_inferred and self.inferred_order in QUERIES:
-            remarks.append(
-                f"The detector's output is read as a DETR's: {order_option}."
-            )
+        remarks = self._remarks_on_order
         if self.ignores_masks:
             remarks.append(
                 "The detector's masks are not used: only its boxes and scores are read."
             )
+        is_order_inferred = not self.order and bool(self.inferred_order)
         if is_order_inferred and self.is_order_ambiguous:
             remarks.append(
                 "Scores and classes of the detector's boxes are distinguished by their "
-                f"values: they are read as {order_option}."
+                f"values: they are read as {self._order_option}."
             )
         if self.format_doubts:
             remarks.append(
                 f"The detector's boxes may be read wrongly: {self.format_doubts}."
             )
         return tuple(remarks)
+
+    @property
+    def _order_option(self) -> str:
+        """The option that states the inferred order."""
+        return format_detection_option(f"order: {self.inferred_order}")
+
+    @property
+    def _remarks_on_order(self) -> list[str]:
+        """Sentences about the kind of network whose order was inferred."""
+        if self.order:
+            return []
+        remarks = []
+        if self.head_shape:
+            remarks.append(
+                f"The detector's output of {self.head_shape} is read as a YOLO's: "
+                f"{self._order_option}."
+            )
+        if self.inferred_order in QUERIES:
+            remarks.append(
+                f"The detector's output is read as a DETR's: {self._order_option}."
+            )
+        return remarks
 
     @property
     def _box_format(self) -> BoxFormat:
@@ -688,15 +715,11 @@ class Detection(ClassTask):
             is_finite = boxes.detach().isfinite().all(dim=1)
             # false for a score of NaN
             is_low = get_possible_scores(resolved) < self._min_score
-            has_low_scores = is_low.all(dim=1)
-            is_used = is_finite | ~has_low_scores
-            if not bool(is_used.all()):
-                resolved = {
-                    # "n_nan_rows" is a count; the others have a row for each box
-                    name: values if name == "n_nan_rows" else values[is_used]
-                    for name, values in resolved.items()
-                }
-            images.append(resolved)
+            is_used = is_finite | ~is_low.all(dim=1)
+            if bool(is_used.all()):
+                images.append(resolved)
+            else:
+                images.append(_select_rows(resolved, is_used))
         return images
 
     def _clear_nothing_classes(self, detections: Detections) -> Tensor:
@@ -812,21 +835,31 @@ class Detection(ClassTask):
         If there is a target, only the scores of target classes count; they may be right
         classes of the object, too.
         """
-        if self.target is None:
-            right_score = self._find_best_scores(detections, truth.labels)
-            wrong_score = self._find_rival_scores(detections, truth.labels)
-        else:
-            right_classes = set(truth.labels)
-            right_targets = tuple(sorted(set(self.target) & right_classes))
-            wrong_targets = tuple(sorted(set(self.target) - right_classes))
-            right_score = self._find_best_scores(detections, right_targets)
-            wrong_score = self._find_best_scores(detections, wrong_targets)
+        right_score, wrong_score = self._find_sought_scores(detections, truth)
         is_on_nothing = self._is_on_nothing(detections, truth)
         is_elsewhere = self._is_elsewhere(detections, truth)
         return torch.maximum(
             torch.where(is_on_nothing, right_score, 0.0),
             torch.where(is_elsewhere, wrong_score, 0.0),
         )
+
+    def _find_sought_scores(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> tuple[Tensor, Tensor]:
+        """Return each box's best score of a right class and of a wrong one, (D,) each.
+
+        If there is a target, only the scores of target classes count.
+        """
+        if self.target is None:
+            right_score = self._find_best_scores(detections, truth.labels)
+            wrong_score = self._find_rival_scores(detections, truth.labels)
+            return right_score, wrong_score
+        right_classes = set(truth.labels)
+        right_targets = tuple(sorted(set(self.target) & right_classes))
+        wrong_targets = tuple(sorted(set(self.target) - right_classes))
+        right_score = self._find_best_scores(detections, right_targets)
+        wrong_score = self._find_best_scores(detections, wrong_targets)
+        return right_score, wrong_score
 
     @staticmethod
     def _find_best_scores(detections: Detections, classes: Labels) -> Tensor:
@@ -872,18 +905,23 @@ class Detection(ClassTask):
 
         An image without a box has the only prediction "nothing".
         """
-        predictions_of_images: list[tuple[Prediction, ...]] = []
-        for detections in self._read_boxes(output):
-            if self._is_broken(detections):
-                predictions_of_images.append((Prediction(NOT_A_NUMBER),))
-                continue
-            boxes = list_boxes(detections, count, MIN_PROBABILITY, self.suppression)
-            predictions = tuple(
-                Prediction(self.get_class_name(label), label, score)
-                for _, label, score in boxes
-            )
-            predictions_of_images.append(predictions or (Prediction("nothing"),))
-        return predictions_of_images
+        return [
+            self._predict_boxes(detections, count)
+            for detections in self._read_boxes(output)
+        ]
+
+    def _predict_boxes(
+        self, detections: Detections, count: int
+    ) -> tuple[Prediction, ...]:
+        """Return the `count` boxes with the best scores of an image, as predictions."""
+        if self._is_broken(detections):
+            return (Prediction(NOT_A_NUMBER),)
+        boxes = list_boxes(detections, count, MIN_PROBABILITY, self.suppression)
+        predictions = [
+            Prediction(self.get_class_name(label), label, score)
+            for _, label, score in boxes
+        ]
+        return tuple(predictions) or (Prediction("nothing"),)
 
     def describe(
         self,
@@ -901,19 +939,25 @@ class Detection(ClassTask):
             truth: truth of the scene.
             margins: not used; other tasks read them.
         """
-        results: list[PredictionWithPayload] = []
-        for detections in self._read_boxes(output):
-            match = self._match_object(self._suppress(detections), truth)
-            payload: dict[str, JsonValue] = {
-                "box": None if truth.box is None else list(truth.box),
-                "found": self._list_stored_boxes(detections, truth),
-            }
-            if match.outcome is not None:
-                payload[OUTCOME] = match.outcome.value
-                payload["class"] = self.get_class_name(match.class_index)
-                payload["iou"] = None if match.iou is None else round(match.iou, 3)
-            results.append((self._describe_match(match, truth), payload))
-        return results
+        return [
+            self._describe_detections(detections, truth)
+            for detections in self._read_boxes(output)
+        ]
+
+    def _describe_detections(
+        self, detections: Detections, truth: DetectionTruth
+    ) -> PredictionWithPayload:
+        """Return the prediction about the object in one image, with its payload."""
+        match = self._match_object(self._suppress(detections), truth)
+        payload: dict[str, JsonValue] = {
+            "box": None if truth.box is None else list(truth.box),
+            "found": self._list_stored_boxes(detections, truth),
+        }
+        if match.outcome is not None:
+            payload[OUTCOME] = match.outcome.value
+            payload["class"] = self.get_class_name(match.class_index)
+            payload["iou"] = None if match.iou is None else round(match.iou, 3)
+        return self._describe_match(match, truth), payload
 
     def _list_stored_boxes(
         self, detections: Detections, truth: DetectionTruth
@@ -924,21 +968,15 @@ class Detection(ClassTask):
         """
         height, width = truth.image_size
         scale = [width, height] * 2  # of x0, y0, x1, y1
-        boxes: list[JsonValue] = []
-        for box, label, score in list_boxes(
+        best_boxes = list_boxes(
             detections, MAX_STORED_BOXES, self._min_score, self.suppression
-        ):
-            pixels: list[JsonValue] = [
-                round(fraction * size, 1)
-                for fraction, size in zip(box, scale, strict=True)
-            ]
-            boxes.append(
-                {
-                    "box": pixels,
-                    "label": self.get_class_name(label),
-                    "score": round(score, 3),
-                }
-            )
+        )
+        boxes: list[JsonValue] = []
+        for box, label, score in best_boxes:
+            corners = [x * size for x, size in zip(box, scale, strict=True)]
+            pixels: list[JsonValue] = [round(corner, 1) for corner in corners]
+            class_name = self.get_class_name(label)
+            boxes.append({"box": pixels, "label": class_name, "score": round(score, 3)})
         return boxes
 
     def _match_object(
@@ -1006,11 +1044,7 @@ class Detection(ClassTask):
                     outcome, detections, scores, is_candidate, truth
                 )
         best_score = float(max_or_zero(right_score, is_at_object))
-        return ObjectMatch(
-            Outcome.MISSED,
-            truth.labels[0],
-            best_score if math.isfinite(best_score) else None,  # JSON has no NaN
-        )
+        return _make_missed_match(truth, best_score)
 
     @staticmethod
     def _match_best_box(
@@ -1033,12 +1067,7 @@ class Detection(ClassTask):
         # Scores are at least 0. So with -1, boxes that are no candidates come last.
         row = int(torch.where(is_candidate, scores, -1.0).argmax())
         score = float(scores[row])
-        if "labels" in detections:
-            class_id = int(detections["labels"][row])
-        else:
-            # The first class with this score. It is equal exactly, since `score` is one of
-            # the scores of the box.
-            class_id = int((detections["scores"][row] == score).nonzero()[0])
+        class_id = _find_class_of_row(detections, row, score)
         iou = None
         if truth.box is not None:
             iou = float(compute_iou_with_truth(detections, truth)[row])
@@ -1083,12 +1112,66 @@ class Detection(ClassTask):
         if self._is_broken(detections):
             return []
         height, width = truth.image_size
-        marks = []
-        for (x0, y0, x1, y1), label, score in list_boxes(
+        best_boxes = list_boxes(
             detections, MAX_STORED_BOXES, self.confidence, self.suppression
-        ):
+        )
+        marks = []
+        for (x0, y0, x1, y1), label, score in best_boxes:
             box = (x0 * width, y0 * height, x1 * width, y1 * height)
-            marks.append(
-                Mark(f"{self.get_class_name(label)} {score:.2f}", true=False, box=box)
-            )
+            text = f"{self.get_class_name(label)} {score:.2f}"
+            marks.append(Mark(text, true=False, box=box))
         return marks
+
+
+def _explain_order_error(error: ValueError, output: Sequence[Detections]) -> str:
+    """Return why an output shows no order, with its shape or advice.
+
+    Args:
+        error: error of `detector_outputs.infer_order`.
+        output: detections of N images.
+    """
+    grids = [detections["grid"] for detections in output if "grid" in detections]
+    shape = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
+    has_pairs = any("score_or_label" in detections for detections in output)
+    hint = f"; {ORDER_ADVICE}" if has_pairs else ""
+    return f"{shape}{error}{hint}"
+
+
+def _find_class_of_row(detections: Detections, row: int, score: float) -> int:
+    """Return the class of a box for which it has a score.
+
+    Args:
+        detections: detections of an image.
+        row: index of the box.
+        score: one of its scores.
+    """
+    if "labels" in detections:
+        return int(detections["labels"][row])
+    # The first class with this score. It is equal exactly, since `score` is one of the
+    # scores of the box.
+    return int((detections["scores"][row] == score).nonzero()[0])
+
+
+def _select_rows(detections: Detections, is_used: Tensor) -> Detections:
+    """Return the detections of an image in some of its rows.
+
+    Args:
+        detections: D boxes with their scores.
+        is_used: (D,) bool, which of them.
+    """
+    return {
+        # "n_nan_rows" is a count; the others have a row for each box
+        name: values if name == "n_nan_rows" else values[is_used]
+        for name, values in detections.items()
+    }
+
+
+def _make_missed_match(truth: DetectionTruth, best_score: float) -> ObjectMatch:
+    """Return the outcome for an object that no box of sufficient score is about.
+
+    Args:
+        truth: truth of the scene.
+        best_score: largest score of a right class at the object.
+    """
+    stored_score = best_score if math.isfinite(best_score) else None  # no JSON NaN
+    return ObjectMatch(Outcome.MISSED, truth.labels[0], stored_score)

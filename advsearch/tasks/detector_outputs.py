@@ -85,6 +85,7 @@ the scores instead of objectness before them.
 """
 
 _UNREAD = "which are not read"  # end of messages about outputs of other kinds
+_ANGLE_PROBLEM = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
 
 NAMES = {
     "boxes": (
@@ -148,11 +149,9 @@ def parse_order(text: str) -> tuple[str, ...]:
     """
     names = tuple(text.replace(",", " ").split())
     is_head_or_query = " ".join(names) in CLASS_COUNT_ORDERS
-    if is_head_or_query:
-        return names
     components = list(NAMES)  # boxes, scores and labels
     is_known = sorted(names) in (sorted(components), sorted([*components, "batch"]))
-    if not is_known:
+    if not is_head_or_query and not is_known:
         raise ValueError(
             f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', "
             f"of a YOLO's head {' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or "
@@ -187,32 +186,53 @@ def read_detections(returned: Any, count: int, order: str = "") -> list[Detectio
         return _split_queries(*queries)
 
     predictions, channels = _split_off_maps(returned)
+    if _may_be_grid(predictions, count):
+        detections_of_images = _read_tensor(predictions, channels, order)
+        if detections_of_images is not None:
+            return detections_of_images
+    # If the user states the order of a YOLO head, the output should have been a grid.
+    is_head_stated = "objectness" in order_names or "channels" in order_names
+    if is_head_stated:
+        raise ValueError(EXPECTED)
+    components_of_images = _split_images(predictions, count, order_names)
+    return [_check_detections(components) for components in components_of_images]
+
+
+def _read_tensor(
+    predictions: Tensor, channels: Collection[int], order: str
+) -> list[Detections] | None:
+    """Read a single tensor (N, A, B) as YOLO grids, or as rows with mask coefficients.
+
+    Args:
+        predictions: (N, A, B).
+        channels: numbers of channels of feature maps that came with it.
+        order: order that the user stated, or "".
+
+    Returns:
+        The detections of each image; None if it is neither.
+    """
     map_channels = torch.tensor(sorted(channels), dtype=torch.long)
-    is_single_tensor = (
+    # rows of a box, a score, a class and mask coefficients
+    has_mask_rows = _has_mask_rows(predictions, channels)
+    if _is_grid(predictions, order, has_mask_rows=has_mask_rows):
+        return [
+            {"grid": grid.float(), "map_channels": map_channels} for grid in predictions
+        ]
+    if not has_mask_rows:
+        return None
+    # The mask coefficients after the first six columns are not read.
+    rows = read_detections(predictions[..., :6], len(predictions), order)
+    return [{**detections, "map_channels": map_channels} for detections in rows]
+
+
+def _may_be_grid(predictions: Any, count: int) -> bool:
+    """Return whether predictions are a single tensor (count, A, B), and no boxes."""
+    return (
         isinstance(predictions, Tensor)
         and predictions.ndim == 3
         and predictions.shape[0] == count
         and predictions.shape[2] != 4  # boxes without scores, as of a DETR
     )
-    # rows of a box, a score, a class and mask coefficients
-    has_mask_rows = is_single_tensor and _has_mask_rows(predictions, channels)
-    if is_single_tensor and _is_grid(predictions, order, has_mask_rows=has_mask_rows):
-        return [
-            {"grid": grid.float(), "map_channels": map_channels} for grid in predictions
-        ]
-    if has_mask_rows:
-        # The mask coefficients after the first six columns are not read.
-        without_masks = predictions[..., :6]
-        rows = read_detections(without_masks, count, order)
-        return [{**detections, "map_channels": map_channels} for detections in rows]
-    # If the user states the order of a YOLO head, the output should have been a grid.
-    is_head_stated = "objectness" in order_names or "channels" in order_names
-    if is_head_stated:
-        raise ValueError(EXPECTED)
-    return [
-        _check_detections(components)
-        for components in _split_images(predictions, count, order_names)
-    ]
 
 
 def _is_grid(predictions: Tensor, order: str, *, has_mask_rows: bool) -> bool:
@@ -294,11 +314,7 @@ def _split_images(
     Raises:
         ValueError: the output has none of the forms of `EXPECTED`.
     """
-    if (
-        isinstance(returned, (list, tuple))
-        and len(returned) == count
-        and all(map(_is_image_output, returned))
-    ):
+    if _is_list_of_images(returned, count):
         return [
             dict(NO_DETECTIONS)
             if output is None
@@ -311,7 +327,17 @@ def _split_images(
     )
     if has_rows_of_all_images:
         return _split_batch_rows(returned, count, order_names)
-    batch = _find_components(returned, order_names)
+    return _split_components(_find_components(returned, order_names), count)
+
+
+def _split_components(
+    batch: Mapping[str, Tensor], count: int
+) -> list[dict[str, Tensor]]:
+    """Split the components of a batch, whose first axis is the image, by image.
+
+    Raises:
+        ValueError: they are not those of `count` images.
+    """
     if batch["boxes"].ndim == 2 and count == 1:
         # The network has dropped the batch dimension, which is added again.
         batch = {name: component[None] for name, component in batch.items()}
@@ -321,6 +347,15 @@ def _split_images(
         {name: component[index] for name, component in batch.items()}
         for index in range(count)
     ]
+
+
+def _is_list_of_images(returned: Any, count: int) -> bool:
+    """Return whether an output is a sequence with an element for each image."""
+    return (
+        isinstance(returned, (list, tuple))
+        and len(returned) == count
+        and all(map(_is_image_output, returned))
+    )
 
 
 def _split_batch_rows(
@@ -341,19 +376,9 @@ def _split_batch_rows(
     Raises:
         ValueError: that column does not hold indices of images.
     """
-    names_before: Sequence[str] = ()
-    if "batch" in order_names:
-        names_before = order_names[: order_names.index("batch")]
-    # A name has one column, but "boxes" has four. The column is 0 without a stated order.
-    batch_column = sum(4 if name == "boxes" else 1 for name in names_before)
+    batch_column = _find_batch_column(order_names)
     image_index = rows.detach()[:, batch_column]
-    is_index = (
-        (image_index == image_index.round())
-        & (image_index >= -1)  # -1 is padding
-        & (image_index < count)
-    )
-    if not bool(is_index.all()):
-        raise ValueError(EXPECTED)
+    _check_image_indices(image_index, count)
     other_columns = torch.cat(
         [rows[:, :batch_column], rows[:, batch_column + 1 :]], dim=1
     )
@@ -363,6 +388,26 @@ def _split_batch_rows(
         _find_components(other_columns[image_index == index], other_names)
         for index in range(count)
     ]
+
+
+def _check_image_indices(numbers: Tensor, count: int) -> None:
+    """Raise ValueError if numbers (D,) are not all indices of `count` images, or -1."""
+    is_index = (
+        (numbers == numbers.round())
+        & (numbers >= -1)  # -1 is padding
+        & (numbers < count)
+    )
+    if not bool(is_index.all()):
+        raise ValueError(EXPECTED)
+
+
+def _find_batch_column(order_names: Sequence[str]) -> int:
+    """Return the column with the index of the image; the first without a stated order."""
+    names_before: Sequence[str] = ()
+    if "batch" in order_names:
+        names_before = order_names[: order_names.index("batch")]
+    # A name has one column, but "boxes" has four.
+    return sum(4 if name == "boxes" else 1 for name in names_before)
 
 
 def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
@@ -385,11 +430,9 @@ def _find_queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
     boxes = get("pred_boxes", None)
     if not isinstance(boxes, Tensor):
         return None
-    for name in QUERY_LOGITS:
-        logits = get(name, None)
-        if isinstance(logits, Tensor):
-            return boxes, logits
-    return None
+    candidates = (get(name, None) for name in QUERY_LOGITS)
+    logits = next((x for x in candidates if isinstance(x, Tensor)), None)
+    return None if logits is None else (boxes, logits)
 
 
 def _find_query_tensors(returned: Sequence[Any]) -> tuple[Tensor, Tensor] | None:
@@ -482,15 +525,13 @@ def _find_components(returned: Any, order_names: Sequence[str]) -> dict[str, Ten
         return named
     # Without known names, the stated order identifies the tensors, or else their shapes.
     tensors = _list_tensors_in_order(returned)
-    if order_names and len(tensors) == len(order_names):
-        components = dict(zip(order_names, tensors, strict=True))
-        # (D,) or (N, D). Scores and labels may have another axis of size one, which is
-        # removed. Each order has boxes.
-        shape = components["boxes"].shape[:-1]
-        return {
-            name: _squeeze_last(tensor, shape) for name, tensor in components.items()
-        }
-    return _identify_by_shape(tensors)
+    if not order_names or len(tensors) != len(order_names):
+        return _identify_by_shape(tensors)
+    components = dict(zip(order_names, tensors, strict=True))
+    # (D,) or (N, D). Scores and labels may have another axis of size one, which is
+    # removed. Each order has boxes.
+    shape = components["boxes"].shape[:-1]
+    return {name: _squeeze_last(tensor, shape) for name, tensor in components.items()}
 
 
 def _list_tensors_in_order(returned: Any) -> list[Tensor]:
@@ -544,16 +585,32 @@ def _find_named(returned: Any) -> dict[str, Tensor] | None:
         return None
     components = dict[str, Tensor]()
     for component, names in NAMES.items():
-        exact = [name for name in names if name in tensors]
-        words = WORDS[component]
-        similar = [
-            name for name in tensors if any(word in name.lower() for word in words)
-        ]
-        if exact or len(similar) == 1:
-            match = exact[0] if exact else similar[0]
-            # taken out, so that no tensor is found for two components
+        match = _find_component_name(tensors, names, WORDS[component])
+        if match is not None:
+            # removed, so that no tensor is found for two components
             components[component] = tensors.pop(match)
     return components
+
+
+def _find_component_name(
+    tensor_names: Iterable[str], known_names: Sequence[str], words: Sequence[str]
+) -> str | None:
+    """Return the name of the tensor that is a component; None if none seems to be.
+
+    Args:
+        tensor_names: names of the tensors.
+        known_names: names that the component may have.
+        words: words of which one is in the name otherwise; then it has to be the only
+            such name.
+    """
+    candidates = list(tensor_names)
+    exact = [name for name in known_names if name in candidates]
+    if exact:
+        return exact[0]
+    similar = [
+        name for name in candidates if any(word in name.lower() for word in words)
+    ]
+    return similar[0] if len(similar) == 1 else None
 
 
 def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:
@@ -571,11 +628,8 @@ def _list_named_tensors(returned: Any) -> dict[str, Tensor] | None:
     if not any(hasattr(returned, name) for name in NAMES["boxes"]):
         return None
     known_names = [name for names in NAMES.values() for name in names]
-    return {
-        name: getattr(returned, name)
-        for name in known_names
-        if isinstance(getattr(returned, name, None), Tensor)
-    }
+    values = {name: getattr(returned, name, None) for name in known_names}
+    return {name: value for name, value in values.items() if isinstance(value, Tensor)}
 
 
 def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
@@ -600,21 +654,35 @@ def _identify_by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
     if has_score_of_every_class:
         return {"boxes": boxes, "scores": others[0]}
     numbers = [_squeeze_last(tensor, shape) for tensor in others]
-    integers = [tensor for tensor in numbers if not tensor.is_floating_point()]
     has_other_shape = any(tensor.shape != shape for tensor in numbers)
-    # Of two integers none is a score.
-    if len(numbers) != 2 or len(integers) == 2 or has_other_shape:
+    if len(numbers) != 2 or has_other_shape:
+        raise ValueError(EXPECTED)
+    return {"boxes": boxes, **_identify_numbers(numbers, boxes.dtype)}
+
+
+def _identify_numbers(
+    numbers: Sequence[Tensor], dtype: torch.dtype
+) -> dict[str, Tensor]:
+    """Return scores and labels, or both as "score_or_label" (..., 2) of a dtype.
+
+    The label has an integer type.
+
+    Args:
+        numbers: two numbers for each box.
+        dtype: dtype of the result, if types do not identify them.
+
+    Raises:
+        ValueError: both are integers, so that none is a score.
+    """
+    integers = [tensor for tensor in numbers if not tensor.is_floating_point()]
+    if len(integers) == 2:
         raise ValueError(EXPECTED)
     if integers:
         (labels,) = integers
         (scores,) = (tensor for tensor in numbers if tensor is not labels)
-        return {"boxes": boxes, "scores": scores, "labels": labels}
-    return {
-        "boxes": boxes,
-        "score_or_label": torch.stack(
-            [tensor.to(boxes.dtype) for tensor in numbers], dim=-1
-        ),
-    }
+        return {"scores": scores, "labels": labels}
+    pairs = [tensor.to(dtype) for tensor in numbers]
+    return {"score_or_label": torch.stack(pairs, dim=-1)}
 
 
 def _find_boxes_by_shape(tensors: Sequence[Tensor]) -> Tensor:
@@ -643,20 +711,7 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
     Raises:
         ValueError: shapes, classes or scores are not those of detections.
     """
-    boxes = components["boxes"]
-    if boxes.numel() == 0:
-        boxes = boxes.reshape(-1, 4)
-    # Each component has a row for each box. Only "n_nan_rows" is a single count.
-    row_tensors = [
-        tensor for name, tensor in components.items() if name != "n_nan_rows"
-    ]
-    if (
-        boxes.ndim != 2
-        or boxes.shape[1] != 4
-        or any(len(tensor) != len(boxes) for tensor in row_tensors)
-    ):
-        raise ValueError(EXPECTED)
-    boxes = boxes.float()
+    boxes = _check_boxes(components)
     if "score_or_label" in components:
         return _remove_padded_pairs(boxes, components["score_or_label"].float())
 
@@ -675,6 +730,28 @@ def _check_detections(components: Mapping[str, Tensor]) -> Detections:
     if "n_nan_rows" in components:
         detections["n_nan_rows"] = components["n_nan_rows"]
     return detections
+
+
+def _check_boxes(components: Mapping[str, Tensor]) -> Tensor:
+    """Return the boxes (D, 4) of an image as floating-point numbers.
+
+    Raises:
+        ValueError: they have another shape, or a component has not a row for each.
+    """
+    boxes = components["boxes"]
+    if boxes.numel() == 0:
+        boxes = boxes.reshape(-1, 4)
+    # Each component has a row for each box. Only "n_nan_rows" is a single count.
+    row_tensors = [
+        tensor for name, tensor in components.items() if name != "n_nan_rows"
+    ]
+    if (
+        boxes.ndim != 2
+        or boxes.shape[1] != 4
+        or any(len(tensor) != len(boxes) for tensor in row_tensors)
+    ):
+        raise ValueError(EXPECTED)
+    return boxes.float()
 
 
 def _find_padding(boxes: Tensor, scores: Tensor, labels: Tensor | None) -> Tensor:
@@ -756,10 +833,8 @@ def _check_probabilities(values: Tensor, *, has_labels: bool) -> None:
         return
     advice = ""
     if not has_labels:
-        options = " or ".join(
-            format_detection_option(f"order: {order}") for order in QUERIES
-        )
-        advice = f", or set {options}"
+        options = [format_detection_option(f"order: {order}") for order in QUERIES]
+        advice = f", or set {' or '.join(options)}"
     raise ValueError(
         "expected scores that are probabilities in [0, 1]; apply a sigmoid or a "
         f"softmax to them{advice}"
@@ -860,30 +935,40 @@ def _resolve_pairs(detections: Detections, order: str) -> Detections:
     """
     pairs = detections["score_or_label"]
     if not order:
-        has_values = are_counted_boxes(detections) | pairs.isnan().any(dim=1)
-        if bool(has_values.any()):
-            raise ValueError(
-                "the output does not show which of a box's two numbers is its score; "
-                f"{ORDER_ADVICE}"
-            )
+        _check_no_values(detections)
         order = SCORES_FIRST  # no box has a score, so that the order does not matter
     if order in HEAD_ORDERS:
-        # Both are scores of classes; or the first is objectness, the probability of any
-        # object in the box, and the score of the only class is their product.
-        has_objectness = order.startswith(OBJECTNESS_HEAD)
-        scores = pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
+        scores = _compute_pair_scores(pairs, order)
         return _check_detections({"boxes": detections["boxes"], "scores": scores})
-    first, second = pairs.unbind(dim=1)
-    if order == SCORES_FIRST:
-        identified = {"scores": first, "labels": second}
-    else:
-        identified = {"scores": second, "labels": first}
-    other_components = {
+    components = {
         name: value
         for name, value in detections.items()
         if name not in ("score_or_label", "map_channels")
     }
-    return _check_detections({**other_components, **identified})
+    names = ("scores", "labels") if order == SCORES_FIRST else ("labels", "scores")
+    components.update(zip(names, pairs.unbind(dim=1), strict=True))
+    return _check_detections(components)
+
+
+def _compute_pair_scores(pairs: Tensor, order: str) -> Tensor:
+    """Return the scores (D, classes) in pairs (D, 2) by an order of `HEAD_ORDERS`.
+
+    Both numbers are scores of classes; or the first is objectness, the probability of
+    any object in the box, and the score of the only class is their product.
+    """
+    has_objectness = order.startswith(OBJECTNESS_HEAD)
+    return pairs.prod(dim=1, keepdim=True) if has_objectness else pairs
+
+
+def _check_no_values(detections: Detections) -> None:
+    """Raise ValueError if a pair of an image has a positive number or NaN."""
+    is_nan = detections["score_or_label"].isnan().any(dim=1)
+    has_values = are_counted_boxes(detections) | is_nan
+    if bool(has_values.any()):
+        raise ValueError(
+            "the output does not show which of a box's two numbers is its score; "
+            f"{ORDER_ADVICE}"
+        )
 
 
 def infer_order(
@@ -949,19 +1034,23 @@ def _infer_logit_order(n_logits: int, classes: int, head: str) -> str:
     allows_nothing_logit = order == SOFTMAX_QUERIES
     if n_logits == classes or (allows_nothing_logit and has_nothing_logit):
         return order
+    raise ValueError(
+        f"expected {classes} logits of a box for {classes} classes, or "
+        f"{classes + 1} with one for nothing, got {n_logits}; "
+        f"{_advise_on_logits(n_logits)}"
+    )
+
+
+def _advise_on_logits(n_logits: int) -> str:
+    """Return what to do about a number of logits that does not fit the classes."""
     # sets of labels with as many classes, without or with a logit for no object
     fitting_sets = dict.fromkeys(
         [*list_sets_of_size(n_logits), *list_sets_of_size(n_logits - 1)]
     )
     fitting = [f"`labels={name}`" for name in fitting_sets]
     if fitting:
-        advice = f"{' or '.join(fitting)} would fit"
-    else:
-        advice = "set the `labels` of its classes"
-    raise ValueError(
-        f"expected {classes} logits of a box for {classes} classes, or "
-        f"{classes + 1} with one for nothing, got {n_logits}; {advice}"
-    )
+        return f"{' or '.join(fitting)} would fit"
+    return "set the `labels` of its classes"
 
 
 def _infer_grid_order(grids: Sequence[Detections], classes: int, head: str) -> str:
@@ -985,11 +1074,10 @@ def _infer_grid_order(grids: Sequence[Detections], classes: int, head: str) -> s
     if not orders:
         raise ValueError("the numbers of different pictures have different orders")
     if len(orders) > 1:
-        options = " or ".join(
-            format_detection_option(f"order: {name}") for name in sorted(orders)
-        )
+        options = [format_detection_option(f"order: {name}") for name in sorted(orders)]
         raise ValueError(
-            f"the output does not show the order of its numbers; set {options}"
+            "the output does not show the order of its numbers; set "
+            f"{' or '.join(options)}"
         )
     return orders.pop()
 
@@ -1015,31 +1103,69 @@ def _infer_pair_order(
     if not any(map(len, pairs_of_images)):
         return ""
     columns = torch.cat(pairs_of_images).unbind(dim=1)
+    orders = _find_fitting_orders(columns, classes)
+    if len(orders) > 1:
+        # Numbers such as 0 and 1 may be scores or classes.
+        return _find_falling_order(pairs_of_images)
+    if orders:
+        return orders[0]
+    return _infer_score_order(detections_of_images, columns, classes)
+
+
+def _infer_score_order(
+    detections_of_images: Sequence[Detections],
+    columns: Sequence[Tensor],
+    classes: int | None,
+) -> str:
+    """Infer the order of two numbers of boxes of which neither seems to be a class.
+
+    Args:
+        detections_of_images: detections of images.
+        columns: the first and the second number of all their boxes, (D,) each.
+        classes: number of classes; None if it is unknown.
+
+    Raises:
+        ValueError: the numbers are neither scores nor classes.
+    """
+    are_scores = all(map(_may_be_scores, columns))
+    order = _infer_order_without_labels(columns, classes) if are_scores else ""
+    if order:
+        return order
+    if classes is not None:
+        # An index may be too large because the number of classes is wrong: try without
+        # that number.
+        return _infer_pair_order(detections_of_images, classes=None)
+    raise ValueError(
+        "expected for each box a score in [0, 1] and the index of a "
+        "class, got other numbers"
+    )
+
+
+def _find_fitting_orders(columns: Sequence[Tensor], classes: int | None) -> list[str]:
+    """Return those of `ORDERS` in which two columns of numbers can be read.
+
+    Args:
+        columns: two columns (K,) of numbers of boxes.
+        classes: number of classes; None if it is unknown.
+    """
+    first, second = columns
     max_classes = math.inf if classes is None else classes
-    are_classes = [_may_be_classes(column, max_classes) for column in columns]
-    are_scores = [_may_be_scores(column) for column in columns]
-    fits_scores_first = are_scores[0] and are_classes[1]
-    fits_labels_first = are_scores[1] and are_classes[0]
-    if not fits_scores_first and not fits_labels_first:
-        if all(are_scores):
-            order = _infer_order_without_labels(columns, classes)
-            if order:
-                return order
-        if classes is not None:
-            # An index may be too large because the number of classes is wrong: try without
-            # that number.
-            return _infer_pair_order(detections_of_images, classes=None)
-        raise ValueError(
-            "expected for each box a score in [0, 1] and the index of a "
-            "class, got other numbers"
-        )
-    if fits_scores_first and fits_labels_first:
-        # Numbers such as 0 and 1 may be scores or classes. Then the column that falls has
-        # the scores.
-        fits_scores_first = _is_falling(pairs_of_images, column=0)
-        fits_labels_first = _is_falling(pairs_of_images, column=1)
-        if fits_scores_first == fits_labels_first:  # both columns fall, or none does
-            return ""
+    orders = []
+    if _may_be_scores(first) and _may_be_classes(second, max_classes):
+        orders.append(SCORES_FIRST)
+    if _may_be_scores(second) and _may_be_classes(first, max_classes):
+        orders.append(LABELS_FIRST)
+    return orders
+
+
+def _find_falling_order(pairs_of_images: Sequence[Tensor]) -> str:
+    """Return the order in which the column that falls has the scores; "" if both
+    columns fall, or none does.
+    """
+    fits_scores_first = _is_falling(pairs_of_images, column=0)
+    fits_labels_first = _is_falling(pairs_of_images, column=1)
+    if fits_scores_first == fits_labels_first:
+        return ""
     return SCORES_FIRST if fits_scores_first else LABELS_FIRST
 
 
@@ -1129,36 +1255,61 @@ def find_head_orders(
     problem = ""
     for name in _list_orders_of_size(returned.shape, map_channels, classes, order):
         _, scores = split_grid(returned, classes, name, multiply_objectness=False)
-        scores = scores.detach()
-        is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
-        # scores that are not finite make an output broken, in any order
-        fits = not bool((is_outside & scores.isfinite()).any())
-        is_only_last_outside = not bool(is_outside[:, :-1].any())
-        if fits:
+        new_problem = _describe_misread_scores(scores.detach(), name)
+        if not new_problem:
             orders.append(name)
-        elif name == _OBB_LIKE_ORDER and is_only_last_outside:
-            # The last channel is no score but an angle.
-            problem = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
-        elif not problem:
-            problem = (
-                f"scores from {float(scores.min()):.3g} to "
-                f"{float(scores.max()):.3g} if it is read as '{name}'; "
-                "expected probabilities in [0, 1]: apply a sigmoid to them"
-            )
-    # An OBB head (box, scores, angle) has as many channels as a head with objectness (box,
-    # objectness, scores). If its angle is in [0, 1], both look the same. So this order is
-    # accepted only if the user states it.
-    if orders == [_OBB_LIKE_ORDER] and not order:
-        raise ValueError(
-            f"its {5 + classes} channels may be those of an OBB head (with an angle), "
-            f"{_UNREAD}; if it has objectness, set `task='detection={{order: "
-            f"{_OBB_LIKE_ORDER}}}'`"
-        )
+        elif not problem or new_problem == _ANGLE_PROBLEM:
+            problem = new_problem
+    if not order:
+        _check_no_angle(orders, classes)
     if orders:
         return tuple(orders)
     if problem:
         raise ValueError(f"it has {problem}")
     raise _make_channel_error((returned.shape[0], returned.shape[1]), classes)
+
+
+def _describe_misread_scores(scores: Tensor, order: str) -> str:
+    """Describe scores that are outside [0, 1] if an output is read in an order.
+
+    The text is empty if none is. Scores that are not finite make an output broken, in
+    any order.
+
+    Args:
+        scores: scores that are read in this order; the last axis is that of classes.
+        order: the order.
+    """
+    is_outside = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
+    if not bool((is_outside & scores.isfinite()).any()):
+        return ""
+    is_only_last_outside = not bool(is_outside[:, :-1].any())
+    if order == _OBB_LIKE_ORDER and is_only_last_outside:
+        # The last channel is no score but an angle.
+        return _ANGLE_PROBLEM
+    return (
+        f"scores from {float(scores.min()):.3g} to "
+        f"{float(scores.max()):.3g} if it is read as '{order}'; "
+        "expected probabilities in [0, 1]: apply a sigmoid to them"
+    )
+
+
+def _check_no_angle(orders: list[str], classes: int) -> None:
+    """Raise ValueError if an output may be that of an OBB head, by its only order.
+
+    An OBB head (box, scores, angle) has as many channels as a head with objectness (box,
+    objectness, scores). If its angle is in [0, 1], both look the same. So this order is
+    accepted only if the user states it.
+
+    Args:
+        orders: orders that fit the output.
+        classes: number of classes.
+    """
+    if orders == [_OBB_LIKE_ORDER]:
+        raise ValueError(
+            f"its {5 + classes} channels may be those of an OBB head (with an angle), "
+            f"{_UNREAD}; if it has objectness, set `task='detection={{order: "
+            f"{_OBB_LIKE_ORDER}}}'`"
+        )
 
 
 def _list_orders_of_size(
@@ -1216,18 +1367,13 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
         may_be_rows: whether boxes are rows; these may begin with a box, a score and a
             class.
     """
+    fitting = _list_fitting_labels(n_channels)
+    if fitting:
+        return f"; {' or '.join(fitting)} would fit"
     # channels after the box and a score for every class
     excess_channels = {n_channels - 4 - classes}
     if may_be_rows:  # or after the box, a score and a class
         excess_channels.add(n_channels - 4 - 2)
-    # sets of labels with as many classes as there are channels from the first score on
-    fitting = [
-        f"`labels={name}`"
-        for n_channels_before_scores in HEADS.values()
-        for name in list_sets_of_size(n_channels - n_channels_before_scores)
-    ]
-    if fitting:
-        return f"; {' or '.join(fitting)} would fit"
     # OBB heads have 1 channel in excess (an angle), YOLO's masks 32, and a keypoint 3.
     if 1 in excess_channels:
         return f", as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
@@ -1242,6 +1388,18 @@ def _advise_on_channels(n_channels: int, classes: int, *, may_be_rows: bool) -> 
             "`labels` of the model's classes"
         )
     return "; set the `labels` of the model's classes"
+
+
+def _list_fitting_labels(n_channels: int) -> list[str]:
+    """Return the settings of known label sets that fit a number of channels.
+
+    Such a set has as many classes as there are channels from the first score on.
+    """
+    return [
+        f"`labels={name}`"
+        for n_channels_before_scores in HEADS.values()
+        for name in list_sets_of_size(n_channels - n_channels_before_scores)
+    ]
 
 
 def split_grid(

@@ -94,15 +94,9 @@ class Rig(tasks.JointTask):
                 "task rig: expected a rig, got one camera; set `camera=rig.yaml`"
             )
         # The task of an image does not depend on the number of cameras.
-        part = self.image_task.on(
-            replace(model, cameras=1), target=target, minimise=minimise
-        )
-        if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
-            raise InputError(
-                f"task rig: task {part.name} judges one output for all pictures; use a "
-                "policy that takes all of them at once, as "
-                "advsearch.models.all_at_once.AllAtOnce"
-            )
+        image_model = replace(model, cameras=1)
+        part = self.image_task.on(image_model, target=target, minimise=minimise)
+        _check_takes_all_images(model, part)
         return replace(
             self,
             image_task=part,
@@ -169,10 +163,8 @@ class Rig(tasks.JointTask):
         """
         rows = []
         for image_outputs in output:
-            values = [
-                function(image_output, image_truth)
-                for image_output, image_truth in zip(image_outputs, truth, strict=True)
-            ]
+            pairs = zip(image_outputs, truth, strict=True)
+            values = [function(*pair) for pair in pairs]
             rows.append(torch.cat(values))
         return torch.stack(rows)
 
@@ -230,15 +222,21 @@ class Rig(tasks.JointTask):
             scores = self.score(output, truth).tolist()
         rig_judgements = []
         for image_outputs, margin, score in zip(output, margins, scores, strict=True):
-            judgements = [
-                self.image_task.judge(image_output, image_truth)[0]
-                for image_output, image_truth in zip(image_outputs, truth, strict=True)
-            ]
+            judgements = self._judge_images(image_outputs, truth)
             # The rule may ignore an image with NaN, but the rig's judgement is NaN then.
             if any(judgement.is_non_finite for judgement in judgements):
                 margin = math.nan
             rig_judgements.append(self._join_judgements(judgements, margin, score))
         return rig_judgements
+
+    def _judge_images(
+        self, outputs: tasks.Outputs, truth: tasks.Truths
+    ) -> list[tasks.Judgement]:
+        """Return the judgement of each image of a single rig."""
+        return [
+            self.image_task.judge(image_output, image_truth)[0]
+            for image_output, image_truth in zip(outputs, truth, strict=True)
+        ]
 
     def _join_judgements(
         self, judgements: Sequence[tasks.Judgement], margin: float, score: float
@@ -251,19 +249,13 @@ class Rig(tasks.JointTask):
             score: joint score by the rule.
         """
         image_payloads: list[tasks.JsonValue] = [
-            {
-                "prediction": judgement.prediction.label,
-                "right": judgement.right,
-                "payload": judgement.payload,
-            }
-            for judgement in judgements
+            _make_image_payload(judgement) for judgement in judgements
         ]
         prediction = tasks.join_predictions(
             judgement.prediction for judgement in judgements
         )
-        outcome = tasks.make_outcome_payload(
-            self._find_deciding_judgement(judgements, margin)
-        )
+        deciding = self._find_deciding_judgement(judgements, margin)
+        outcome = tasks.make_outcome_payload(deciding)
         payload = {"pictures": image_payloads, **outcome}
         return tasks.Judgement.from_margin(score, margin, prediction, payload)
 
@@ -296,13 +288,10 @@ class Rig(tasks.JointTask):
         marks_of_rigs = []
         for image_outputs in output:
             marks = self.image_task.marks(image_outputs[0], truth[0])[0]
+            # A map would be drawn next to the image, where the second image is.
+            flat_marks = [mark for mark in marks if mark.map is None]
             marks_of_rigs.append(
-                [
-                    replace(mark, mask=self._pad_to_rig(mark.mask))
-                    for mark in marks
-                    # A map would be drawn next to the image, where the second image is.
-                    if mark.map is None
-                ]
+                [replace(mark, mask=self._pad_to_rig(mark.mask)) for mark in flat_marks]
             )
         return marks_of_rigs
 
@@ -312,3 +301,24 @@ class Rig(tasks.JointTask):
             return None
         other_images = [torch.zeros_like(mask)] * (self.cameras - 1)
         return torch.cat([mask, *other_images], dim=-1)
+
+
+def _check_takes_all_images(model: Model, part: Task) -> None:
+    """Raise InputError if a task needs one output for all images of a rig, and the
+    model takes them one by one.
+    """
+    if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
+        raise InputError(
+            f"task rig: task {part.name} judges one output for all pictures; use a "
+            "policy that takes all of them at once, as "
+            "advsearch.models.all_at_once.AllAtOnce"
+        )
+
+
+def _make_image_payload(judgement: tasks.Judgement) -> tasks.JsonValue:
+    """Return what is stored about one image of a rig, from its judgement."""
+    return {
+        "prediction": judgement.prediction.label,
+        "right": judgement.right,
+        "payload": judgement.payload,
+    }

@@ -83,20 +83,15 @@ class Segmentation(tasks.ClassTask):
         Raises:
             ValueError: there are no logits of `count` images.
         """
-        if isinstance(returned, Mapping):
-            returned = returned.get("out", returned.get("logits"))
-        elif hasattr(returned, "logits"):
-            returned = returned.logits
-        elif isinstance(returned, (list, tuple)) and returned:
-            returned = returned[0]
+        logits = _find_pixel_logits(returned)
         if (
-            not isinstance(returned, Tensor)
-            or returned.ndim != 4
-            or len(returned) != count
-            or returned.shape[1] < 2  # with a single class nothing could be wrong
+            not isinstance(logits, Tensor)
+            or logits.ndim != 4
+            or len(logits) != count
+            or logits.shape[1] < 2  # with a single class nothing could be wrong
         ):
             raise ValueError(EXPECTED)
-        return returned.float()
+        return logits.float()
 
     def count_classes(self, output: Tensor) -> int:
         return output.shape[1]
@@ -126,19 +121,10 @@ class Segmentation(tasks.ClassTask):
         """
         if self.target is None:
             return super().score(output, truth)
-
-        def compute_target_shortfall(logits: Tensor, labels: tasks.Labels) -> Tensor:
-            """Compute the largest other logit minus the largest one of the target.
-
-            Like the margin of wrong classes, it is at most 0 at pixels that get the
-            requested class.
-            """
-            return -tasks.compute_target_margin(logits, labels)
-
         # At most 0 if enough pixels get a target class, and over 0 otherwise: a loss, as if
         # the target were the truth.
         target_loss = self._compute_deciding_margin(
-            output, truth, compute_target_shortfall, self.target
+            output, truth, _compute_target_shortfall, self.target
         )
         return -target_loss
 
@@ -225,66 +211,84 @@ class Segmentation(tasks.ClassTask):
         # other logit that is not finite are left out.
         is_number = (logits.isfinite() | (logits == -math.inf)).all(dim=0)
         class_of_pixel = logits[:, is_number].argmax(dim=0)
-        n_classes = len(logits)
-        n_pixels = logits[0].numel()
-        counts = class_of_pixel.bincount(minlength=n_classes)
+        counts = class_of_pixel.bincount(minlength=len(logits))
         counts[list(self.background_classes)] = 0
-        top_counts, top_classes = counts.topk(min(count, n_classes))
-        predictions = tuple(
-            tasks.Prediction(
-                self.get_class_name(class_id), class_id, class_count / n_pixels
-            )
-            for class_id, class_count in zip(
-                top_classes.tolist(), top_counts.tolist(), strict=True
-            )
-            if class_count
-        )
+        predictions = self._list_frequent_classes(counts, logits[0].numel(), count)
         if predictions:
             return predictions
         has_any_number = len(class_of_pixel) > 0
         label = "nothing" if has_any_number else tasks.NOT_A_NUMBER
         return (tasks.Prediction(label),)
 
+    def _list_frequent_classes(
+        self, counts: Tensor, n_pixels: int, count: int
+    ) -> tuple[tasks.Prediction, ...]:
+        """Return the `count` most frequent classes that have any pixel.
+
+        Args:
+            counts: number of pixels with each class, (classes,).
+            n_pixels: number of all pixels, of which a class has a fraction.
+            count: how many; there may be fewer.
+        """
+        top_counts, top_classes = counts.topk(min(count, len(counts)))
+        ranked = zip(top_classes.tolist(), top_counts.tolist(), strict=True)
+        return tuple(
+            tasks.Prediction(
+                self.get_class_name(class_id), class_id, n_class / n_pixels
+            )
+            for class_id, n_class in ranked
+            if n_class
+        )
+
     def describe(
         self, output: Tensor, truth: SegmentationTruth, margins: Sequence[float]
     ) -> list[tasks.PredictionWithPayload]:
         """Return the prediction about the object in each image, and a payload.
-
-        The prediction is the class of most of its pixels (`_describe_object`). The
-        payload has the outcome, the fraction of the object's pixels that are right, the
-        fraction of them with each class, and the intersection over union.
 
         Args:
             output: logits (N, classes, h, w).
             truth: truth of the scene.
             margins: margin of each image; at least 0 if it is right.
         """
-        results: list[tasks.PredictionWithPayload] = []
         mask = truth.resize_mask((output.shape[2], output.shape[3])).to(output.device)
-        for logits, margin in zip(output, margins, strict=True):
-            # (P, classes) of the object's pixels, from a batch with this image only
-            batch = logits[None]
-            pixels = self._select_object_logits(batch, truth)
-            if pixels is None:
-                results.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
-                continue
-            # (h, w) which pixels of the full image have a right class
-            is_right_class = self._find_right_pixels(logits, truth)
-            accuracy = float(is_right_class[mask].float().mean())
-            iou = float((is_right_class & mask).sum() / (is_right_class | mask).sum())
-            counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
-            prediction, outcome = self._describe_object(
-                counts, truth, accuracy, is_right=margin >= 0.0
-            )
-            fraction_by_class = self._compute_class_fractions(counts, len(pixels))
-            payload: tasks.JsonValue = {
-                tasks.OUTCOME: outcome.value,
-                "accuracy": round(accuracy, 4),
-                "iou": round(iou, 4),
-                "pixels": fraction_by_class,
-            }
-            results.append((prediction, payload))
-        return results
+        return [
+            self._describe_image(logits, truth, mask, is_right=margin >= 0.0)
+            for logits, margin in zip(output, margins, strict=True)
+        ]
+
+    def _describe_image(
+        self, logits: Tensor, truth: SegmentationTruth, mask: Tensor, *, is_right: bool
+    ) -> tasks.PredictionWithPayload:
+        """Return the prediction about the object in an image, and a payload.
+
+        The prediction is the class of most of its pixels (`_describe_object`). The
+        payload has the outcome, the fraction of the object's pixels that are right, the
+        fraction of them with each class, and the intersection over union.
+
+        Args:
+            logits: (classes, h, w).
+            truth: truth of the scene.
+            mask: (h, w) bool, the object's pixels.
+            is_right: whether enough of the object's pixels are right.
+        """
+        # (P, classes) of the object's pixels, from a batch with this image only
+        pixels = self._select_object_logits(logits[None], truth)
+        if pixels is None:
+            return tasks.Prediction(tasks.OUT_OF_VIEW), None
+        # (h, w) which pixels of the full image have a right class
+        is_right_class = self._find_right_pixels(logits, truth)
+        accuracy = float(is_right_class[mask].float().mean())
+        iou = float((is_right_class & mask).sum() / (is_right_class | mask).sum())
+        counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
+        prediction, outcome = self._describe_object(
+            counts, truth, accuracy, is_right=is_right
+        )
+        return prediction, {
+            tasks.OUTCOME: outcome.value,
+            "accuracy": round(accuracy, 4),
+            "iou": round(iou, 4),
+            "pixels": self._compute_class_fractions(counts, len(pixels)),
+        }
 
     def _compute_class_fractions(
         self, counts: Tensor, n_pixels: int
@@ -324,18 +328,24 @@ class Segmentation(tasks.ClassTask):
                 the probability of the prediction.
             is_right: whether enough of them are right.
         """
-        is_right_class = torch.zeros_like(counts, dtype=torch.bool)
-        is_right_class[list(truth.labels)] = True
         # right classes if the object is right, otherwise wrong classes
-        is_candidate = is_right_class if is_right else ~is_right_class
-        # Other classes come last with a count of -1, even after classes without pixels.
-        top_class = int(counts.masked_fill(~is_candidate, -1).argmax())
+        top_class = _find_top_class(counts, truth.labels, is_right=is_right)
         if is_right or top_class not in self.background_classes:
-            prediction = tasks.Prediction(
-                self.get_class_name(top_class), top_class, accuracy
-            )
+            class_name = self.get_class_name(top_class)
+            prediction = tasks.Prediction(class_name, top_class, accuracy)
             outcome = tasks.Outcome.FOUND if is_right else tasks.Outcome.WRONG_CLASS
             return prediction, outcome
+        return self._describe_as_background(truth, accuracy)
+
+    def _describe_as_background(
+        self, truth: SegmentationTruth, accuracy: float
+    ) -> tuple[tasks.Prediction, tasks.Outcome]:
+        """Return the prediction and outcome for an object that is taken for background.
+
+        Args:
+            truth: truth of the image.
+            accuracy: fraction of the object's pixels that are right.
+        """
         name = self.get_class_name(truth.labels[0])
         if accuracy >= MIN_PARTIAL_ACCURACY:
             prediction = tasks.Prediction(f"{name} in part", None, accuracy)
@@ -369,6 +379,41 @@ class Segmentation(tasks.ClassTask):
             ]
             for logits in output.detach()
         ]
+
+
+def _find_pixel_logits(returned: Any) -> Any:
+    """Find the logits in what a network returned; anything else if there are none."""
+    if isinstance(returned, Mapping):
+        return returned.get("out", returned.get("logits"))
+    if hasattr(returned, "logits"):
+        return returned.logits
+    if isinstance(returned, (list, tuple)) and returned:
+        return returned[0]
+    return returned
+
+
+def _compute_target_shortfall(logits: Tensor, labels: tasks.Labels) -> Tensor:
+    """Compute the largest other logit minus the largest one of the target, (P,).
+
+    Like the margin of wrong classes, it is at most 0 at pixels that get the requested
+    class.
+    """
+    return -tasks.compute_target_margin(logits, labels)
+
+
+def _find_top_class(counts: Tensor, labels: tasks.Labels, *, is_right: bool) -> int:
+    """Return the most frequent class of pixels, among the right ones or the wrong ones.
+
+    Args:
+        counts: number of pixels with each class, (classes,).
+        labels: indices of the right classes.
+        is_right: whether to look among the right classes.
+    """
+    is_right_class = torch.zeros_like(counts, dtype=torch.bool)
+    is_right_class[list(labels)] = True
+    is_candidate = is_right_class if is_right else ~is_right_class
+    # Other classes come last with a count of -1, even after classes without pixels.
+    return int(counts.masked_fill(~is_candidate, -1).argmax())
 
 
 def _make_hidden_value(output: Tensor) -> Tensor:

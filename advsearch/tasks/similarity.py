@@ -57,6 +57,23 @@ class Gallery:
         """
         return features @ self.features.to(features).T
 
+    def average_nearest(self, features: Tensor, k: int) -> Tensor:
+        """Compute the mean cosine to the k nearest images of each name, (N, names).
+
+        Args:
+            features: (N, D), of length 1.
+            k: number of images, if a name has as many.
+        """
+        cosines = self.compute_cosines(features)  # (N, R)
+        name_of_image = self.name_index.to(features.device)
+        name_scores = []
+        for name_index in range(len(self.names)):
+            name_cosines = cosines[:, name_of_image == name_index]
+            n_nearest = min(k, name_cosines.shape[1])
+            nearest = name_cosines.topk(n_nearest, dim=1).values
+            name_scores.append(nearest.mean(dim=1))
+        return torch.stack(name_scores, dim=1)
+
 
 def list_name_folders(folder: str) -> list[tuple[str, Path]]:
     """List the names in a folder with their folders, in alphabetical order.
@@ -132,12 +149,17 @@ def _list_references(
             )
         paths += image_paths
         name_indices += [index] * len(image_paths)
+    _check_reference_count(paths, root)
+    return paths, name_indices
+
+
+def _check_reference_count(paths: Sequence[Path], root: Path) -> None:
+    """Raise FileFormatError if there are too many reference images in a folder."""
     limit = stored_files.scale_limit(MAX_REFERENCES)
     if len(paths) > limit:
         raise stored_files.make_size_error(
             root, f"at most {limit:,} reference pictures", f"{len(paths):,}"
         )
-    return paths, name_indices
 
 
 def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
@@ -149,13 +171,7 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
     """
     # A generator: images are loaded one by one, when a batch below needs them. They have
     # the aspect ratio of the model's input, but their sizes may differ.
-    images = (
-        _crop_center(
-            torch.from_numpy(models.load_upright(path, MAX_IMAGE_SIZE)),
-            model.input_size,
-        )
-        for path in paths
-    )
+    images = (_load_cropped(path, model.input_size) for path in paths)
     batches: list[Tensor] = []
     with torch.no_grad():
         # All images of a batch have the same size. `groupby` keeps the order of the
@@ -163,13 +179,7 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
         for _, same_size in itertools.groupby(images, key=lambda image: image.shape):
             # the next images of this size, until there are none
             while batch := list(itertools.islice(same_size, BATCH_SIZE)):
-                batch_features = model(torch.stack(batch))
-                if batch_features.dim() != 2:
-                    raise InputError(
-                        f"model {model.name}: expected features (N, D), "
-                        f"got {tuple(batch_features.shape)}; use another task"
-                    )
-                batches.append(batch_features)
+                batches.append(_embed_batch(torch.stack(batch), model))
     features = torch.cat(batches)
     is_non_finite = ~features.isfinite().all(dim=1)
     if bool(is_non_finite.any()):
@@ -178,6 +188,23 @@ def _embed_images(paths: Sequence[Path], model: Model) -> Tensor:
             f"references: model {model.name} returns NaN or infinity for {paths[first]}"
         )
     return functional.normalize(features, dim=1)
+
+
+def _load_cropped(path: Path, size: tuple[int, int]) -> Tensor:
+    """Load an image (H, W, 3), cropped around its center to the aspect ratio of a size."""
+    image = torch.from_numpy(models.load_upright(path, MAX_IMAGE_SIZE))
+    return _crop_center(image, size)
+
+
+def _embed_batch(images: Tensor, model: Model) -> Tensor:
+    """Return the features (N, D) of images (N, H, W, 3); InputError for another shape."""
+    features: Tensor = model(images)
+    if features.dim() != 2:
+        raise InputError(
+            f"model {model.name}: expected features (N, D), "
+            f"got {tuple(features.shape)}; use another task"
+        )
+    return features
 
 
 def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tensor]:
@@ -202,33 +229,60 @@ def fit_linear_head(features: Tensor, name_index: Tensor) -> tuple[Tensor, Tenso
     # w x + (b - w center): so the bias is shifted at the end.
     center = features.double().mean(dim=0)
     centered = features.double() - center
+    weights, biases = _minimize_cross_entropy(centered, name_index, image_weights)
+    shifted_biases = biases - weights @ center
+    return weights.float(), shifted_biases.float()
+
+
+def _minimize_cross_entropy(
+    features: Tensor, name_index: Tensor, image_weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return weights (names, D) and biases (names,) of the least penalized loss, float64.
+
+    Args:
+        features: (R, D) float64.
+        name_index: (R,) int64, the index of each row's name.
+        image_weights: (R,) float64, weight of each row's cross-entropy.
+    """
+    n_names = int(name_index.max()) + 1
     weights = torch.zeros(
         n_names, features.shape[1], dtype=torch.float64, requires_grad=True
     )
     biases = torch.zeros(n_names, dtype=torch.float64, requires_grad=True)
-    optimizer = torch.optim.LBFGS(
-        [weights, biases],
+    optimizer = _make_lbfgs_optimizer([weights, biases])
+
+    def closure() -> Tensor:
+        """Return the loss, with its gradients by weights and biases."""
+        optimizer.zero_grad()
+        logits = functional.linear(features, weights, biases)
+        image_loss = functional.cross_entropy(logits, name_index, reduction="none")
+        loss = _add_penalty((image_weights * image_loss).sum(), weights)
+        torch.autograd.backward(loss, inputs=[weights, biases])
+        return loss
+
+    with torch.enable_grad():
+        optimizer.step(closure)
+    return weights.detach(), biases.detach()
+
+
+def _make_lbfgs_optimizer(parameters: list[Tensor]) -> torch.optim.LBFGS:
+    """Return the optimizer of a smooth loss; one step of it minimizes the loss."""
+    return torch.optim.LBFGS(
+        parameters,
         max_iter=MAX_ITERATIONS,
         tolerance_grad=1e-8,
         tolerance_change=1e-12,
         line_search_fn="strong_wolfe",
     )
 
-    def closure() -> Tensor:
-        """Return the loss, with its gradients by weights and biases."""
-        optimizer.zero_grad()
-        logits = functional.linear(centered, weights, biases)
-        image_loss = functional.cross_entropy(logits, name_index, reduction="none")
-        penalty = WEIGHT_PENALTY / 2.0 * weights.square().sum()
-        loss: Tensor = (image_weights * image_loss).sum() + penalty
-        torch.autograd.backward(loss, inputs=[weights, biases])
-        return loss
 
-    with torch.enable_grad():
-        optimizer.step(closure)
-    fitted_weights = weights.detach()
-    fitted_biases = biases.detach() - fitted_weights @ center
-    return fitted_weights.float(), fitted_biases.float()
+def _add_penalty(loss: Tensor, weights: Tensor) -> Tensor:
+    """Return a loss plus the penalty of weights (names, D): half the sum of their
+    squares, times `WEIGHT_PENALTY`.
+    """
+    penalty = WEIGHT_PENALTY / 2.0 * weights.square().sum()
+    penalized_loss: Tensor = loss + penalty
+    return penalized_loss
 
 
 def _list_visible(folder: Path) -> list[Path]:
@@ -329,6 +383,23 @@ class Similarity(tasks.Classification):
                 f"task similarity: method: expected one of {', '.join(METHODS)}, got "
                 f"{self.method!r}"
             )
+        self._check_k()
+        if self.threshold is not None:
+            self._check_cosine_threshold()
+
+    def _check_cosine_threshold(self) -> None:
+        """Raise InputError if the threshold is no cosine, or there are references."""
+        self.check_numbers(
+            lambda bar: -1.0 < bar < 1.0, "a cosine between -1 and 1", "threshold"
+        )
+        if self.references:
+            raise InputError(
+                "task similarity: threshold: compares with the clean "
+                "picture; leave `references` out"
+            )
+
+    def _check_k(self) -> None:
+        """Raise InputError if `k` is no number from 1 on, or does not fit the method."""
         if isinstance(self.k, bool) or not isinstance(self.k, int) or self.k < 1:
             raise InputError(
                 "task similarity: k: expected a whole number of at least "
@@ -339,15 +410,6 @@ class Similarity(tasks.Classification):
                 "task similarity: k: is an option of `method: nearest`; leave "
                 "one of the two out"
             )
-        if self.threshold is not None:
-            self.check_numbers(
-                lambda bar: -1.0 < bar < 1.0, "a cosine between -1 and 1", "threshold"
-            )
-            if self.references:
-                raise InputError(
-                    "task similarity: threshold: compares with the clean "
-                    "picture; leave `references` out"
-                )
 
     def on(
         self, model: Model, *, target: str | None = None, minimise: bool = False
@@ -367,6 +429,19 @@ class Similarity(tasks.Classification):
                 references, or the folder of references does not fit.
             FileFormatError: a reference is no image or is too large.
         """
+        self._check_comparison(target)
+        task = super().on(model, target=target, minimise=minimise)
+        embedder = (model.module, model.preprocessing)
+        is_embedded = self.gallery is not None and self.gallery.embedder == embedder
+        if is_embedded or not self.references:
+            return task
+        gallery = embed_gallery(self.references, model, linear=self.method == "linear")
+        return replace(task, gallery=gallery)
+
+    def _check_comparison(self, target: str | None) -> None:
+        """Raise InputError if there is nothing to compare with, or a target has no
+        references.
+        """
         if not self.references and self.threshold is None:
             raise InputError(
                 "task similarity: references: expected a folder with a folder of "
@@ -379,13 +454,6 @@ class Similarity(tasks.Classification):
                 "target: with a `threshold` there are no names; set `references` "
                 "of task similarity"
             )
-        task = super().on(model, target=target, minimise=minimise)
-        embedder = (model.module, model.preprocessing)
-        is_embedded = self.gallery is not None and self.gallery.embedder == embedder
-        if is_embedded or not self.references:
-            return task
-        gallery = embed_gallery(self.references, model, linear=self.method == "linear")
-        return replace(task, gallery=gallery)
 
     def _get_model_labels(self, model: Model) -> tuple[tuple[str, ...], bool]:
         if not self.references:
@@ -469,14 +537,8 @@ class Similarity(tasks.Classification):
             return functional.linear(
                 features, weights.to(features), biases.to(features)
             )
-        cosines = self.gallery.compute_cosines(features)  # (N, R)
-        name_of_image = self.gallery.name_index.to(features.device)
-        name_scores = []
-        for name_index in range(len(self.gallery.names)):
-            name_cosines = cosines[:, name_of_image == name_index]
-            k = min(self.k, name_cosines.shape[1])
-            name_scores.append(name_cosines.topk(k, dim=1).values.mean(dim=1))
-        return torch.stack(name_scores, dim=1) / TEMPERATURE
+        scores = self.gallery.average_nearest(features, self.k)
+        return scores / TEMPERATURE
 
     def _compute_threshold_logits(self, features: Tensor) -> Tensor:
         """Compute the logits (N, 2) of `ITSELF` and `SOMETHING_ELSE`.
@@ -510,15 +572,7 @@ class Similarity(tasks.Classification):
         """
         with torch.no_grad():
             judgements = super().judge(output, truth)
-            features = functional.normalize(output, dim=1)
-            payloads: list[dict[str, tasks.JsonValue]]
-            if self.gallery is not None:
-                logits = self.as_logits(output, truth)
-                payloads = _rank_references(self.gallery, features, logits, truth)
-            else:
-                assert self.clean_features is not None
-                cosines = (features @ self.clean_features.to(features)).tolist()
-                payloads = [{"cosine": round(cosine, 4)} for cosine in cosines]
+            payloads = self._make_payloads(output, truth)
         return [
             replace(
                 judgement,
@@ -527,6 +581,23 @@ class Similarity(tasks.Classification):
             )
             for judgement, payload in zip(judgements, payloads, strict=True)
         ]
+
+    def _make_payloads(
+        self, output: Tensor, truth: tasks.Labels
+    ) -> list[dict[str, tasks.JsonValue]]:
+        """Return the payload of each image: ranks, or the cosine to the clean image.
+
+        Args:
+            output: features (N, D).
+            truth: indices of the right names.
+        """
+        features = functional.normalize(output, dim=1)
+        if self.gallery is not None:
+            logits = self.as_logits(output, truth)
+            return _rank_references(self.gallery, features, logits, truth)
+        assert self.clean_features is not None
+        cosines = (features @ self.clean_features.to(features)).tolist()
+        return [{"cosine": round(cosine, 4)} for cosine in cosines]
 
 
 def _rank_references(
@@ -552,12 +623,7 @@ def _rank_references(
     right_cosine = cosines[:, is_right_image].amax(dim=1)
     is_nearer = cosines[:, ~is_right_image] > right_cosine[:, None]
     image_rank = 1 + is_nearer.sum(dim=1)
-
-    is_right_name = torch.isin(torch.arange(logits.shape[1]), right_names)
-    is_right_name = is_right_name.to(logits.device)
-    right_logit = logits[:, is_right_name].amax(dim=1, keepdim=True)
-    name_rank = 1 + (logits[:, ~is_right_name] > right_logit).sum(dim=1)
-
+    name_rank = _rank_right_name(logits, right_names)
     nearest_cosine, nearest_image = cosines.max(dim=1)
     return [
         {
@@ -570,3 +636,11 @@ def _rank_references(
         }
         for row in range(len(features))
     ]
+
+
+def _rank_right_name(logits: Tensor, right_names: Tensor) -> Tensor:
+    """Return the rank (N,) of the best right name among all names, by logits (N, names)."""
+    is_right_name = torch.isin(torch.arange(logits.shape[1]), right_names)
+    is_right_name = is_right_name.to(logits.device)
+    right_logit = logits[:, is_right_name].amax(dim=1, keepdim=True)
+    return 1 + (logits[:, ~is_right_name] > right_logit).sum(dim=1)

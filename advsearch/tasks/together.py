@@ -203,24 +203,28 @@ class EnsembleTask(JointTask):
         """
         network = model.module
         models = network.models if isinstance(network, Ensemble) else ()
-        if len(models) != len(self.parts):
-            n_models = len(models) or 1  # a model that is no ensemble is a single one
-            raise InputError(
-                f"model: expected {len(self.parts)}, one for each task, got {n_models}"
-            )
+        self._check_model_count(len(models))
         # `parts` are the tasks as the user set them, `tasks` those for their models.
-        tasks = tuple(
-            part.on(
-                network,
-                target=target if self._takes_label(part) else None,
-                minimise=minimise,
-            )
-            for part, network in zip(self.parts, models, strict=True)
-        )
+        tasks = []
+        for part, part_model in zip(self.parts, models, strict=True):
+            part_target = target if self._takes_label(part) else None
+            tasks.append(part.on(part_model, target=part_target, minimise=minimise))
         targets = None if target is None else tuple(task.target for task in tasks)
         return replace(
-            self, models=models, tasks=tasks, target=targets, minimise=minimise
+            self, models=models, tasks=tuple(tasks), target=targets, minimise=minimise
         )
+
+    def _check_model_count(self, n_models: int) -> None:
+        """Raise InputError if an ensemble has not one model for each task.
+
+        Args:
+            n_models: number of its models; 0 for a model that is no ensemble.
+        """
+        if n_models != len(self.parts):
+            raise InputError(
+                f"model: expected {len(self.parts)}, one for each task, got "
+                f"{n_models or 1}"
+            )
 
     def with_objective(self, objective: str) -> EnsembleTask:
         return replace(
@@ -328,10 +332,9 @@ class EnsembleTask(JointTask):
             margin = math.nan
         payload = None
         if any(judgement.payload is not None for judgement in judgements):
-            payload = {
-                model.name: judgement.payload
-                for model, judgement in zip(self.models, judgements, strict=True)
-            }
+            names = [model.name for model in self.models]
+            payloads = [judgement.payload for judgement in judgements]
+            payload = dict(zip(names, payloads, strict=True))
             payload |= make_outcome_payload(worst)
         prediction = join_predictions(judgement.prediction for judgement in judgements)
         score = min(judgement.score for judgement in judgements)
@@ -348,22 +351,33 @@ class EnsembleTask(JointTask):
         for index, (task, model_output, task_truth) in enumerate(
             self._by_task(output, truth)
         ):
-            model = self.models[index]
             model_marks = task.marks(model_output, task_truth)
             for image_marks, marks in zip(marks_of_images, model_marks, strict=True):
-                # Boxes and masks of the truth are taken from the first model only.
-                is_first_model = index == 0
-                image_marks += [
-                    mark
-                    for mark in marks
-                    if mark.true and (is_first_model or mark.map is not None)
-                ]
-                image_marks += [
-                    replace(mark, text=f"{model.name}: {mark.text}")
-                    for mark in marks
-                    if not mark.true
-                ]
+                image_marks += self._select_marks(marks, index)
         return marks_of_images
+
+    def _select_marks(self, marks: Sequence[Mark], index: int) -> list[Mark]:
+        """Return those marks of a model on an image that are drawn, the truth first.
+
+        Boxes and masks of the truth are those of the first model only.
+
+        Args:
+            marks: marks of the task of the model.
+            index: index of the model.
+        """
+        is_first_model = index == 0
+        true_marks = [
+            mark
+            for mark in marks
+            if mark.true and (is_first_model or mark.map is not None)
+        ]
+        model_name = self.models[index].name
+        predicted_marks = [
+            replace(mark, text=f"{model_name}: {mark.text}")
+            for mark in marks
+            if not mark.true
+        ]
+        return true_marks + predicted_marks
 
     def _by_task(
         self, output: Sequence[Outputs], truth: Truths
@@ -461,18 +475,7 @@ class EachThingTask(JointTask):
                 zip(truth, image_judgements, strict=True)
             )
             worst = _find_worst_thing(by_name)
-            worst_payload = by_name[worst].payload
-            payload: dict[str, JsonValue] = {
-                **(worst_payload if isinstance(worst_payload, dict) else {}),
-                "worst": worst,
-                "mean_margin": mean(
-                    [judgement.margin for judgement in image_judgements]
-                ),
-                "things": {
-                    name: _summarize_thing(judgement)
-                    for name, judgement in by_name.items()
-                },
-            }
+            payload = _make_thing_payload(by_name, worst)
             results.append((by_name[worst].prediction, payload))
         return results
 
@@ -504,6 +507,27 @@ def _find_worst_thing(judgements: Mapping[str, Judgement]) -> str:
         if not judgement.prediction.is_out_of_view
     ]
     return min(visible or judgements, key=lambda name: judgements[name].margin)
+
+
+def _make_thing_payload(
+    judgements: Mapping[str, Judgement], worst: str
+) -> dict[str, JsonValue]:
+    """Return the payload of an image, from the judgement of each thing by name.
+
+    Args:
+        judgements: judgement of each thing.
+        worst: name of the worst visible thing, whose payload is included.
+    """
+    worst_payload = judgements[worst].payload
+    margins = [judgement.margin for judgement in judgements.values()]
+    return {
+        **(worst_payload if isinstance(worst_payload, dict) else {}),
+        "worst": worst,
+        "mean_margin": mean(margins),
+        "things": {
+            name: _summarize_thing(judgement) for name, judgement in judgements.items()
+        },
+    }
 
 
 def _summarize_thing(judgement: Judgement) -> dict[str, JsonValue]:

@@ -85,9 +85,8 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
         specs = options["policies"]
         if not isinstance(specs, (list, tuple)):  # a single policy
             specs = [specs]
-        options["policies"] = tuple(
-            _make_nested_policy(spec, f"policies of {name}") for spec in specs
-        )
+        where = f"policies of {name}"
+        options["policies"] = tuple(_make_nested_policy(spec, where) for spec in specs)
     return policy(**options)
 
 
@@ -110,10 +109,8 @@ def _make_nested_policy(spec: Spec, where: str) -> Policy[Any]:
             f"{where}: expected a name or a mapping with a name and "
             f"options, got {spec!r}"
         )
-    return make_policy(
-        str(spec["name"]),
-        **{option: spec[option] for option in spec if option != "name"},
-    )
+    options = {option: spec[option] for option in spec if option != "name"}
+    return make_policy(str(spec["name"]), **options)
 
 
 __all__ = [

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Container, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, ClassVar
@@ -125,13 +125,8 @@ class ArchiveState:
             first + SIGMA * self.half_widths * noise + line_fraction * (second - first)
         )
         is_resampled = torch.rand(count, dim, generator=rng) < RESAMPLED_FRACTION
-        for block, part in self.domain.list_block_slices():
-            is_choice = block.n_options > 0
-            if is_choice:
-                offspring[:, part] = torch.where(
-                    is_resampled[:, part], samples[:, part], first[:, part]
-                )
-        return offspring
+        choices = torch.where(is_resampled, samples, first)
+        return torch.where(self.domain.option_counts > 0, choices, offspring)
 
     def _sample_parents(self, count: int) -> tuple[Tensor, Tensor]:
         """Return two parents (count, d) of each offspring.
@@ -171,12 +166,7 @@ class ArchiveState:
         to_beat = torch.tensor(
             [failed_objective_of_cell.get(cell, threshold) for cell in cells]
         )
-        weight = torch.tensor(
-            [
-                IMPROVEMENT_WEIGHT if cell in failed_objective_of_cell else 1.0
-                for cell in cells
-            ]
-        )
+        weight = _weight_cells(cells, failed_objective_of_cell)
         # (mean - to_beat) / deviation is normal under the surrogate
         promise = weight * torch.special.ndtr((mean - to_beat) / deviation)
         order = promise.argsort(descending=True, stable=True).tolist()
@@ -201,6 +191,18 @@ class ArchiveState:
         if bool(is_wrong.any()):
             return objective_of_cell, float(wrong_objectives.min())
         return objective_of_cell, float(objectives.max())
+
+
+def _weight_cells(cells: Sequence[int], failed_cells: Container[int]) -> Tensor:
+    """Return the weight of each candidate by its cell, (n,) float32.
+
+    Args:
+        cells: index of the cell of each candidate.
+        failed_cells: indices of the cells that have a failure already.
+    """
+    return torch.tensor(
+        [IMPROVEMENT_WEIGHT if cell in failed_cells else 1.0 for cell in cells]
+    )
 
 
 def _order_by_cell(order: list[int], cells: list[int]) -> list[int]:
@@ -392,23 +394,9 @@ class MapElites(Policy[ArchiveState]):
         domain.check_dim(MAX_DIM, "archive", "use pgd or auto")
         seed = policies.draw_seed(generator)
         measure_indices = self._find_measure_indices(domain)
-        # A choice has a cell for each option. A number has 0 options, and `cells`
-        # cells.
-        cells_of_axes = [
-            n_options or self.cells
-            for n_options in domain.option_counts[measure_indices].tolist()
-        ]
-        n_cells = math.prod(cells_of_axes)
-        if n_cells > MAX_CELLS:
-            raise InputError(
-                f"cells: expected at most {MAX_CELLS} in all, got "
-                f"{n_cells}; set `cells` lower"
-            )
+        cells_of_axes = self._count_cells_of_axes(domain, measure_indices)
         archive = _make_archive(domain, measure_indices, cells_of_axes, seed)
-        first_points = [
-            domain.initial_point[None],
-            domain.sample(policies.seeded(seed, 0), self.population - 1),
-        ]
+        random_points = domain.sample(policies.seeded(seed, 0), self.population - 1)
         return ArchiveState(
             domain,
             seed,
@@ -416,9 +404,33 @@ class MapElites(Policy[ArchiveState]):
             policies.compute_half_widths(domain),
             archive,
             generation=0,
-            points=torch.cat(first_points),
+            points=torch.cat([domain.initial_point[None], random_points]),
             observations=_make_observations(domain),
         )
+
+    def _count_cells_of_axes(
+        self, domain: policies.Domain, measure_indices: Tensor
+    ) -> list[int]:
+        """Return the number of cells along each axis of the archive.
+
+        Args:
+            domain: domain of the search.
+            measure_indices: (k,) indices in u of the parameters that span the archive.
+
+        Raises:
+            InputError: the archive has too many cells.
+        """
+        # A choice has a cell for each option. A number has 0 options, and `cells`
+        # cells.
+        option_counts = domain.option_counts[measure_indices].tolist()
+        cells_of_axes = [n_options or self.cells for n_options in option_counts]
+        n_cells = math.prod(cells_of_axes)
+        if n_cells > MAX_CELLS:
+            raise InputError(
+                f"cells: expected at most {MAX_CELLS} in all, got "
+                f"{n_cells}; set `cells` lower"
+            )
+        return cells_of_axes
 
     def propose(
         self, state: ArchiveState, n: int
@@ -431,20 +443,27 @@ class MapElites(Policy[ArchiveState]):
         self, state: ArchiveState, evaluated: policies.Evaluated
     ) -> ArchiveState:
         """Add evaluations to the generation; start the next once it is complete."""
+        state = self._add_evaluations(state, evaluated)
+        if len(state.values) < len(state.points):
+            return state
+        return self._start_generation(state.add_generation())
+
+    @staticmethod
+    def _add_evaluations(
+        state: ArchiveState, evaluated: policies.Evaluated
+    ) -> ArchiveState:
+        """Return the state with the evaluations of the generation's next points."""
         new_values = [evaluation.objective for _, evaluation in evaluated]
         new_successes = [evaluation.success for _, evaluation in evaluated]
         observations = state.observations
         if observations is not None:
             observations = observations.extend(evaluated)
-        state = replace(
+        return replace(
             state,
             values=(*state.values, *new_values),
             successes=(*state.successes, *new_successes),
             observations=observations,
         )
-        if len(state.values) < len(state.points):
-            return state
-        return self._start_generation(state.add_generation())
 
     def failures(self, state: ArchiveState) -> policies.Failures:
         """Return how many cells contain a failure, and diverse examples of these.
@@ -452,36 +471,22 @@ class MapElites(Policy[ArchiveState]):
         The evaluations of the current generation are counted as well, even if it is not
         complete yet.
         """
-        archive = state.add_generation().archive  # with the current generation
-        measure_indices = tuple(state.measure_indices.tolist())
+        state = state.add_generation()  # with the current generation
         # one row for each cell that stores a configuration
-        elites = archive.data()
+        elites = state.archive.data()
         failed_rows = np.flatnonzero(elites["wrong"])
-        # Each array below has one entry for each cell with a failure.
-        configurations = elites["solution"][failed_rows]
-        objectives = elites["objective"][failed_rows].tolist()
-        grid_indices = archive.int_to_grid_index(elites["index"][failed_rows])
-        # position of each cell in the grid, as a fraction of each axis
-        positions = torch.from_numpy(grid_indices / archive.dims)
-        diverse = policies.select_diverse(
-            positions,
-            objectives,
-            is_periodic=policies.find_periodic(state.domain)[state.measure_indices],
-            is_discrete=state.domain.option_counts[state.measure_indices] > 0,
+        examples = _choose_examples(
+            state,
+            elites["solution"][failed_rows],
+            elites["objective"][failed_rows].tolist(),
+            state.archive.int_to_grid_index(elites["index"][failed_rows]),
         )
-        examples = []
-        for index in diverse:
-            ranges = _find_cell_ranges(
-                measure_indices, archive.boundaries, grid_indices[index]
-            )
-            u = torch.from_numpy(configurations[index].copy())
-            examples.append(policies.FoundFailure(u, objectives[index], ranges))
         return policies.Failures(
             tuple(examples),
-            cell_parameter_indices=measure_indices,
+            cell_parameter_indices=tuple(state.measure_indices.tolist()),
             n_failures=len(failed_rows),
             n_visited=len(elites["objective"]),
-            n_cells=int(archive.cells),
+            n_cells=int(state.archive.cells),
         )
 
     def _start_generation(self, state: ArchiveState) -> ArchiveState:
@@ -502,19 +507,29 @@ class MapElites(Policy[ArchiveState]):
         n_random = int(is_random.sum())
         samples = domain.sample(rng, self.population)
         random_points = samples[:n_random]
-        observations = state.observations
-        if observations is None:
+        if state.observations is None:
             # Offspring may get new options for their choices from the other samples.
-            offspring = [
-                domain.project(u) for u in state.make_offspring(samples[n_random:], rng)
-            ]
-            return replace(state, points=torch.stack([*random_points, *offspring]))
+            offspring = state.make_offspring(samples[n_random:], rng)
+            points = torch.stack([*random_points, *map(domain.project, offspring)])
+            return replace(state, points=points)
+        return self._choose_by_surrogate(state, random_points, rng)
+
+    def _choose_by_surrogate(
+        self, state: ArchiveState, random_points: Tensor, rng: torch.Generator
+    ) -> ArchiveState:
+        """Return the state with a generation that a surrogate has completed.
+
+        Args:
+            state: state of the search, with observations.
+            random_points: (k, d) the first configurations of the generation.
+            rng: generator of random numbers; it advances.
+        """
+        assert state.observations is not None
+        count = self.population - len(random_points)
         with policies.limit_to_single_thread():
-            surrogate, observations = observations.fit_surrogate()
+            surrogate, observations = state.observations.fit_surrogate()
             candidates = _make_candidates(state, observations, rng)
-            promising_points = state.select_most_promising(
-                surrogate, candidates, self.population - n_random
-            )
+            promising_points = state.select_most_promising(surrogate, candidates, count)
         points = torch.cat([random_points, promising_points])
         return replace(state, points=points, observations=observations)
 
@@ -532,14 +547,68 @@ class MapElites(Policy[ArchiveState]):
         if not names:
             return torch.arange(min(2, domain.dim))
         index_of_name = {name: index for index, name in enumerate(domain.element_names)}
-        for name in names:
-            if name not in index_of_name:
-                raise errors.UnknownNameError(
-                    "parameter in `over` of policy 'archive':", name, index_of_name
-                )
-        if len(set(names)) != len(names) or len(names) > MAX_MEASURES:
-            raise InputError(
-                f"over: expected 1 to {MAX_MEASURES} different "
-                f"parameters, got {', '.join(names)}"
-            )
+        _check_measures(names, index_of_name)
         return torch.tensor([index_of_name[name] for name in names])
+
+
+def _choose_examples(
+    state: ArchiveState,
+    configurations: Any,
+    objectives: Sequence[float],
+    grid_indices: Any,
+) -> list[policies.FoundFailure]:
+    """Return diverse failures of the archive, each with the ranges of its cell.
+
+    Args:
+        state: state of the search.
+        configurations: (n, d) array of the failure in each cell that has one.
+        objectives: their objectives.
+        grid_indices: (n, k) array, index of these cells on each axis of the archive.
+    """
+    # position of each cell in the grid, as a fraction of each axis
+    positions = torch.from_numpy(grid_indices / state.archive.dims)
+    measures = state.measure_indices.tolist()
+    boundaries = state.archive.boundaries
+    examples = []
+    for index in _select_diverse_cells(state, positions, objectives):
+        ranges = _find_cell_ranges(measures, boundaries, grid_indices[index])
+        u = torch.from_numpy(configurations[index].copy())
+        examples.append(policies.FoundFailure(u, objectives[index], ranges))
+    return examples
+
+
+def _select_diverse_cells(
+    state: ArchiveState, positions: Tensor, objectives: Sequence[float]
+) -> list[int]:
+    """Return the indices of cells that are far from each other, the worst first.
+
+    Args:
+        state: state of the search.
+        positions: (n, k) positions of the cells in the grid, as fractions of its axes.
+        objectives: objectives of the configurations in the cells.
+    """
+    return policies.select_diverse(
+        positions,
+        objectives,
+        is_periodic=policies.find_periodic(state.domain)[state.measure_indices],
+        is_discrete=state.domain.option_counts[state.measure_indices] > 0,
+    )
+
+
+def _check_measures(names: Sequence[str], known_names: Collection[str]) -> None:
+    """Raise an error if parameters can't span an archive.
+
+    Raises:
+        UnknownNameError: the domain has no parameter of that name.
+        InputError: a name occurs twice, or there are too many.
+    """
+    for name in names:
+        if name not in known_names:
+            raise errors.UnknownNameError(
+                "parameter in `over` of policy 'archive':", name, known_names
+            )
+    if len(set(names)) != len(names) or len(names) > MAX_MEASURES:
+        raise InputError(
+            f"over: expected 1 to {MAX_MEASURES} different "
+            f"parameters, got {', '.join(names)}"
+        )

@@ -124,27 +124,42 @@ def make_plan(domain: Domain, box: BoxCoordinates, steps: int) -> BudgetPlan:
         return BudgetPlan(steps, screen=0, ascent_start=0, gradient=True)
     has_norm_balls = box.count < domain.dim
     if has_norm_balls:
-        # A "free" gradient leaves out the elements whose derivatives cost renders.
-        can_avoid_cost = domain.gradient_cost > 0 and domain.partial_gradients
-        return BudgetPlan(
-            steps,
-            screen=math.ceil(SCREEN_FRACTION_MIXED * steps),
-            ascent_start=math.ceil(ASCENT_START_MIXED * steps),
-            gradient="free" if can_avoid_cost else True,
-        )
+        return _plan_mixed(domain, steps)
     plan = _plan_box_ascent(box, steps)
-    n_numbers = _count_numbers(box)  # number of derivatives of a gradient
-    cost = domain.gradient_cost
-    is_worth_renders = MIN_DERIVATIVES_PER_RENDER * cost <= n_numbers
-    # the configuration is rendered as well, which is the 1
-    renders_needed = MIN_GRADIENTS * (1 + cost)
-    fits = renders_needed <= steps - plan.ascent_start
-    if n_numbers and is_worth_renders and fits:
+    if _is_ascent_worthwhile(domain, box, steps - plan.ascent_start):
         return plan
     # `ascent_start=steps` means that the ascent never begins. Nothing has to be saved
     # for it, so the screen may be longer.
     screen = math.ceil(SCREEN_FRACTION * steps)
     return replace(plan, screen=screen, ascent_start=steps)
+
+
+def _plan_mixed(domain: Domain, steps: int) -> BudgetPlan:
+    """Divide renders in a domain of box coordinates and norm balls."""
+    # A "free" gradient leaves out the elements whose derivatives cost renders.
+    can_avoid_cost = domain.gradient_cost > 0 and domain.partial_gradients
+    return BudgetPlan(
+        steps,
+        screen=math.ceil(SCREEN_FRACTION_MIXED * steps),
+        ascent_start=math.ceil(ASCENT_START_MIXED * steps),
+        gradient="free" if can_avoid_cost else True,
+    )
+
+
+def _is_ascent_worthwhile(domain: Domain, box: BoxCoordinates, renders: int) -> bool:
+    """Return whether a gradient ascent in box coordinates is worth its renders.
+
+    Args:
+        domain: domain of the search.
+        box: box coordinates of the domain.
+        renders: renders of the ascent.
+    """
+    n_numbers = _count_numbers(box)  # number of derivatives of a gradient
+    cost = domain.gradient_cost
+    is_worth_renders = MIN_DERIVATIVES_PER_RENDER * cost <= n_numbers
+    # the configuration is rendered as well, which is the 1
+    renders_needed = MIN_GRADIENTS * (1 + cost)
+    return bool(n_numbers) and is_worth_renders and renders_needed <= renders
 
 
 def _count_numbers(box: BoxCoordinates) -> int:
@@ -215,6 +230,11 @@ class AutoState:
     def box(self) -> BoxCoordinates:
         return self.observations.box
 
+    @property
+    def has_norm_balls(self) -> bool:
+        """Whether the domain has more than box coordinates."""
+        return self.box.count < self.domain.dim
+
     def to_configuration(self, x: Tensor) -> Tensor:
         """Return the configuration (d,) whose box coordinates are x and whose norm
         balls are at their start.
@@ -269,20 +289,16 @@ class Auto(Policy[AutoState]):
         no_points = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)
         observations = Observations(box, no_points)
+        state = AutoState(domain, observations, plan, seed=0, screen=no_points)
         if box.count == 0:
-            return AutoState(
-                domain,
-                observations,
-                plan,
-                seed=0,  # the ascent draws its own
-                screen=no_points,
-                ascent=_make_pgd(domain).start(domain, generator, steps),
-            )
+            # the ascent draws a seed of its own
+            ascent = _make_pgd(domain).start(domain, generator, steps)
+            return replace(state, ascent=ascent)
         seed = draw_seed(generator)
         with limit_to_single_thread():
             # one render less: that of the initial point, which comes first
             screen = box.sample_screen(seed, max(0, plan.screen - 1))
-        return AutoState(domain, observations, plan, seed, screen)
+        return replace(state, seed=seed, screen=screen)
 
     def propose(
         self, state: AutoState, n: int
@@ -307,9 +323,14 @@ class Auto(Policy[AutoState]):
             if steps:
                 (proposal,) = steps
                 return self._propose_ascent_step(state, proposal, ascent.n_evaluations)
-            has_norm_balls = state.box.count < state.domain.dim
-            if has_norm_balls:
+            if state.has_norm_balls:
                 return (), state
+        return self._propose_box_points(state, n)
+
+    def _propose_box_points(
+        self, state: AutoState, n: int
+    ) -> tuple[tuple[Proposal, ...], AutoState]:
+        """Propose at most n points of the screen; after it, one of the surrogate."""
         points = self._list_screen(state, n)
         is_screen_complete = not points
         if is_screen_complete:
@@ -357,13 +378,21 @@ class Auto(Policy[AutoState]):
         moves_box = not has_full_gradient and count % 2 == 1  # every second step
         if not moves_box:
             return (proposal,), state
-        box = state.box
-        x = box.from_configuration(proposal.u)
+        x = state.box.from_configuration(proposal.u)
+        u = self._move_box(state, proposal.u, x, count)
+        return (replace(proposal, u=u),), replace(state, box_before_trial=x)
+
+    @staticmethod
+    def _move_box(state: AutoState, u: Tensor, x: Tensor, count: int) -> Tensor:
+        """Return a configuration u (d,) with its box coordinates x (k,) moved at random.
+
+        `count`, the number of evaluations of the ascent so far, gives each move its own
+        random numbers.
+        """
         # The surrogate draws with numbers below `plan.steps`, so that this one is new.
         rng = seeded(state.seed, state.plan.steps + count)
-        moved_x = box.sample_moves(x[None], rng)[0]
-        u = state.domain.project(box.to_configuration(proposal.u, moved_x))
-        return (replace(proposal, u=u),), replace(state, box_before_trial=x)
+        moved_x = state.box.sample_moves(x[None], rng)[0]
+        return state.domain.project(state.box.to_configuration(u, moved_x))
 
     def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
         """Pass evaluations to the ascent, or add them to the observations."""
@@ -389,12 +418,10 @@ class Auto(Policy[AutoState]):
         ascent = _make_pgd(state.domain).update(ascent, evaluated)
         has_fallen = evaluation.objective < state.latest_objective
         if state.box_before_trial is not None and has_fallen:
-            u = state.domain.project(
-                state.box.to_configuration(ascent.u, state.box_before_trial)
-            )
-            ascent = replace(
-                ascent, u=u, counts=ascent.counts + CorrectionCounts(rejected=1)
-            )
+            restored_u = state.box.to_configuration(ascent.u, state.box_before_trial)
+            counts = ascent.counts + CorrectionCounts(rejected=1)
+            u = state.domain.project(restored_u)
+            ascent = replace(ascent, u=u, counts=counts)
         return replace(state, ascent=ascent, latest_objective=evaluation.objective)
 
     def takes_differences(self, domain: Domain, steps: int) -> bool:
@@ -436,25 +463,40 @@ class Auto(Policy[AutoState]):
         balls begin at their start. In box coordinates, steps are smaller than usual
         (`ASCENT_REACH`), because the screen has explored the rest of the box already.
         """
-        # (k,) box coordinates of the best point
-        x = state.box.from_configuration(state.domain.initial_point)
-        if state.observations.has_finite:
-            surrogate, observations = state.observations.fit_surrogate()
-            state = replace(state, observations=observations)
-            observed_points = surrogate.x  # those to which it was fitted
-            mean, _ = surrogate.predict(observed_points)
-            x = observed_points[int(mean.argmax())]
-        ascent_blocks = []
-        for block in state.domain.blocks:
-            # the reach of a box is its unit step; a norm ball has none
-            reach = ASCENT_REACH * block.radius if block.norm == "box" else None
-            ascent_blocks.append(replace(block, unit_step_length=reach))
-        domain = replace(state.domain, blocks=tuple(ascent_blocks))
+        x, state = self._find_best_point(state)
+        domain = _shorten_box_steps(state.domain)
         renders_left = max(1, state.plan.steps - state.renders_spent)
         ascent = _make_pgd(domain).start(domain, seeded(state.seed, 0), renders_left)
         # PGD starts at the initial point of the domain, so it is moved to the best
         # point. `to_configuration` puts norm balls at their start.
         return replace(state, ascent=replace(ascent, u=state.to_configuration(x)))
+
+    @staticmethod
+    def _find_best_point(state: AutoState) -> tuple[Tensor, AutoState]:
+        """Return the box coordinates (k,) of the best point that was observed.
+
+        That is the one with the largest mean of the surrogate, or the initial point if
+        no objective is finite. The state has the surrogate's observations.
+        """
+        if not state.observations.has_finite:
+            return state.box.from_configuration(state.domain.initial_point), state
+        surrogate, observations = state.observations.fit_surrogate()
+        observed_points = surrogate.x  # those to which it was fitted
+        mean, _ = surrogate.predict(observed_points)
+        best_point = observed_points[int(mean.argmax())]
+        return best_point, replace(state, observations=observations)
+
+
+def _shorten_box_steps(domain: Domain) -> Domain:
+    """Return the domain with unit steps of boxes that are shorter than usual
+    (`ASCENT_REACH`).
+    """
+    blocks = []
+    for block in domain.blocks:
+        # the reach of a box is its unit step; a norm ball has none
+        reach = ASCENT_REACH * block.radius if block.norm == "box" else None
+        blocks.append(replace(block, unit_step_length=reach))
+    return replace(domain, blocks=tuple(blocks))
 
 
 def _sample_candidates(surrogate: Surrogate, generator: torch.Generator) -> Tensor:
@@ -548,12 +590,8 @@ class Restarts(RacingPolicy[Race]):
         each at least one evaluation with its gradient.
         """
         seed = draw_seed(generator)
-        renders_per_evaluation = 1
-        if self.policy.uses_gradient:
-            renders_per_evaluation += domain.gradient_cost
-        n_starts = max(1, min(self.times, steps // renders_per_evaluation))
         initial_points = [domain.initial_point]
-        for number in range(1, n_starts):
+        for number in range(1, self._count_starts(domain, steps)):
             initial_points.append(domain.sample(seeded(seed, number))[0])
         searches = [
             (self.policy, replace(domain, restart_point=point))
@@ -561,6 +599,13 @@ class Restarts(RacingPolicy[Race]):
         ]
         # With a single round, no search is dropped before the end.
         return start_race(searches, steps, seed, rounds=1)
+
+    def _count_starts(self, domain: Domain, steps: int) -> int:
+        """Return how many searches there are, of which each can be evaluated."""
+        renders_per_evaluation = 1
+        if self.policy.uses_gradient:
+            renders_per_evaluation += domain.gradient_cost
+        return max(1, min(self.times, steps // renders_per_evaluation))
 
 
 @dataclass(frozen=True)
@@ -611,8 +656,19 @@ class Portfolio(RacingPolicy[Race]):
             InputError: none of them can; it is the error of the first.
         """
         seed = draw_seed(generator)
+        policies = self._find_suitable_policies(domain, seed, steps)
+        return start_race([(policy, domain) for policy in policies], steps, seed)
+
+    def _find_suitable_policies(
+        self, domain: Domain, seed: int, steps: int
+    ) -> list[Policy[Any]]:
+        """Return the policies that can search the domain, at least one.
+
+        Raises:
+            InputError: none of them can; it is the error of the first.
+        """
         steps_each = max(1, steps // len(self.policies))
-        searches = []
+        suitable = []
         errors = []
         for policy in self.policies:
             wrapped = wrap_choices(policy, domain)
@@ -623,7 +679,7 @@ class Portfolio(RacingPolicy[Race]):
             except InputError as error:
                 errors.append(error)
             else:
-                searches.append((wrapped, domain))
-        if not searches:
+                suitable.append(wrapped)
+        if not suitable:
             raise errors[0]
-        return start_race(searches, steps, seed)
+        return suitable

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -63,6 +63,13 @@ class Runner:
         """Return the search after it has paid for one of its proposals."""
         cost = proposal.max_cost(self.domain)
         return replace(self, renders_left=self.renders_left - cost)
+
+    def update(self, evaluated: Evaluated) -> Runner:
+        """Return the search after the evaluations of some of its proposals."""
+        best = max(evaluation.objective for _, evaluation in evaluated)
+        state = self.policy.update(self.state, evaluated)
+        best_objective = max(self.best_objective, best)
+        return replace(self, state=state, best_objective=best_objective)
 
 
 Racing = TypeVar("Racing", bound="Race")
@@ -124,76 +131,105 @@ class Race:
         """Return up to n proposals of this round that do not depend on each other.
 
         There are none if the round is over. Each search makes its proposals in one
-        call: n divided by the number of searches. From these they are taken one by one,
-        the next always from the search with the most renders left. The batch ends when
-        it is the turn of a search whose proposals are used up, because its next ones
-        depend on evaluations of this batch.
+        call: n divided by the number of searches.
 
         Args:
             n: largest number of proposals.
         """
-        runners = list(self.runners)
-        waiting = self._find_waiting(runners)
-        max_proposals = math.ceil(n / max(1, len(waiting)))  # of each search
-        proposals = dict[int, tuple[Proposal, ...]]()  # by index of the search
-        n_used = Counter[int]()  # proposals in the batch, by index of the search
-        batch = list[Proposal]()
-        runner_of_proposal = list[int]()
-        while waiting and len(batch) < n:
-            k = max(waiting, key=lambda index: runners[index].renders_left)
-            proposer = runners[k]
-            if k not in proposals:
-                # `charge` below stores the new state in `runners`. A search without a
-                # proposal stays in its state before.
-                proposals[k], proposer = proposer.propose(max_proposals)
-            has_nothing_to_propose = not proposals[k]
-            if has_nothing_to_propose:
-                self._retire(runners, k)  # in place: it gets no more renders
-                waiting = self._find_waiting(runners)
-                continue
-            are_used_up = n_used[k] == len(proposals[k])
-            if are_used_up:
+        batch = _Batch(self, list(self.runners))
+        batch.max_proposals = math.ceil(n / max(1, len(batch.find_waiting())))
+        while batch.find_waiting() and len(batch.proposals) < n:
+            if not batch.add_next():
                 break
-            proposal = self._limit_proposal(proposals[k][n_used[k]], proposer)
-            batch.append(proposal)
-            runner_of_proposal.append(k)
-            n_used[k] += 1
-            runners[k] = proposer.charge(proposal)
-            waiting = self._find_waiting(runners)
-        # A search expects evaluations of all its proposals. If not all were used, it
-        # proposes again from its state before the batch, only as many as were used.
-        for k, count in n_used.items():
-            if count < len(proposals[k]):
-                state = self._propose_again(k, count)
-                runners[k] = replace(runners[k], state=state)
-        return tuple(batch), replace(
-            self, runners=tuple(runners), runner_of_proposal=tuple(runner_of_proposal)
+        batch.drop_unused()
+        return tuple(batch.proposals), replace(
+            self,
+            runners=tuple(batch.runners),
+            runner_of_proposal=tuple(batch.runner_of_proposal),
         )
 
-    def _propose_again(self, k: int, count: int) -> Any:
-        """Return the state of search k after it proposed no more than `count`
-        configurations, from its state before the batch.
-        """
-        runner = self.runners[k]
-        _, state = runner.policy.propose(runner.state, count)
-        return state
 
-    def _find_waiting(self, runners: Sequence[Runner]) -> list[int]:
+@dataclass(eq=False)
+class _Batch:
+    """The proposals of a race that are evaluated together, while they are collected.
+
+    They are collected one by one, the next always from the search with the most renders
+    left. The batch ends when it is the turn of a search whose proposals are used up,
+    because its next ones depend on evaluations of this batch.
+
+    Attributes:
+        race: the race before the batch.
+        runners: its searches, in their states so far.
+        max_proposals: largest number of proposals of each search.
+        proposals: the proposals of the batch.
+        runner_of_proposal: for each of them, the index of its search.
+        available: all proposals that a search has made, by the index of the search.
+        n_used: how many of them are in the batch.
+    """
+
+    race: Race
+    runners: list[Runner]
+    max_proposals: int = 0
+    proposals: list[Proposal] = field(default_factory=list)
+    runner_of_proposal: list[int] = field(default_factory=list)
+    available: dict[int, tuple[Proposal, ...]] = field(default_factory=dict)
+    n_used: Counter[int] = field(default_factory=Counter)
+
+    def find_waiting(self) -> list[int]:
         """Return the indices of active runners that have renders left."""
-        return [index for index in self.active_runners if runners[index].renders_left]
+        active_runners = self.race.active_runners
+        return [index for index in active_runners if self.runners[index].renders_left]
 
-    def _retire(self, runners: list[Runner], k: int) -> None:
-        """End a search that has nothing more to propose.
+    def add_next(self) -> bool:
+        """Add a proposal of the search whose turn it is, or retire this search.
+
+        Returns:
+            False if the batch ends, because the proposals of the search are used up.
+        """
+        k = max(self.find_waiting(), key=lambda index: self.runners[index].renders_left)
+        proposer = self.runners[k]
+        if k not in self.available:
+            # `_add_proposal` stores the new state in `runners`. A search without a proposal
+            # stays in its state before.
+            self.available[k], proposer = proposer.propose(self.max_proposals)
+        if not self.available[k]:  # nothing to propose
+            self._retire(k)
+            return True
+        if self.n_used[k] == len(self.available[k]):
+            return False
+        self._add_proposal(k, proposer)
+        return True
+
+    def _add_proposal(self, k: int, proposer: Runner) -> None:
+        """Add the next proposal of search k, which is charged for it."""
+        proposal = self._limit_proposal(self.available[k][self.n_used[k]], proposer)
+        self.proposals.append(proposal)
+        self.runner_of_proposal.append(k)
+        self.n_used[k] += 1
+        self.runners[k] = proposer.charge(proposal)
+
+    def _limit_proposal(self, proposal: Proposal, runner: Runner) -> Proposal:
+        """Return a proposal that the renders of its runner can pay."""
+        proposal = replace(proposal, samples=min(runner.renders_left, proposal.samples))
+        renders_left = runner.renders_left
+        has_later_round = self.race.round + 1 < self.race.n_rounds
+        # `limit_cost` drops a gradient that uses up the renders, because no step could
+        # follow it. If there is a later round, its renders follow. Then a gradient that
+        # exactly uses up those of this round is kept, by one render more.
+        if has_later_round:
+            renders_left += 1
+        return proposal.limit_cost(runner.domain, renders_left)
+
+    def _retire(self, k: int) -> None:
+        """End search k, which has nothing more to propose.
 
         Its renders are divided among the searches that are left in the round.
-
-        Args:
-            runners: all searches of the race; the list is changed.
-            k: index of the search that ends.
         """
+        runners = self.runners
         renders = runners[k].renders_left
         runners[k] = replace(runners[k], renders_left=0, is_over=True)
-        others = [other for other in self.active_runners if not runners[other].is_over]
+        active_runners = self.race.active_runners
+        others = [other for other in active_runners if not runners[other].is_over]
         if not others:
             return
         renders_each, remainder = divmod(renders, len(others))
@@ -203,17 +239,17 @@ class Race:
             renders_left = runners[other].renders_left + added
             runners[other] = replace(runners[other], renders_left=renders_left)
 
-    def _limit_proposal(self, proposal: Proposal, runner: Runner) -> Proposal:
-        """Return a proposal that the renders of its runner can pay."""
-        proposal = replace(proposal, samples=min(runner.renders_left, proposal.samples))
-        renders_left = runner.renders_left
-        has_later_round = self.round + 1 < self.n_rounds
-        # `limit_cost` drops a gradient that uses up the renders, because no step could
-        # follow it. If there is a later round, its renders follow. Then a gradient that
-        # exactly uses up those of this round is kept, by one render more.
-        if has_later_round:
-            renders_left += 1
-        return proposal.limit_cost(runner.domain, renders_left)
+    def drop_unused(self) -> None:
+        """Move each search back to where it has made no more proposals than are used.
+
+        A search expects evaluations of all its proposals. If not all were used, it
+        proposes again from its state before the batch, only as many as were used.
+        """
+        for k, count in self.n_used.items():
+            if count < len(self.available[k]):
+                runner = self.race.runners[k]
+                _, state = runner.policy.propose(runner.state, count)
+                self.runners[k] = replace(self.runners[k], state=state)
 
 
 def count_rounds(runners: int) -> int:
@@ -265,24 +301,46 @@ def start_race(
     steps = max(1, steps)
     if rounds is None:
         rounds = count_rounds(len(searches))
-    # Every search is started with the number of renders that it gets if it is never
-    # dropped: its part of each round. All rounds have equally many renders.
-    planned_renders = 0.0
-    n_active = len(searches)
-    for _ in range(rounds):
-        planned_renders += steps / rounds / n_active
-        n_active = math.ceil(n_active / 2)
-    runners = tuple(
-        Runner(
-            policy,
-            domain,
-            policy.start(domain, seeded(seed, number), max(1, int(planned_renders))),
-        )
-        for number, (policy, domain) in enumerate(searches)
-    )
+    renders = max(1, int(_plan_renders(len(searches), steps, rounds)))
+    runners = _start_runners(searches, renders, seed)
     race = Race(runners, steps, n_rounds=rounds)
     all_runners = range(len(runners))
     return race.begin_round(all_runners, number=0)
+
+
+def _start_runners(
+    searches: Sequence[tuple[Policy[Any], Domain]], renders: int, seed: int
+) -> tuple[Runner, ...]:
+    """Return the searches of a race in their first states.
+
+    Args:
+        searches: policies, each with the domain that it searches.
+        renders: renders that each plans for.
+        seed: seed of random numbers; each search gets other ones.
+    """
+    runners = []
+    for number, (policy, domain) in enumerate(searches):
+        state = policy.start(domain, seeded(seed, number), renders)
+        runners.append(Runner(policy, domain, state))
+    return tuple(runners)
+
+
+def _plan_renders(n_searches: int, steps: int, rounds: int) -> float:
+    """Return the number of renders of a search that is never dropped from a race.
+
+    It is its part of each round. All rounds have equally many renders.
+
+    Args:
+        n_searches: number of searches in the first round.
+        steps: renders of the race.
+        rounds: number of rounds.
+    """
+    planned_renders = 0.0
+    n_active = n_searches
+    for _ in range(rounds):
+        planned_renders += steps / rounds / n_active
+        n_active = math.ceil(n_active / 2)
+    return planned_renders
 
 
 class RacingPolicy(Policy[Racing]):
@@ -335,27 +393,26 @@ class RacingPolicy(Policy[Racing]):
             evaluated: configurations and their evaluations, in the order of the latest
                 proposals; there may be fewer, if the search is interrupted.
         """
-        evaluated_by_runner = defaultdict[int, list[Any]](list)
-        for k, (u, evaluation) in zip(
-            state.runner_of_proposal, evaluated, strict=False
-        ):
-            evaluated_by_runner[k].append((u, evaluation))
         runners = list(state.runners)
-        for k, runner_evaluated in evaluated_by_runner.items():
-            runner = runners[k]
-            best = max(evaluation.objective for _, evaluation in runner_evaluated)
-            runner_state = runner.policy.update(runner.state, runner_evaluated)
-            runners[k] = replace(
-                runner,
-                state=runner_state,
-                best_objective=max(runner.best_objective, best),
-            )
-        spent = state.renders_spent + sum(
-            evaluation.cost for _, evaluation in evaluated
-        )
+        for k, runner_evaluated in self._group_by_runner(state, evaluated).items():
+            runners[k] = runners[k].update(runner_evaluated)
+        cost = sum(evaluation.cost for _, evaluation in evaluated)
         return replace(
-            state, runners=tuple(runners), renders_spent=spent, runner_of_proposal=()
+            state,
+            runners=tuple(runners),
+            renders_spent=state.renders_spent + cost,
+            runner_of_proposal=(),
         )
+
+    @staticmethod
+    def _group_by_runner(race: Race, evaluated: Evaluated) -> dict[int, list[Any]]:
+        """Return the evaluated proposals of each search, by the index of the search."""
+        evaluated_by_runner = defaultdict[int, list[Any]](list)
+        # there may be fewer evaluations than proposals
+        pairs = zip(race.runner_of_proposal, evaluated, strict=False)
+        for k, evaluated_proposal in pairs:
+            evaluated_by_runner[k].append(evaluated_proposal)
+        return evaluated_by_runner
 
     def distribution(self, state: Racing) -> Distribution | None:
         runner = state.runners[state.leader]
@@ -463,18 +520,10 @@ class Choices(RacingPolicy[ChoicesState]):
         is_choice = domain.option_counts > 0  # a number has 0 options
         numbers = (~is_choice).nonzero().flatten()
         choices = is_choice.nonzero().flatten()
-        policy: Policy[Any]
-        if len(numbers):
-            policy = self.policy
-            inner_domain = _drop_choices(domain, numbers)
-        else:
-            policy = Random()
-            inner_domain = Domain(torch.zeros(1), (Block(1),))
+        policy, inner_domain = self._make_inner_search(domain, numbers)
+        max_combinations = _count_affordable_combinations(domain, policy, steps)
         combinations = _select_combinations(
-            domain.option_counts[choices].tolist(),
-            domain.initial_point[choices],  # its combination is searched, too
-            max_combinations=_count_affordable_combinations(domain, policy, steps),
-            generator=seeded(seed, 0),
+            domain, choices, max_combinations, generator=seeded(seed, 0)
         )
         # one search for each combination, all of the same numbers
         searches = [(policy, inner_domain)] * len(combinations)
@@ -486,6 +535,20 @@ class Choices(RacingPolicy[ChoicesState]):
             choices=choices,
             combinations=combinations,
         )
+
+    def _make_inner_search(
+        self, domain: Domain, numbers: Tensor
+    ) -> tuple[Policy[Any], Domain]:
+        """Return the policy and the domain of each search of a combination.
+
+        Args:
+            domain: domain of numbers and choices.
+            numbers: (k,) indices of the numbers; if there are none, the search is a
+                random search of a dummy number.
+        """
+        if len(numbers):
+            return self.policy, _drop_choices(domain, numbers)
+        return Random(), Domain(torch.zeros(1), (Block(1),))
 
     def propose(
         self, state: ChoicesState, n: int
@@ -576,10 +639,7 @@ def _count_affordable_combinations(
 
 
 def _select_combinations(
-    n_options: list[int],
-    initial_point: Tensor,
-    max_combinations: int,
-    generator: torch.Generator,
+    domain: Domain, choices: Tensor, max_combinations: int, generator: torch.Generator
 ) -> Tensor:
     """Select combinations of options, the initial one first.
 
@@ -588,8 +648,8 @@ def _select_combinations(
     order.
 
     Args:
-        n_options: number of options of each of the c choices.
-        initial_point: (c,) elements of u that are choices, at the initial point.
+        domain: domain of numbers and choices.
+        choices: (c,) indices of the choices in u.
         max_combinations: largest number of combinations.
         generator: generator of random numbers; it advances.
 
@@ -597,23 +657,42 @@ def _select_combinations(
         (n, c) elements of u: those of the initial point as they are, then others at the
         centers of the options.
     """
+    n_options = domain.option_counts[choices].tolist()
     sizes = torch.tensor(n_options)
+    initial_point = domain.initial_point[choices]
     # index of the option of each choice; u = 1 belongs to the last
     initial = torch.floor(initial_point * sizes).long().clamp(max=sizes - 1)
+    selected = _select_others(n_options, initial, max_combinations, generator)
+    # `selected` has indices; option i of n has the center (i + 1/2) / n
+    centers = option_center((selected + 0.5) / sizes, sizes)
+    return torch.cat([initial_point[None], centers.to(initial_point.dtype)])
+
+
+def _select_others(
+    n_options: list[int],
+    initial: Tensor,
+    max_combinations: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """Return the indices of options (n, c) of combinations other than the initial one.
+
+    Args:
+        n_options: number of options of each of the c choices.
+        initial: (c,) index of the option of each choice in the initial combination.
+        max_combinations: largest number of combinations, with the initial one.
+        generator: generator of random numbers; it advances.
+    """
     # With more combinations than this, samples are rarely equal, so that drawing until
     # enough of them differ takes few draws.
     max_listed = max(MIN_LISTED_COMBINATIONS, 4 * max_combinations)
     if math.prod(n_options) <= max_listed:
         combinations = _shuffle_combinations(n_options, generator)
         is_initial = (combinations == initial).all(dim=1)
-        selected = combinations[~is_initial][: max_combinations - 1]
-    else:
-        selected = _sample_combinations(
-            n_options, tuple(initial.tolist()), max_combinations - 1, generator
-        )
-    # `selected` has indices; option i of n has the center (i + 1/2) / n
-    centers = option_center((selected + 0.5) / sizes, sizes)
-    return torch.cat([initial_point[None], centers.to(initial_point.dtype)])
+        return combinations[~is_initial][: max_combinations - 1]
+    initial_options = tuple(initial.tolist())
+    return _sample_combinations(
+        n_options, initial_options, max_combinations - 1, generator
+    )
 
 
 def _shuffle_combinations(n_options: list[int], generator: torch.Generator) -> Tensor:

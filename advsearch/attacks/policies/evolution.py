@@ -71,11 +71,24 @@ def utilities(values: Sequence[float]) -> list[float]:
     descending = sorted(values, reverse=True)
     weight_of_value = {}
     for value in set(values):
-        first = descending.index(value)  # index of the first of its ranks
-        count = descending.count(value)
-        mean_weight = math.fsum(rank_weights[first : first + count]) / count
+        mean_weight = _average_rank_weights(value, descending, rank_weights)
         weight_of_value[value] = mean_weight / total - 1.0 / n
     return [weight_of_value[value] for value in values]
+
+
+def _average_rank_weights(
+    value: float, descending: Sequence[float], rank_weights: Sequence[float]
+) -> float:
+    """Return the mean weight of the ranks that a value has among all values.
+
+    Args:
+        value: one of the values; equal ones share their ranks.
+        descending: all values, the largest first.
+        rank_weights: weight of each rank.
+    """
+    first = descending.index(value)  # index of the first of its ranks
+    count = descending.count(value)
+    return math.fsum(rank_weights[first : first + count]) / count
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +125,31 @@ class NESState:
         generator = seeded(self.seed, self.generation * pairs_per_generation + pair)
         noise = torch.randn(self.domain.dim, generator=generator)
         return noise.neg_() if is_mirrored else noise
+
+    def update_distribution(self) -> NESState:
+        """Return the state with the distribution after a complete generation.
+
+        With weights w_k by the rank of the objectives, standard normal samples s_k and
+        the projection P onto the domain:
+
+            mean      <- P(mean + deviation * sum_k w_k s_k)
+            deviation <- deviation * exp(rate / 2 * sum_k w_k (s_k^2 - 1))
+        """
+        d = self.domain.dim
+        # the sums over w_k s_k and w_k s_k^2
+        mean_gradient, square_sum = self.sum_weighted_noise()
+        # the rate of Wierstra et al. 2014
+        rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
+        # The sum over w_k (s_k^2 - 1) is that over w_k s_k^2, as the weights sum to 0.
+        growth = square_sum.mul_(rate / 2.0).exp_()
+        deviation = (self.deviation * growth).clamp_(MIN_STEP_SIZE, MAX_STEP_SIZE)
+        # with the deviation of this generation, which is in half ranges
+        step = self.half_widths * self.deviation * mean_gradient
+        mean = self.domain.project(self.mean + step)
+        generation = self.generation + 1
+        return replace(
+            self, mean=mean, deviation=deviation, generation=generation, values=()
+        )
 
     def sum_weighted_noise(self) -> tuple[Tensor, Tensor]:
         """Return sum_k w_k s_k and sum_k w_k s_k^2 of a complete generation, (d,) each.
@@ -209,37 +247,12 @@ class NES(Policy[NESState]):
         return tuple(proposals), state
 
     def update(self, state: NESState, evaluated: Evaluated) -> NESState:
-        """Add evaluations to the generation, and update the distribution at its end.
-
-        With weights w_k by the rank of the objectives, standard normal samples s_k and
-        the projection P onto the domain:
-
-            mean      <- P(mean + deviation * sum_k w_k s_k)
-            deviation <- deviation * exp(rate / 2 * sum_k w_k (s_k^2 - 1))
-        """
+        """Add evaluations to the generation, and update the distribution at its end."""
         new_values = [evaluation.objective for _, evaluation in evaluated]
         state = replace(state, values=(*state.values, *new_values))
         if len(state.values) < state.population:
             return state
-        d = state.domain.dim
-        # the sums over w_k s_k and w_k s_k^2
-        mean_gradient, square_sum = state.sum_weighted_noise()
-        # the rate of Wierstra et al. 2014
-        rate = (3.0 + math.log(d)) / (5.0 * math.sqrt(d))
-        # The sum over w_k (s_k^2 - 1) is that over w_k s_k^2, as the weights sum to 0.
-        growth = square_sum.mul_(rate / 2.0).exp_()
-        deviation = (state.deviation * growth).clamp_(MIN_STEP_SIZE, MAX_STEP_SIZE)
-        # with the deviation of this generation, which is in half ranges
-        mean = state.domain.project(
-            state.mean + state.half_widths * state.deviation * mean_gradient
-        )
-        return replace(
-            state,
-            mean=mean,
-            deviation=deviation,
-            generation=state.generation + 1,
-            values=(),
-        )
+        return state.update_distribution()
 
     def distribution(self, state: NESState) -> Distribution:
         return Distribution(state.mean, state.half_widths * state.deviation)
@@ -369,22 +382,38 @@ class CMAESState:
         from the domain: by the interquartile range at a distance of one step size.
         """
         values = np.array(self.values)
-        interquartile_range = 0.0
-        is_finite = np.isfinite(values)
-        if is_finite.any():
-            lower_quartile, upper_quartile = np.percentile(values[is_finite], (25, 75))
-            interquartile_range = float(upper_quartile - lower_quartile)
-            values[~is_finite] = values[is_finite].min() - interquartile_range
-        else:  # equal values teach pycma nothing
-            values[:] = 0.0
+        spread = _compute_interquartile_range(values)
+        _fill_missing(values, spread)
         strategy = copy.deepcopy(self.strategy)
         step_size = max(strategy.sigma, 1e-30)  # avoids a division by 0
-        penalty = interquartile_range * np.array(self.violations) / step_size**2
+        penalty = spread * np.array(self.violations) / step_size**2
         with _isolate_numpy_random(self.seed, self.generation):
             # pycma minimizes, so the objective is negated and the penalty added
             strategy.tell(list(self.points), list(penalty - values))
         strategy.sigma = min(strategy.sigma, MAX_STEP_SIZE)
         return replace(self, strategy=strategy)
+
+
+def _compute_interquartile_range(values: Float64Array) -> float:
+    """Return the interquartile range of those values (n,) that are finite, or 0."""
+    finite_values = values[np.isfinite(values)]
+    if not finite_values.size:
+        return 0.0
+    lower_quartile, upper_quartile = np.percentile(finite_values, (25, 75))
+    return float(upper_quartile - lower_quartile)
+
+
+def _fill_missing(values: Float64Array, spread: float) -> None:
+    """Replace values (n,) that are not finite, in place.
+
+    They become the smallest finite value minus `spread`. If none is finite, all become
+    equal, which teaches pycma nothing.
+    """
+    is_finite = np.isfinite(values)
+    if is_finite.any():
+        values[~is_finite] = values[is_finite].min() - spread
+    else:
+        values[:] = 0.0
 
 
 @dataclass(frozen=True)
@@ -454,14 +483,13 @@ class CMAES(Policy[CMAESState]):
         domain.check_dim(MAX_DIM, "cmaes", "use policy pgd, auto or nes")
         population = self.population or 4 + int(3 * math.log(d))
         seed = draw_seed(generator)
-        strategy = self._make_strategy(d, population, seed)
         state = CMAESState(
             domain,
             seed,
             domain.initial_point,
             compute_half_widths(domain),
             find_periodic(domain),
-            strategy,
+            strategy=self._make_strategy(d, population, seed),
             generation=0,
             points=np.empty((0, d)),
         )
@@ -480,23 +508,31 @@ class CMAES(Policy[CMAESState]):
         at a random point with twice the population, as in IPOP-CMA-ES (Auger and Hansen
         2005).
         """
-        values = [evaluation.objective for _, evaluation in evaluated]
-        evaluated_points = state.points[len(state.values) :][: len(values)]
-        # `project` returns a configuration, and how far x lies out of the domain
-        violations = [state.project(x)[1] for x in evaluated_points]
-        best = max(state.best, *values)
-        state = replace(
-            state,
-            values=(*state.values, *values),
-            violations=(*state.violations, *violations),
-            best=best,
-        )
+        state = self._add_values(state, evaluated)
         if len(state.values) < len(state.points):
             return state
         state = state.tell()
         has_converged = float(state.stds.max()) <= MIN_STEP_SIZE
-        if not has_converged:
-            return state.ask()
+        if has_converged:
+            state = self._begin_run(state)
+        return state.ask()
+
+    @staticmethod
+    def _add_values(state: CMAESState, evaluated: Evaluated) -> CMAESState:
+        """Return the state with the evaluations of the generation's next points."""
+        values = [evaluation.objective for _, evaluation in evaluated]
+        evaluated_points = state.points[len(state.values) :][: len(values)]
+        # `project` returns a configuration, and how far x lies out of the domain
+        violations = [state.project(x)[1] for x in evaluated_points]
+        return replace(
+            state,
+            values=(*state.values, *values),
+            violations=(*state.violations, *violations),
+            best=max(state.best, *values),
+        )
+
+    def _begin_run(self, state: CMAESState) -> CMAESState:
+        """Return the state of a run from a random point, with twice the population."""
         # (best objective, final distribution) of the best run so far
         best_run = state.best_run
         if best_run is None or state.best > best_run[0]:
@@ -505,10 +541,9 @@ class CMAES(Policy[CMAESState]):
         strategy = self._make_strategy(state.domain.dim, doubled_population, state.seed)
         # the index of the generation gives each run another origin
         origin = state.domain.sample(seeded(state.seed, state.generation))[0]
-        new_run = replace(
+        return replace(
             state, origin=origin, strategy=strategy, best=-math.inf, best_run=best_run
         )
-        return new_run.ask()
 
     def distribution(self, state: CMAESState) -> Distribution:
         if state.best_run is not None and state.best_run[0] > state.best:

@@ -156,15 +156,25 @@ class Components:
     def sample(self, generator: torch.Generator, ranges: Ranges) -> Tensor:
         """Return one sample (d,) of the mixture, in fractions of each range.
 
-        A number is sampled from its truncated normal distribution, by inverting the
-        distribution function. A discrete choice is the center of its option's part of
-        [0, 1].
+        A discrete choice is the center of its option's part of [0, 1].
 
         Args:
             generator: generator of random numbers; it advances.
             ranges: kinds of the d elements.
         """
         k = int(torch.multinomial(self.weights, 1, generator=generator))
+        x = self._sample_numbers(k, generator, ranges)
+        option = torch.multinomial(self.option_probs[k], 1, generator=generator)[:, 0]
+        option_center = (option + 0.5) / ranges.n_options.clamp(min=1)
+        return torch.where(ranges.n_options > 0, option_center, x)
+
+    def _sample_numbers(
+        self, k: int, generator: torch.Generator, ranges: Ranges
+    ) -> Tensor:
+        """Return one sample (d,) of the truncated normal distributions of component k.
+
+        It is sampled by inverting the distribution function.
+        """
         mean = self.means[k]
         std = self.stds[k]
         lower_offset, upper_offset = ranges.compute_bounds(mean)
@@ -177,10 +187,7 @@ class Components:
         # `ndtri` is infinite at 0 and 1: x is clipped to a bound. Where rounding goes
         # beyond 0 or 1 it is NaN: the center of the range is taken.
         clipped = x.nan_to_num(0.5).clamp(0.0, 1.0)
-        x = torch.where(ranges.is_periodic, wrapped, clipped)
-        option = torch.multinomial(self.option_probs[k], 1, generator=generator)[:, 0]
-        option_center = (option + 0.5) / ranges.n_options.clamp(min=1)
-        return torch.where(ranges.n_options > 0, option_center, x)
+        return torch.where(ranges.is_periodic, wrapped, clipped)
 
     def maximize(
         self, x: Tensor, weights: Tensor, ranges: Ranges, uniform_probs: Tensor
@@ -205,13 +212,7 @@ class Components:
         # M step. (k, n) weights of the samples in each component, with the sum 1;
         # clamped, since a component may have no samples at all.
         sample_weights = (responsibility / counts.clamp(min=1e-12)).T
-        # Means are computed from offsets x - old mean, in which angles do not wrap.
-        offset = ranges.compute_offset(x[:, None], self.means)  # (n, k, d)
-        mean_offset, variance = _compute_moments(offset, sample_weights)
-        # of the normal distributions before they are truncated to the ranges
-        means, stds = _correct_truncation(
-            self.means + mean_offset, variance, counts[:, None], ranges
-        )
+        means, stds = self._fit_normals(x, sample_weights, counts, ranges)
         option = ranges.find_option(x, max_options=uniform_probs.shape[2])
         option_probs = _estimate_option_probs(
             sample_weights, option, counts, uniform_probs
@@ -220,6 +221,25 @@ class Components:
         new_weights = (1.0 - UNIFORM_WEIGHT) * fraction
         new_weights += UNIFORM_WEIGHT / len(fraction)
         return Components(new_weights, means, stds, option_probs)
+
+    def _fit_normals(
+        self, x: Tensor, sample_weights: Tensor, counts: Tensor, ranges: Ranges
+    ) -> tuple[Tensor, Tensor]:
+        """Return means and standard deviations (k, d) of the normal distributions,
+        before they are truncated to the ranges.
+
+        Args:
+            x: (n, d) samples, in fractions of each range.
+            sample_weights: (k, n) weights of the samples in each component, with the
+                sum 1.
+            counts: (k,) number of samples of each component.
+            ranges: kinds of the d elements.
+        """
+        # Means are computed from offsets x - old mean, in which angles do not wrap.
+        offset = ranges.compute_offset(x[:, None], self.means)  # (n, k, d)
+        mean_offset, variance = _compute_moments(offset, sample_weights)
+        sample_means = self.means + mean_offset
+        return _correct_truncation(sample_means, variance, counts[:, None], ranges)
 
 
 def _compute_moments(values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -257,13 +277,7 @@ def _correct_truncation(
     """
     uniform_mean = 0.5
     uniform_variance = UNIFORM_STD**2
-    # The prior is the uniform distribution, which counts as `PRIOR_COUNT` samples: its
-    # variance is averaged with that of the samples.
-    pooled_variance = (counts * variance + PRIOR_COUNT * uniform_variance) / (
-        counts + PRIOR_COUNT
-    )
-    # It has to be below that of the prior, so that `precision` is positive.
-    pooled_variance = pooled_variance.clamp(max=0.999 * uniform_variance)
+    pooled_variance = _pool_variance(variance, counts)
     precision = 1.0 / pooled_variance - 1.0 / uniform_variance
     stds = (1.0 / precision).sqrt().clamp(MIN_STD, MAX_STD)
     corrected_means = stds.square() * (
@@ -275,6 +289,23 @@ def _correct_truncation(
         corrected_means.clamp(0.0, 1.0),
     )
     return means, stds
+
+
+def _pool_variance(variance: Tensor, counts: Tensor) -> Tensor:
+    """Return the variance (k, d) of the samples, averaged with that of the prior.
+
+    The prior is the uniform distribution, which counts as `PRIOR_COUNT` samples. The
+    result is below the variance of the prior.
+
+    Args:
+        variance: (k, d) variances of the samples.
+        counts: (k, 1) number of samples of each component.
+    """
+    uniform_variance = UNIFORM_STD**2
+    pooled_variance = (counts * variance + PRIOR_COUNT * uniform_variance) / (
+        counts + PRIOR_COUNT
+    )
+    return pooled_variance.clamp(max=0.999 * uniform_variance)
 
 
 def _estimate_option_probs(
@@ -362,19 +393,28 @@ class MixtureState:
         lower = self.domain.lower_bounds.double()
         width = (self.domain.upper_bounds - self.domain.lower_bounds).double()
         ranges: dict[int, tuple[float, float]] = {}
-        for index, n_options in enumerate(self.ranges.n_options.tolist()):
-            if n_options:
-                bounds = self._option_bounds(mixture.option_probs[k, index], n_options)
-            else:
-                bounds = self._number_bounds(
-                    float(mixture.means[k, index]),
-                    float(mixture.stds[k, index]),
-                    is_periodic=bool(self.ranges.is_periodic[index]),
-                )
+        for index in range(len(self.ranges.n_options)):
+            bounds = self._find_bounds(mixture, k, index)
             if bounds is not None:
                 low, high = (float(lower[index] + x * width[index]) for x in bounds)
                 ranges[index] = (low, high)
         return ranges
+
+    def _find_bounds(
+        self, mixture: Components, k: int, index: int
+    ) -> tuple[float, float] | None:
+        """Return the range of one element that distinguishes component k, or None.
+
+        It is in fractions of the full range; `index` is that of the element in u.
+        """
+        n_options = int(self.ranges.n_options[index])
+        if n_options:
+            return self._option_bounds(mixture.option_probs[k, index], n_options)
+        return self._number_bounds(
+            float(mixture.means[k, index]),
+            float(mixture.stds[k, index]),
+            is_periodic=bool(self.ranges.is_periodic[index]),
+        )
 
     @staticmethod
     def _option_bounds(
@@ -474,12 +514,11 @@ class Mixture(Policy[MixtureState]):
             InputError: the domain has more than `MAX_DIM` numbers.
         """
         domain.check_dim(MAX_DIM, "mixture", "use pgd or auto")
-        ranges = Ranges(domain.option_counts, policies.find_periodic(domain))
         no_points = torch.empty(0, domain.dim, dtype=torch.float64)
         state = MixtureState(
             domain,
             policies.draw_seed(generator),
-            ranges,
+            Ranges(domain.option_counts, policies.find_periodic(domain)),
             generation=0,
             mixtures=(),
             points=no_points,
@@ -498,31 +537,10 @@ class Mixture(Policy[MixtureState]):
     def update(
         self, state: MixtureState, evaluated: policies.Evaluated
     ) -> MixtureState:
-        """Log evaluations, and fit a new mixture after each complete generation.
-
-        The importance weight of a sample is the uniform density divided by the density
-        from which it was drawn.
-        """
+        """Log evaluations, and fit a new mixture after each complete generation."""
         # Samples are proposed and evaluated in order, so these are the next ones.
         points = state.points[state.n_evaluated :][: len(evaluated)]
-        mixture = state.mixtures[-1]  # that of the current generation
-        with policies.limit_to_single_thread():
-            weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
-        # Without a mixture the density is 1. With one, the fraction `even` of samples
-        # is uniform, so that the density is at least `even`.
-        max_weight = 1.0 if mixture is None else 1.0 / self.even
-        # A success of the search is a failure of the model, the column "failed". The
-        # values are in the order of the columns of `log`.
-        rows = [
-            (
-                evaluation.objective,
-                evaluation.success,
-                not math.isfinite(evaluation.objective),
-                weight,
-                max_weight,
-            )
-            for (_, evaluation), weight in zip(evaluated, weights, strict=True)
-        ]
+        rows = self._make_log_rows(state, evaluated, points)
         state = replace(
             state,
             log=torch.cat([state.log, torch.tensor(rows, dtype=torch.float64)]),
@@ -536,6 +554,29 @@ class Mixture(Policy[MixtureState]):
         next_mixture = self._fit(state)
         return self._begin_generation(state, next_mixture)
 
+    def _make_log_rows(
+        self, state: MixtureState, evaluated: policies.Evaluated, points: Tensor
+    ) -> list[tuple[float, bool, bool, float, float]]:
+        """Return the rows of the log for evaluated points (n, d), by its columns.
+
+        The importance weight of a sample is the uniform density divided by the density
+        from which it was drawn.
+        """
+        mixture = state.mixtures[-1]  # that of the current generation
+        with policies.limit_to_single_thread():
+            weights = (1.0 / self._density(mixture, points, state.ranges)).tolist()
+        # Without a mixture the density is 1. With one, the fraction `even` of samples
+        # is uniform, so that the density is at least `even`.
+        max_weight = 1.0 if mixture is None else 1.0 / self.even
+        rows = []
+        for (_, evaluation), weight in zip(evaluated, weights, strict=True):
+            objective = evaluation.objective
+            is_unknown = not math.isfinite(objective)
+            # a success of the search is a failure of the model
+            row = (objective, evaluation.success, is_unknown, weight, max_weight)
+            rows.append(row)
+        return rows
+
     def failures(self, state: MixtureState) -> policies.Failures:
         """Return the worst failure of each component, and the estimated failure rate.
 
@@ -545,23 +586,23 @@ class Mixture(Policy[MixtureState]):
         """
         has_failed = state.log[:, FAILED_COLUMN] > 0
         is_unknown = state.log[:, UNKNOWN_COLUMN] > 0
-        failure_rate = None
-        if all(block.norm != "l2" for block in state.domain.blocks):
-            with policies.limit_to_single_thread():
-                failure_rate = policies.estimate_failure_rate(
-                    state.log[:, WEIGHT_COLUMN],
-                    state.log[:, MAX_WEIGHT_COLUMN],
-                    has_failed,
-                    is_unknown,
-                )
-        return policies.Failures(
+        failures = policies.Failures(
             self._list_examples(state),
             cell_parameter_indices=(),
             n_failures=int((has_failed & ~is_unknown).sum()),
             n_visited=len(state.log),
             n_cells=None,
-            failure_rate=failure_rate,
         )
+        if any(block.norm == "l2" for block in state.domain.blocks):
+            return failures
+        with policies.limit_to_single_thread():
+            failure_rate = policies.estimate_failure_rate(
+                weights=state.log[:, WEIGHT_COLUMN],
+                bounds=state.log[:, MAX_WEIGHT_COLUMN],
+                failed=has_failed,
+                unknown=is_unknown,
+            )
+        return replace(failures, failure_rate=failure_rate)
 
     def _list_examples(self, state: MixtureState) -> tuple[policies.FoundFailure, ...]:
         """Return the worst failure of each component, by descending weight.
@@ -577,21 +618,26 @@ class Mixture(Policy[MixtureState]):
         objectives = log[is_failure, OBJECTIVE_COLUMN]
         if not len(points):
             return ()
-        # index of the component that each point most likely comes from
-        component_of_point = torch.zeros(len(points), dtype=torch.long)
-        if mixture is not None:
-            log_densities = mixture.compute_log_densities(points, state.ranges)
-            component_of_point = log_densities.argmax(dim=1)
+        component_of_point = self._assign_components(mixture, points, state.ranges)
         examples = []
         for k in self._rank_components(mixture, component_of_point):
-            members = (component_of_point == k).nonzero().flatten()
-            worst = int(members[objectives[members].argmax()])
-            u = state.to_configuration(points[worst])
-            ranges = {}
-            if mixture is not None:
-                ranges = state.find_distinctive_ranges(mixture, k)
-            examples.append(policies.FoundFailure(u, float(objectives[worst]), ranges))
+            is_member = component_of_point == k
+            example = _choose_worst_example(
+                state, k, points[is_member], objectives[is_member]
+            )
+            examples.append(example)
         return tuple(examples)
+
+    @staticmethod
+    def _assign_components(
+        mixture: Components | None, points: Tensor, ranges: Ranges
+    ) -> Tensor:
+        """Return the index (n,) of the component that each point (n, d) most likely
+        comes from; 0 without a mixture.
+        """
+        if mixture is None:
+            return torch.zeros(len(points), dtype=torch.long)
+        return mixture.compute_log_densities(points, ranges).argmax(dim=1)
 
     @staticmethod
     def _rank_components(
@@ -619,12 +665,7 @@ class Mixture(Policy[MixtureState]):
         """
         generation = state.generation + 1
         rng = policies.seeded(state.seed, generation)
-        points = self._sample_uniform(state.ranges, rng)
-        if mixture is not None:
-            for row in range(self.population):
-                stays_uniform = float(torch.rand(1, generator=rng)) < self.even
-                if not stays_uniform:
-                    points[row] = mixture.sample(rng, state.ranges)
+        points = self._sample_points(state.ranges, mixture, rng)
         # The window consists of complete generations. Their samples are stored, and
         # their mixtures besides that of the generation that begins here.
         n_past_generations = max(1, WINDOW // self.population)
@@ -638,6 +679,23 @@ class Mixture(Policy[MixtureState]):
             evaluated_points=state.evaluated_points[-n_past_points:],
             n_evaluated=0,
         )
+
+    def _sample_points(
+        self, ranges: Ranges, mixture: Components | None, rng: torch.Generator
+    ) -> Tensor:
+        """Return the points (n, d) of a generation, in fractions of each range.
+
+        Each is uniform with probability `even`, otherwise from the mixture; without a
+        mixture all are uniform.
+        """
+        points = self._sample_uniform(ranges, rng)
+        if mixture is None:
+            return points
+        for row in range(self.population):
+            stays_uniform = float(torch.rand(1, generator=rng)) < self.even
+            if not stays_uniform:
+                points[row] = mixture.sample(rng, ranges)
+        return points
 
     def _sample_uniform(self, ranges: Ranges, rng: torch.Generator) -> Tensor:
         """Return uniform points (n, d) of a generation, in fractions of each range.
@@ -677,28 +735,48 @@ class Mixture(Policy[MixtureState]):
         points = state.evaluated_points[is_elite]
         if not len(points):
             return None
+        objectives = log[is_elite, OBJECTIVE_COLUMN]
         with policies.limit_to_single_thread():
-            densities = [
-                self._density(mixture, points, ranges) for mixture in state.mixtures
-            ]
-            # `WEIGHT_COLUMN` of the log has a sample's weight by the density of its own
-            # generation. Here the mean density of all generations is used instead.
-            weights = 1.0 / torch.stack(densities).mean(dim=0)
-            # Scaled so that their sum is the effective sample size, (sum w)^2 / sum
-            # w^2. It is compared with the `PRIOR_COUNT` samples of the prior.
-            weights *= weights.sum() / weights.square().sum()
-            center_index = policies.select_diverse(
-                points,
-                log[is_elite, OBJECTIVE_COLUMN].tolist(),
-                ranges.is_periodic,
-                ranges.n_options > 0,
-                limit=self.components,
-            )
-            mixture = self._make_initial_components(points[center_index], ranges)
+            weights = self._weight_points(state, points)
+            mixture = self._make_initial_mixture(points, objectives, ranges)
             uniform_probs = mixture.option_probs  # the initial ones are uniform
             for _ in range(N_FIT_ROUNDS):
                 mixture = mixture.maximize(points, weights, ranges, uniform_probs)
         return mixture
+
+    def _weight_points(self, state: MixtureState, points: Tensor) -> Tensor:
+        """Return the weights (n,) of points (n, d) that a mixture is fitted to.
+
+        Their sum is the effective sample size, (sum w)^2 / sum w^2. It is compared with
+        the `PRIOR_COUNT` samples of the prior.
+        """
+        densities = [
+            self._density(mixture, points, state.ranges) for mixture in state.mixtures
+        ]
+        # `WEIGHT_COLUMN` of the log has a sample's weight by the density of its own
+        # generation. Here the mean density of all generations is used instead.
+        weights = 1.0 / torch.stack(densities).mean(dim=0)
+        weights *= weights.sum() / weights.square().sum()
+        return weights
+
+    def _make_initial_mixture(
+        self, points: Tensor, objectives: Tensor, ranges: Ranges
+    ) -> Components:
+        """Return wide components around points that are far from each other.
+
+        Args:
+            points: (n, d) samples, in fractions of each range.
+            objectives: (n,) their objectives.
+            ranges: kinds of the d elements.
+        """
+        center_index = policies.select_diverse(
+            points,
+            objectives.tolist(),
+            ranges.is_periodic,
+            ranges.n_options > 0,
+            limit=self.components,
+        )
+        return self._make_initial_components(points[center_index], ranges)
 
     def _make_initial_components(self, centers: Tensor, ranges: Ranges) -> Components:
         """Return wide components of equal weight around centers (k, d)."""
@@ -742,3 +820,25 @@ class Mixture(Policy[MixtureState]):
         probs = torch.ones(n_components, n_elements, max_options, dtype=torch.float64)
         probs *= torch.arange(max_options) < ranges.n_options.clamp(min=1)[:, None]
         return probs / probs.sum(dim=2, keepdim=True)
+
+
+def _choose_worst_example(
+    state: MixtureState, k: int, points: Tensor, objectives: Tensor
+) -> policies.FoundFailure:
+    """Return the failure of a component with the largest objective.
+
+    It has the ranges that are distinctive of the component; none without a mixture.
+
+    Args:
+        state: state of the search.
+        k: index of the component.
+        points: (n, d) failures of the component, in fractions of each range.
+        objectives: (n,) their objectives.
+    """
+    worst = int(objectives.argmax())
+    u = state.to_configuration(points[worst])
+    mixture = state.mixtures[-1]
+    ranges = {}
+    if mixture is not None:
+        ranges = state.find_distinctive_ranges(mixture, k)
+    return policies.FoundFailure(u, float(objectives[worst]), ranges)

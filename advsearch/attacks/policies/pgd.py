@@ -64,6 +64,23 @@ def clip_gradient(
     are_images_predicted = domain.is_noise_free or domain.draws_conditions
     if are_images_predicted:
         return gradient, lengths, NO_COUNTS
+    clipped_gradient, has_outliers = _clip_elements(domain, gradient)
+    length = float(torch.linalg.vector_norm(clipped_gradient))
+    lengths = (*lengths, length)[-MEMORY:]
+    max_length = _find_max_length(lengths)
+    # with a median of 0 there is no usual length to compare with
+    is_too_long = length > max_length and max_length > 0.0
+    if is_too_long:
+        clipped_gradient = clipped_gradient * (max_length / length)
+    counts = CorrectionCounts(cut=int(has_outliers), shortened=int(is_too_long))
+    return clipped_gradient, lengths, counts
+
+
+def _clip_elements(domain: Domain, gradient: Tensor) -> tuple[Tensor, bool]:
+    """Return a gradient (d,) whose elements are clipped to the limit of their block.
+
+    The second value is whether any of them was above its limit.
+    """
     clipped_gradient = gradient.clone()
     has_outliers = False
     for block, part in domain.list_block_slices():
@@ -71,17 +88,14 @@ def clip_gradient(
         if float(gradient[part].abs().amax()) > limit:
             has_outliers = True
             clipped_gradient[part] = clipped_gradient[part].clamp(-limit, limit)
-    length = float(torch.linalg.vector_norm(clipped_gradient))
-    lengths = (*lengths, length)[-MEMORY:]
+    return clipped_gradient, has_outliers
+
+
+def _find_max_length(lengths: tuple[float, ...]) -> float:
+    """Return the largest length of a gradient, a multiple of the median of the last."""
     # if their number is even, the larger of the two in the middle
     median_length = sorted(lengths)[len(lengths) // 2]
-    max_length = CLIP * median_length
-    # with a median of 0 there is no usual length to compare with
-    is_too_long = length > max_length and max_length > 0.0
-    if is_too_long:
-        clipped_gradient = clipped_gradient * (max_length / length)
-    counts = CorrectionCounts(cut=int(has_outliers), shortened=int(is_too_long))
-    return clipped_gradient, lengths, counts
+    return CLIP * median_length
 
 
 def _find_element_limit(block: Block, gradient: Tensor) -> float:
@@ -450,10 +464,6 @@ class PGD(AscentPolicy):
             u = domain.sample(seeded(seed, 0))[0]
         # every step needs a gradient, which costs renders too
         steps = max(1, steps // (1 + domain.gradient_cost))
-        if domain.is_noise_free:  # without noise all windows are short
-            window_length = max(MIN_WINDOW_EXACT, round(MIN_WINDOW_FRACTION * steps))
-        else:
-            window_length = max(MIN_WINDOW, round(FIRST_WINDOW * steps))
         return Ascent(
             domain,
             steps,
@@ -461,7 +471,7 @@ class PGD(AscentPolicy):
             u,
             direction=torch.zeros_like(u),
             step_size=self.step_size,
-            window=StepWindow(window_length),
+            window=StepWindow(_choose_window_length(domain, steps)),
         )
 
     def compute_step_size(self, state: Ascent) -> float:
@@ -526,19 +536,14 @@ class PGD(AscentPolicy):
         best = max(window.values)
         gain = best - window.reference_best
         gain_since_start = best - state.start_objective
+        next_window = StepWindow(window.length, reference_best=best)
+        state = replace(state, window=next_window)
         is_idle = gain <= MIN_WINDOW_GAIN * gain_since_start
-        if is_idle:
-            step_size = state.step_size / 2
-            n_idle_windows = state.n_idle_windows + 1
-        else:
-            step_size = state.step_size
-            n_idle_windows = 0
-        return replace(
-            state,
-            step_size=step_size,
-            n_idle_windows=n_idle_windows,
-            window=StepWindow(window.length, reference_best=best),
-        )
+        if not is_idle:
+            return replace(state, n_idle_windows=0)
+        n_idle_windows = state.n_idle_windows + 1
+        step_size = state.step_size / 2
+        return replace(state, step_size=step_size, n_idle_windows=n_idle_windows)
 
     def _end_noisy_window(self, state: Ascent, window: StepWindow, u: Tensor) -> Ascent:
         """End a window of a noisy search, and take a step.
@@ -560,11 +565,8 @@ class PGD(AscentPolicy):
             state = replace(state, step_size=state.step_size / 2)
         if peak is not None and is_stalled and window.is_behind(best):
             u = peak.u
-            state = replace(
-                state,
-                direction=peak.direction,
-                counts=state.counts + CorrectionCounts(rejected=1),
-            )
+            counts = state.counts + CorrectionCounts(rejected=1)
+            state = replace(state, direction=peak.direction, counts=counts)
         next_window = window.next(state.steps, best, halved=is_stalled)
         return self._move_uphill(replace(state, window=next_window), u)
 
@@ -581,6 +583,15 @@ class PGD(AscentPolicy):
             alpha=self.compute_step_size(state),
         )
         return replace(state, u=state.domain.project(moved_u))
+
+
+def _choose_window_length(domain: Domain, steps: int) -> int:
+    """Return the number of evaluations of the first window of an ascent of so many
+    steps.
+    """
+    if domain.is_noise_free:  # without noise all windows are short
+        return max(MIN_WINDOW_EXACT, round(MIN_WINDOW_FRACTION * steps))
+    return max(MIN_WINDOW, round(FIRST_WINDOW * steps))
 
 
 @dataclass(frozen=True)
@@ -684,19 +695,21 @@ class Adam(AscentPolicy):
             u: (d,) the latest configuration.
             objective: its objective, which Adam does not use.
         """
-        has_gradient = state.n_updates > 0
-        if has_gradient:
-            # m' and v', without the bias of means that began at zero
-            mean = state.direction / (1.0 - self.beta1**state.n_updates)
-            mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
-            direction = mean / mean_square.sqrt_().clamp_(min=1e-30)
-        else:
-            noise = torch.randn(
-                u.numel(), generator=seeded(state.seed, state.n_evaluations)
-            )
-            direction = noise.sign_()
+        direction = self._compute_direction(state)
         latest_index = state.n_evaluations - 1  # index of the latest evaluation
         rate = state.decay_step_size(latest_index)
         half_widths = compute_half_widths(state.domain)
         u = torch.addcmul(u, half_widths, direction, value=rate)
         return replace(state, u=state.domain.project(u))
+
+    def _compute_direction(self, state: Ascent) -> Tensor:
+        """Return the direction (d,) of a step, of about 1 in each element."""
+        has_gradient = state.n_updates > 0
+        if has_gradient:
+            # m' and v', without the bias of means that began at zero
+            mean = state.direction / (1.0 - self.beta1**state.n_updates)
+            mean_square = state.mean_square / (1.0 - self.beta2**state.n_updates)
+            return mean / mean_square.sqrt_().clamp_(min=1e-30)
+        generator = seeded(state.seed, state.n_evaluations)
+        noise = torch.randn(state.u.numel(), generator=generator)
+        return noise.sign_()

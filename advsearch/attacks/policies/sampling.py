@@ -116,15 +116,7 @@ class Sobol(NonAdaptivePolicy):
         self, domain: Domain, generator: torch.Generator, steps: int
     ) -> PointsState:
         """Start the sequence, with its first chunk of points."""
-        # One dimension for each element, and one for the distance from the center of
-        # each l2 ball. Its elements only decide the direction (`to_domain`).
-        n_l2_balls = sum(block.norm == "l2" for block in domain.blocks)
-        size = domain.dim + n_l2_balls
-        if size > MAX_SOBOL_DIM:
-            raise InputError(
-                f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got "
-                f"{size}; use policy random, nes, pgd or auto"
-            )
+        size = _count_sobol_dimensions(domain)
         seed = draw_seed(generator)
         max_points = max(1, MAX_CHUNK_NUMBERS // size)
         n_points = min(steps, max_points)
@@ -148,6 +140,25 @@ class Sobol(NonAdaptivePolicy):
             state = replace(state, points=points)
         next_points = state.points[index_in_chunk:][:n]
         return state.propose(to_domain(state.domain, x) for x in next_points)
+
+
+def _count_sobol_dimensions(domain: Domain) -> int:
+    """Return the number of dimensions of the sequence for a domain.
+
+    It is one for each element, and one for the distance from the center of each l2
+    ball. The ball's elements only decide the direction (`to_domain`).
+
+    Raises:
+        InputError: there are more than `MAX_SOBOL_DIM`.
+    """
+    n_l2_balls = sum(block.norm == "l2" for block in domain.blocks)
+    size = domain.dim + n_l2_balls
+    if size > MAX_SOBOL_DIM:
+        raise InputError(
+            f"policy 'sobol': expected at most {MAX_SOBOL_DIM} dimensions, got "
+            f"{size}; use policy random, nes, pgd or auto"
+        )
+    return size
 
 
 def sample_sobol_points(size: int, seed: int, begin: int, count: int) -> Tensor:
@@ -261,22 +272,19 @@ def _make_axes(domain: Domain, counts: Sequence[int]) -> list[Tensor]:
         if block.norm == "l2" and block.epsilon is not None:
             lower[part] = lower[part].maximum(domain.start[part] - block.epsilon)
             upper[part] = upper[part].minimum(domain.start[part] + block.epsilon)
-    axes = []
-    for block, count, low, high in zip(
-        _list_block_of_elements(domain),
-        counts,
-        lower.tolist(),
-        upper.tolist(),
-        strict=True,
-    ):
-        is_choice = block.n_options > 0
-        if is_choice:  # the center of each option's part of [0, 1]
-            axes.append((torch.arange(count) + 0.5) / count)
-        elif block.periodic:  # both bounds are the same angle: only one is listed
-            axes.append(low + (high - low) * torch.arange(count) / count)
-        else:
-            axes.append(torch.linspace(low, high, count))
-    return axes
+    blocks = _list_block_of_elements(domain)
+    elements = zip(blocks, counts, lower.tolist(), upper.tolist(), strict=True)
+    return [_make_axis(*element) for element in elements]
+
+
+def _make_axis(block: Block, count: int, low: float, high: float) -> Tensor:
+    """Return `count` values of one element of u between two bounds, ascending."""
+    is_choice = block.n_options > 0
+    if is_choice:  # the center of each option's part of [0, 1]
+        return (torch.arange(count) + 0.5) / count
+    if block.periodic:  # both bounds are the same angle: only one is listed
+        return low + (high - low) * torch.arange(count) / count
+    return torch.linspace(low, high, count)
 
 
 def _order_coarse_to_fine(blocks: Sequence[Block], counts: Sequence[int]) -> Tensor:
@@ -320,26 +328,34 @@ def _count_values(domain: Domain, steps: int, points: int) -> list[int]:
         InputError: the grid does not fit into the renders.
     """
     options = domain.option_counts.tolist()  # 0 for a number
+    _check_grid_fits(options, steps, min_values=points or 2)
+    if points:
+        return [n_options or points for n_options in options]
+    return _fill_budget(options, steps)
+
+
+def _check_grid_fits(options: Sequence[int], steps: int, min_values: int) -> None:
+    """Raise InputError if a grid does not fit into the renders.
+
+    Args:
+        options: number of options of each element; 0 for a number.
+        steps: renders that the grid may take.
+        min_values: smallest number of values of each number.
+    """
     n_numbers = options.count(0)
     n_combinations = math.prod(count for count in options if count)
-    min_values = points or 2
     # 2^64 exceeds any budget already; a larger power would only take long to compute
     min_renders = n_combinations * min_values ** min(n_numbers, 64)
     if min_renders > steps:
         combinations_text = ""
         if n_combinations > 1:
             combinations_text = f" and {n_combinations} combinations of options"
-        renders_text = str(min_renders)
-        if min_renders >= 10**9:
-            renders_text = "billions of"
+        renders_text = "billions of" if min_renders >= 10**9 else str(min_renders)
         raise InputError(
             f"policy 'grid': {min_values} values for each of {n_numbers} "
             f"numbers{combinations_text} are {renders_text} renders, and there are "
             f"{steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
         )
-    if points:
-        return [n_options or points for n_options in options]
-    return _fill_budget(options, steps)
 
 
 def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
@@ -355,17 +371,29 @@ def _fill_budget(options: Sequence[int], steps: int) -> list[int]:
     # reduced a little, as rounding errors might make the root too large
     values_each = max(2, int(root * (1 - 1e-9)))
     counts = [count or values_each for count in options]
+    numbers = [index for index, n_options in enumerate(options) if not n_options]
+    _grow_axes(counts, numbers, steps)
+    return counts
+
+
+def _grow_axes(counts: list[int], numbers: Sequence[int], steps: int) -> None:
+    """Give each number of a grid one more value in turn, as long as the grid fits.
+
+    Args:
+        counts: number of values of each element of u; it is changed.
+        numbers: indices of the elements that are numbers.
+        steps: largest number of points of the grid.
+    """
     total = math.prod(counts)
     has_grown = True
-    while has_grown:  # one more value for each number in turn, as long as that fits
+    while has_grown:
         has_grown = False
-        for index, n_options in enumerate(options):
+        for index in numbers:
             grown_total = total // counts[index] * (counts[index] + 1)
-            if not n_options and grown_total <= steps:
+            if grown_total <= steps:
                 total = grown_total
                 counts[index] += 1
                 has_grown = True
-    return counts
 
 
 def _compute_levels(block: Block, count: int) -> Tensor:

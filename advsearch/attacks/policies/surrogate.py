@@ -101,9 +101,7 @@ class BoxCoordinates:
         # log-uniform from `MIN_MOVE` to `MAX_MOVE`
         log_range = math.log(MAX_MOVE / MIN_MOVE)
         size = MIN_MOVE * torch.exp(log_range * torch.rand(n, 1, generator=generator))
-        is_moved = torch.rand(n, k, generator=generator) < N_MOVED_COORDINATES / k
-        always_moved = torch.randint(k, (n,), generator=generator)
-        is_moved[torch.arange(n), always_moved] = True
+        is_moved = _select_moved(n, k, generator)
         noise = torch.randn(n, k, generator=generator)
         is_choice = self.option_counts > 0
         x = torch.where(is_choice, x, x + is_moved * size * noise)
@@ -137,12 +135,26 @@ class BoxCoordinates:
             angle.sin() / scaled_length,
         ]
         for coordinate in torch.nonzero(self.option_counts).flatten().tolist():
-            n_options = int(self.option_counts[coordinate])
-            option = (x[:, coordinate] * n_options).long().clamp_(max=n_options - 1)
-            corner = torch.nn.functional.one_hot(option, n_options).double()
-            # two corners of a one-hot code are sqrt(2) apart
+            corner = self._embed_choice(x, coordinate)
             features.append(corner / (math.sqrt(2.0) * lengths[coordinate]))
         return torch.cat(features, dim=1)
+
+    def _embed_choice(self, x: Tensor, coordinate: int) -> Tensor:
+        """Return the one-hot code (n, options) of a choice, by its coordinate.
+
+        Two different codes are sqrt(2) apart.
+        """
+        n_options = int(self.option_counts[coordinate])
+        option = (x[:, coordinate] * n_options).long().clamp_(max=n_options - 1)
+        return torch.nn.functional.one_hot(option, n_options).double()
+
+
+def _select_moved(n: int, k: int, generator: torch.Generator) -> Tensor:
+    """Select which coordinates of n points move, at least one of each, (n, k) bool."""
+    is_moved = torch.rand(n, k, generator=generator) < N_MOVED_COORDINATES / k
+    always_moved = torch.randint(k, (n,), generator=generator)
+    is_moved[torch.arange(n), always_moved] = True
+    return is_moved
 
 
 def find_box_coordinates(domain: Domain) -> BoxCoordinates:
@@ -290,25 +302,34 @@ class Observations:
         `REFIT_INTERVAL` new points, or a tenth of all points if that is more.
         """
         n_points = len(self.values)
-        values = torch.tensor(self.values, dtype=torch.float64)
-        is_finite = torch.isfinite(values)
-        values = torch.where(is_finite, values, values[is_finite].min())
+        values = self._replace_non_finite_values()
         scales = self.scales
         n_fitted = self.n_fitted  # number of points when the scales were fitted
         refit_interval = max(REFIT_INTERVAL, n_fitted // 10)
         if scales is None or n_points - n_fitted >= refit_interval:
-            # As fitting scales is slow, it uses `MEMORY` of the best and of the latest
-            # points, even if `self.memory`, for the predictions below, is larger.
-            scale_points = _select_best_and_latest(values, MEMORY)
-            scales = _find_best_scales(
-                self.box, self.points[scale_points], values[scale_points]
-            )
+            scales = self._fit_scales(values)
             n_fitted = n_points
         used = _select_best_and_latest(values, self.memory)
-        surrogate = fit_gaussian_process(
-            self.box, self.points[used], values[used], scales
-        )
+        used_points = self.points[used]
+        surrogate = fit_gaussian_process(self.box, used_points, values[used], scales)
         return surrogate, replace(self, scales=scales, n_fitted=n_fitted)
+
+    def _replace_non_finite_values(self) -> Tensor:
+        """Return the values (n,) float64, with the smallest one for each that is not
+        finite.
+        """
+        values = torch.tensor(self.values, dtype=torch.float64)
+        is_finite = torch.isfinite(values)
+        return torch.where(is_finite, values, values[is_finite].min())
+
+    def _fit_scales(self, values: Tensor) -> Scales:
+        """Return the scales that fit finite objectives (n,) of the points best.
+
+        As fitting scales is slow, it uses `MEMORY` of the best and of the latest
+        points, even if `self.memory`, for predictions, is larger.
+        """
+        used = _select_best_and_latest(values, MEMORY)
+        return _find_best_scales(self.box, self.points[used], values[used])
 
 
 def _select_best_and_latest(values: Tensor, memory: int) -> Tensor:
@@ -347,13 +368,8 @@ def fit_gaussian_process(
             of maximum likelihood.
     """
     scales = scales or _find_best_scales(box, x, y)
-    features = box.embed(x, scales.lengths)
     n = len(x)
-    # 1e-8 keeps the matrix positive definite where points coincide
-    matrix = kernel(features, features) + (scales.noise + 1e-8) * torch.eye(
-        n, dtype=torch.float64
-    )
-    factor = torch.linalg.cholesky(matrix)
+    factor = _factorize_kernel(box.embed(x, scales.lengths), scales.noise)
     right_sides = torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1)
     # K^-1 y and K^-1 1, with which generalised least squares give the mean
     solved_values, solved_ones = torch.cholesky_solve(right_sides, factor).T
@@ -363,6 +379,14 @@ def fit_gaussian_process(
     variance = max(float(weights @ (y.double() - mean)) / n, 1e-30)
     likelihood = -0.5 * n * math.log(variance) - float(factor.diagonal().log().sum())
     return Surrogate(box, x, scales, factor, weights, mean, variance, likelihood)
+
+
+def _factorize_kernel(features: Tensor, noise: float) -> Tensor:
+    """Return the Cholesky factor (n, n) of the kernel matrix of features (n, f)."""
+    # 1e-8 keeps the matrix positive definite where points coincide
+    diagonal = (noise + 1e-8) * torch.eye(len(features), dtype=torch.float64)
+    factor: Tensor = torch.linalg.cholesky(kernel(features, features) + diagonal)
+    return factor
 
 
 def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
@@ -378,32 +402,47 @@ def _find_best_scales(box: BoxCoordinates, x: Tensor, y: Tensor) -> Scales:
         y: (n,) values.
     """
     k = x.shape[1]
-    # Distances in the unit box grow with the square root of its dimension.
-    length_unit = math.sqrt(k)
-
-    def find_most_likely(candidates: list[Scales]) -> Surrogate:
-        fits = [fit_gaussian_process(box, x, y, scales) for scales in candidates]
-        return max(fits, key=lambda surrogate: surrogate.likelihood)
-
-    # one length scale for all coordinates, in units of `length_unit`
-    best = find_most_likely(
-        [
-            Scales(torch.full((k,), length_unit * length).double(), noise)
-            for length in LENGTHS
-            for noise in NOISE_VARIANCES
-        ]
-    )
+    best = _find_most_likely(box, x, y, _list_common_scales(k))
     # A single coordinate is fitted already. With many coordinates all share one scale.
     if not 1 < k <= MAX_SCALED_DIM:
         return best.scales
     for coordinate in range(k):
-        candidates = []
-        for factor in LENGTH_FACTORS:
-            lengths = best.scales.lengths.clone()
-            changed_length = float(lengths[coordinate]) * factor
-            lengths[coordinate] = min(length_unit * MAX_LENGTH, changed_length)
-            candidates.append(Scales(lengths, best.scales.noise))
-        changed = find_most_likely(candidates)
+        candidates = _list_changed_scales(best.scales, coordinate)
+        changed = _find_most_likely(box, x, y, candidates)
         if changed.likelihood > best.likelihood + MIN_LIKELIHOOD_GAIN:
             best = changed
     return best.scales
+
+
+def _find_most_likely(
+    box: BoxCoordinates, x: Tensor, y: Tensor, candidates: list[Scales]
+) -> Surrogate:
+    """Return the process of the largest likelihood, fitted with each of some scales.
+
+    The first three arguments are those of `fit_gaussian_process`.
+    """
+    fits = [fit_gaussian_process(box, x, y, scales) for scales in candidates]
+    return max(fits, key=lambda surrogate: surrogate.likelihood)
+
+
+def _list_common_scales(k: int) -> list[Scales]:
+    """Return a grid of noises and of lengths that all k coordinates share."""
+    # Distances in the unit box grow with the square root of its dimension.
+    length_unit = math.sqrt(k)
+    return [
+        Scales(torch.full((k,), length_unit * length).double(), noise)
+        for length in LENGTHS
+        for noise in NOISE_VARIANCES
+    ]
+
+
+def _list_changed_scales(scales: Scales, coordinate: int) -> list[Scales]:
+    """Return scales in which the length of one coordinate is multiplied by a factor."""
+    max_length = math.sqrt(len(scales.lengths)) * MAX_LENGTH
+    changed_scales = []
+    for factor in LENGTH_FACTORS:
+        lengths = scales.lengths.clone()
+        changed_length = float(lengths[coordinate]) * factor
+        lengths[coordinate] = min(max_length, changed_length)
+        changed_scales.append(Scales(lengths, scales.noise))
+    return changed_scales

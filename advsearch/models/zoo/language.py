@@ -65,10 +65,9 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
     if getattr(loaded.network.config, "is_encoder_decoder", False):
         raise _make_unsupported_error(loaded, "has a separate encoder")
     processor = _load_processor(loaded)
-    purpose = loaded.purpose
     name = loaded.name
-    is_free, question = purpose.parse_question(name, "goes on in words")
-    names = purpose.names
+    is_free, question = loaded.purpose.parse_question(name, "goes on in words")
+    names = loaded.purpose.names
     if not is_free:
         _check_has_choice(names, name)
     kind = type(loaded.network).__name__
@@ -79,19 +78,7 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         reader = _LanguageModel(loaded, processor, question or models.QUESTION)
         # Without names, likelihoods are checked with another text.
         tokens = reader.tokenize_names(names or (CHECK_TEXT,))
-        max_new_tokens = max(map(len, tokens))
-        if is_free:
-            max_new_tokens = max(max_new_tokens, purpose.tokens)
-        _check_length(loaded, reader, max_new_tokens)
-        # A network that answers freely needs the classifier for the check only.
-        classifier = _NameClassifier(reader, tokens)
-        module = _FreeAnswerer(reader, purpose.tokens) if is_free else classifier
-        with torch.no_grad():
-            _check_likelihood(loaded, classifier)
-            # A black image is only timed.
-            start_time = time.perf_counter()
-            module(torch.zeros((1, 3, *reader.image_size)))
-            seconds = time.perf_counter() - start_time
+        module, seconds = _make_checked_module(loaded, reader, tokens, is_free=is_free)
     if names is not None:
         _warn_of_prefixes(tokens, names, name)
     _warn_of_size(loaded, seconds)
@@ -103,6 +90,52 @@ def make_language_source(loaded: LoadedNetwork) -> models.Source:
         reads_text=True,
         **reader.preprocessing,
     )
+
+
+def _make_checked_module(
+    loaded: LoadedNetwork,
+    reader: _LanguageModel,
+    tokens: Sequence[Sequence[int]],
+    *,
+    is_free: bool,
+) -> tuple[nn.Module, float]:
+    """Return the network that answers, once its likelihoods are checked.
+
+    Args:
+        loaded: the network.
+        reader: reader of images and prompt.
+        tokens: tokens of each name.
+        is_free: whether it answers freely, and does not choose a name.
+
+    Returns:
+        The network, and the seconds that it takes for an image.
+    """
+    max_answer_tokens = loaded.purpose.tokens
+    max_new_tokens = max(map(len, tokens))
+    if is_free:
+        max_new_tokens = max(max_new_tokens, max_answer_tokens)
+    _check_length(loaded, reader, max_new_tokens)
+    # A network that answers freely needs the classifier for the check only.
+    classifier = _NameClassifier(reader, tokens)
+    module = _FreeAnswerer(reader, max_answer_tokens) if is_free else classifier
+    with torch.no_grad():
+        _check_likelihood(loaded, classifier)
+        black_image = torch.zeros((1, 3, *reader.image_size))
+        return module, _measure_call_seconds(module, black_image)
+
+
+def _find_max_error(values: Tensor, expected: Tensor) -> float:
+    """Return the largest absolute difference; infinity for tensors of other shapes."""
+    if values.shape != expected.shape:
+        return float("inf")
+    return float((values - expected).abs().max())
+
+
+def _measure_call_seconds(module: nn.Module, images: Tensor) -> float:
+    """Return how many seconds a network takes for images (N, 3, H, W)."""
+    start_time = time.perf_counter()
+    module(images)
+    return time.perf_counter() - start_time
 
 
 def _check_has_choice(names: Sequence[str] | None, model_name: str) -> None:
@@ -241,27 +274,15 @@ class _LanguageModel(nn.Module):
         Raises:
             ModelError: the processor treats them differently.
         """
-        height, width = self.image_size
-        # A test image (3, H, W) of 8-bit levels with a different ramp in each channel:
-        # an exchange of channels or axes is noticed.
-        vertical = torch.linspace(0, 200, height)[:, None].expand(height, width)
-        horizontal = torch.linspace(0, 200, width).expand(height, width)
-        diagonal = (vertical + horizontal) / 4 + 100  # from 100 to 200
-        levels = torch.stack([vertical, horizontal, diagonal]).round()
+        levels = _make_ramps(*self.image_size)
         image_8bit = np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy())
         expected = self._process(image_8bit)["pixel_values"]
         image = levels / 255.0
         if self.is_affine:
             # In use, `Preprocessing` does this before the image reaches this module.
-            mean = image.new_tensor(self.preprocessing["mean"]).view(3, 1, 1)
-            std = image.new_tensor(self.preprocessing["std"]).view(3, 1, 1)
-            if self.preprocessing["channels"] != "RGB":
-                image = image.flip(0)
-            image = (image - mean) / std
+            image = self._apply_preprocessing(image)
         pixels = self._compute_pixel_values(image)
-        max_error = float("inf")
-        if pixels.shape == expected.shape:
-            max_error = float((pixels - expected).abs().max())
+        max_error = _find_max_error(pixels, expected)
         is_accurate = max_error <= PIXEL_TOLERANCE * float(expected.abs().max())
         if not is_accurate:  # also if the error is NaN
             raise errors.ModelError(
@@ -269,6 +290,14 @@ class _LanguageModel(nn.Module):
                 "floating-point images differently from 8-bit images. Wrap network and "
                 "processor in an nn.Module, and pass that from Python"
             )
+
+    def _apply_preprocessing(self, image: Tensor) -> Tensor:
+        """Return an image (3, H, W) with its channel order and colors normalized."""
+        mean = image.new_tensor(self.preprocessing["mean"]).view(3, 1, 1)
+        std = image.new_tensor(self.preprocessing["std"]).view(3, 1, 1)
+        if self.preprocessing["channels"] != "RGB":
+            image = image.flip(0)
+        return (image - mean) / std
 
     def _process(self, image: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
         """Return the network's inputs for an image and a text.
@@ -311,15 +340,13 @@ class _LanguageModel(nn.Module):
         separator = self._find_separator()
         # A processor that adds tokens at the end of a text adds them to every text: the
         # first word is enough to find out.
-        processor_keeps_prompt = self._keeps_prompt(f"{separator}{words[0]}")
+        keeps_prompt = self._keeps_prompt(f"{separator}{words[0]}")
         tokens_of_names: list[list[int]] = []
         for word in words:
             # None if the tokenizer joins the end of the prompt with this word.
             tokens = self._tokenize_after_prompt(f"{separator}{word}")
-            if tokens is None or not processor_keeps_prompt:
-                tokens = self.processor.tokenizer(word, add_special_tokens=False)[
-                    "input_ids"
-                ]
+            if tokens is None or not keeps_prompt:
+                tokens = self._tokenize_alone(word)
             if not tokens:
                 raise InputError(
                     "labels: expected names that the network has tokens "
@@ -327,6 +354,12 @@ class _LanguageModel(nn.Module):
                 )
             tokens_of_names.append(tokens)
         return tokens_of_names
+
+    def _tokenize_alone(self, word: str) -> list[int]:
+        """Return the tokens of a word without the prompt and without special tokens."""
+        tokenized = self.processor.tokenizer(word, add_special_tokens=False)
+        tokens: list[int] = tokenized["input_ids"]
+        return tokens
 
     def _find_separator(self) -> str:
         """Return the text between the prompt and a name.
@@ -459,52 +492,67 @@ class _NameClassifier(nn.Module):
         self.tokens = [list(name_tokens) for name_tokens in tokens]
         stems = _find_stems(self.tokens)
         stem_length = max(map(len, stems), default=0)
-        longest_name = max(map(len, tokens))
-        # For each token of each name: its row and column in the table, and 1. Shorter
-        # names are padded with 0.
-        rows = torch.zeros((len(tokens), longest_name), dtype=torch.long)
-        columns = torch.zeros_like(rows)
-        is_token = torch.zeros_like(rows)
-        for index, name_tokens in enumerate(self.tokens):
-            # the stem that is, or begins with, all tokens of the name but the last
-            stem_index = _find_stem(stems, name_tokens[:-1])
-            first_stem_row = 1 + stem_index * stem_length
-            for position, token in enumerate(name_tokens):
-                # The first token follows the prompt (row 0). Any other token follows
-                # the token before it, which is in the stem.
-                if position > 0:
-                    rows[index, position] = first_stem_row + position - 1
-                columns[index, position] = token
-                is_token[index, position] = 1
         padded_stems = [[*stem, *[0] * (stem_length - len(stem))] for stem in stems]
         # (stems, stem length), and three times (names, longest name); see `forward`
         self._stems = torch.tensor(padded_stems).long()
-        self._rows = rows
-        self._columns = columns
-        self._is_token = is_token
+        shape = (len(tokens), max(map(len, tokens)))
+        self._rows = torch.zeros(shape, dtype=torch.long)
+        self._columns = torch.zeros_like(self._rows)
+        self._is_token = torch.zeros_like(self._rows)
+        for index, name_tokens in enumerate(self.tokens):
+            # the stem that is, or begins with, all tokens of the name but the last
+            stem_index = _find_stem(stems, name_tokens[:-1])
+            self._store_positions(index, name_tokens, 1 + stem_index * stem_length)
+
+    def _store_positions(
+        self, index: int, name_tokens: Sequence[int], first_stem_row: int
+    ) -> None:
+        """Store row and column in the table, and 1, for each token of a name.
+
+        Shorter names are padded with 0.
+
+        Args:
+            index: index of the name.
+            name_tokens: its tokens.
+            first_stem_row: first row in the table of the stem of the name.
+        """
+        for position, token in enumerate(name_tokens):
+            # The first token follows the prompt (row 0). Any other token follows
+            # the token before it, which is in the stem.
+            if position > 0:
+                self._rows[index, position] = first_stem_row + position - 1
+            self._columns[index, position] = token
+            self._is_token[index, position] = 1
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the log-likelihoods (N, names) for images (N, 3, H, W)."""
-        stems = self._stems.to(images.device)
-        # (names, longest name) each: row and column of each token of a name in the table
-        # below; and 1, or 0 in the padding of a shorter name
+        # (names, longest name) each: row and column of each token of a name in the
+        # table; and 1, or 0 in the padding of a shorter name
         rows = self._rows.to(images.device)
         columns = self._columns.to(images.device)
         is_token = self._is_token.to(images.device)
         scores = []
         for image in images:
-            logits, past = self.reader.read_prompt(image)
-            # Table (1 + stems * stem length, vocabulary) of log-likelihoods of the next
-            # token: after the prompt, and after each token of each stem.
-            table = logits.log_softmax(dim=-1)[None]
-            if len(stems):
-                # This changes `past`, which is not used again.
-                stem_logits = self.reader.continue_with(stems, past)
-                stem_rows = stem_logits.log_softmax(dim=-1).flatten(0, 1)
-                table = torch.cat([table, stem_rows])
+            table = self._compute_table(image)
             token_likelihoods = table[rows, columns] * is_token
             scores.append(token_likelihoods.sum(dim=1))
         return torch.stack(scores)
+
+    def _compute_table(self, image: Tensor) -> Tensor:
+        """Return the log-likelihoods of the next token for an image (3, H, W).
+
+        They are (1 + stems * stem length, vocabulary): after the prompt, and after each
+        token of each stem.
+        """
+        stems = self._stems.to(image.device)
+        logits, past = self.reader.read_prompt(image)
+        table = logits.log_softmax(dim=-1)[None]
+        if not len(stems):
+            return table
+        # This changes `past`, which is not used again.
+        stem_logits = self.reader.continue_with(stems, past)
+        stem_rows = stem_logits.log_softmax(dim=-1).flatten(0, 1)
+        return torch.cat([table, stem_rows])
 
 
 def _make_prompt_text(processor: Any, question: str) -> str:
@@ -564,6 +612,17 @@ def _make_gray_image(size: tuple[int, int]) -> npt.NDArray[np.uint8]:
     return np.full((*size, 3), 128, np.uint8)
 
 
+def _make_ramps(height: int, width: int) -> Tensor:
+    """Return a test image (3, H, W) of 8-bit levels, with a ramp in each channel.
+
+    The ramps differ, so that an exchange of channels or axes is noticed.
+    """
+    vertical = torch.linspace(0, 200, height)[:, None].expand(height, width)
+    horizontal = torch.linspace(0, 200, width).expand(height, width)
+    diagonal = (vertical + horizontal) / 4 + 100  # from 100 to 200
+    return torch.stack([vertical, horizontal, diagonal]).round()
+
+
 def _find_stem(stems: Sequence[Sequence[int]], prefix: Sequence[int]) -> int:
     """Return the index of the first stem (tokens) that begins with a prefix.
 
@@ -613,35 +672,33 @@ class _FreeAnswerer(nn.Module):
         self.end_tokens = frozenset(end_tokens) - {None}
 
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
-        """Return the answer about each of images (N, 3, H, W).
+        """Return the answer about each of images (N, 3, H, W)."""
+        return [self._answer(image) for image in images]
+
+    def _answer(self, image: Tensor) -> dict[str, Any]:
+        """Return the answer about an image (3, H, W).
 
         An answer of n tokens is a mapping with its "text"; the "logits" (n, vocabulary)
         from which the tokens were chosen; and under "begins" a function from a word to
         the tokens that may begin it. An answer ends with an end token, or after
         `max_tokens`.
         """
-        answers = []
-        for image in images:
-            next_logits, past = self.reader.read_prompt(image)
-            logits_of_steps = [next_logits]
-            tokens = [int(next_logits.argmax())]
-            while tokens[-1] not in self.end_tokens and len(tokens) < self.max_tokens:
-                # one alternative of one token, (1, 1)
-                last_token = next_logits.new_tensor([[tokens[-1]]], dtype=torch.long)
-                # This also adds the token to the cache `past`. There is one alternative,
-                # and the logits after its last token are used.
-                next_logits = self.reader.continue_with(last_token, past)[0, -1]
-                logits_of_steps.append(next_logits)
-                tokens.append(int(next_logits.argmax()))
-            text = self.tokenizer.decode(tokens, skip_special_tokens=True).strip()
-            answers.append(
-                {
-                    "text": text,
-                    "logits": torch.stack(logits_of_steps),
-                    "begins": self.find_first_tokens,
-                }
-            )
-        return answers
+        next_logits, past = self.reader.read_prompt(image)
+        logits_of_steps = [next_logits]
+        tokens = [int(next_logits.argmax())]
+        while tokens[-1] not in self.end_tokens and len(tokens) < self.max_tokens:
+            # one alternative of one token, (1, 1)
+            last_token = next_logits.new_tensor([[tokens[-1]]], dtype=torch.long)
+            # This also adds the token to the cache `past`. There is one alternative,
+            # and the logits after its last token are used.
+            next_logits = self.reader.continue_with(last_token, past)[0, -1]
+            logits_of_steps.append(next_logits)
+            tokens.append(int(next_logits.argmax()))
+        return {
+            "text": self.tokenizer.decode(tokens, skip_special_tokens=True).strip(),
+            "logits": torch.stack(logits_of_steps),
+            "begins": self.find_first_tokens,
+        }
 
     def find_first_tokens(self, word: str) -> list[int]:
         """Return the tokens that may begin a word.
@@ -696,17 +753,7 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
     generator = torch.Generator().manual_seed(0)
     image = torch.rand((3, *module.reader.image_size), generator=generator)
     prompt = module.reader.make_inputs(image)
-    name_tokens = torch.tensor(module.tokens[index], device=loaded.network.device)
-    inputs = _append_tokens(prompt, name_tokens)
-    logits = loaded.network(**inputs).logits
-    if logits.shape[1] != inputs["input_ids"].shape[1]:
-        raise _make_unsupported_error(
-            loaded, "returns logits of another length than the text has"
-        )
-    # The logits at a position are those of the next token: so the logits for the name
-    # begin one position before it.
-    likelihoods = logits[0, -len(name_tokens) - 1 : -1].float().log_softmax(dim=-1)
-    expected = likelihoods.gather(1, name_tokens[:, None]).sum().double()
+    expected = _compute_likelihood(loaded, prompt, module.tokens[index])
     computed = module(image[None])[0, index].double()
     # The tolerance is relative to this number.
     magnitude = max(1.0, abs(float(expected)))
@@ -716,6 +763,28 @@ def _check_likelihood(loaded: LoadedNetwork, module: _NameClassifier) -> None:
             "computes another likelihood with its cache than without "
             f"({computed:.6g} for {expected:.6g})",
         )
+
+
+def _compute_likelihood(
+    loaded: LoadedNetwork, prompt: Mapping[str, Tensor], tokens: Sequence[int]
+) -> Tensor:
+    """Return the log-likelihood of tokens after a prompt, by the network itself.
+
+    Raises:
+        ModelError: the network returns logits of another length.
+    """
+    name_tokens = torch.tensor(tokens, device=loaded.network.device)
+    inputs = _append_tokens(prompt, name_tokens)
+    logits = loaded.network(**inputs).logits
+    if logits.shape[1] != inputs["input_ids"].shape[1]:
+        raise _make_unsupported_error(
+            loaded, "returns logits of another length than the text has"
+        )
+    # The logits at a position are those of the next token: so the logits for the name
+    # begin one position before it.
+    likelihoods: Tensor = logits[0, -len(name_tokens) - 1 : -1].float()
+    likelihoods = likelihoods.log_softmax(dim=-1)
+    return likelihoods.gather(1, name_tokens[:, None]).sum().double()
 
 
 def _make_unsupported_error(loaded: LoadedNetwork, what: str) -> errors.ModelError:

@@ -40,14 +40,12 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
     # end.
     logging.disable(logging.WARNING)
     # connections that were not allowed, and therefore not made
-    rejected_connections: list[object] = []
+    rejected: list[object] = []
     try:
         with (
             models.without_unpickling(),
             warnings.catch_warnings(),
-            models.restrict_connections(
-                models.is_fetch_allowed(spec), rejected_connections
-            ),
+            models.restrict_connections(models.is_fetch_allowed(spec), rejected),
         ):
             warnings.simplefilter("ignore")
             yield
@@ -55,19 +53,29 @@ def report_library_errors(spec: str, advice: str) -> Iterator[None]:
         raise
     # Libraries raise many types of errors for missing and corrupt files.
     except Exception as error:
-        if rejected_connections:
-            raise models.CodeNotAllowedError(
-                f"a file names the model {spec}, which is not on this machine and "
-                f"would be fetched; {models.explain_how_to_allow(spec)}"
-            ) from error
-        raise errors.ModelError(
-            f"model {spec}: cannot be fetched or read ({models.get_first_line(error)}). "
-            "Weights come from the library's "
-            "cache on this machine, else from where it publishes them; they are never "
-            f"unpickled. {advice}"
-        ) from error
+        if rejected:
+            raise _make_fetch_error(spec) from error
+        raise _make_library_error(spec, error, advice) from error
     finally:
         logging.disable(disabled_before)
+
+
+def _make_fetch_error(spec: str) -> errors.ModelError:
+    """Return the error of a model that would be fetched, though only a file names it."""
+    return models.CodeNotAllowedError(
+        f"a file names the model {spec}, which is not on this machine and "
+        f"would be fetched; {models.explain_how_to_allow(spec)}"
+    )
+
+
+def _make_library_error(spec: str, error: Exception, advice: str) -> errors.ModelError:
+    """Return the error for a model that a library cannot load."""
+    return errors.ModelError(
+        f"model {spec}: cannot be fetched or read ({models.get_first_line(error)}). "
+        "Weights come from the library's "
+        "cache on this machine, else from where it publishes them; they are never "
+        f"unpickled. {advice}"
+    )
 
 
 Array = npt.NDArray[np.float64]
@@ -145,25 +153,14 @@ def measure_processor(processor: Any, spec: str) -> Processing:
         ModelError: no gradient goes through it, or it pads images or cuts them into
             patches.
     """
-
-    def process_color(color: Color, size: int = PROBE_SIZES[0]) -> Array:
-        """Return the output (3, h, w) for a square image of one color."""
-        return _run_processor(
-            processor, np.full((size, size, 3), color, np.uint8), spec
-        )
-
+    process_color = partial(_process_color, processor, spec)
     black = process_color((0, 0, 0))
     processing = Processing()
     # If the size of the output depends on that of the input, there is no fixed size.
     if black.shape == process_color((0, 0, 0), PROBE_SIZES[1]).shape:
         processing["input_size"] = (black.shape[1], black.shape[2])
     offset = black.mean(axis=(1, 2))
-    primaries = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
-    # gains (3, 3): rows are output channels, columns input channels
-    gains: Array = np.stack(
-        [process_color(color).mean(axis=(1, 2)) - offset for color in primaries],
-        axis=1,
-    )
+    gains = _measure_channel_gains(process_color, offset)
     # 1e-12: a processor that returns a constant has no gain
     tolerance = TOLERANCE * max(float(np.abs(gains).max()), 1e-12)
     if not _predicts_grays(process_color, gains, offset, tolerance):
@@ -175,6 +172,28 @@ def measure_processor(processor: Any, spec: str) -> Processing:
         problem = "mixes the channels of a picture, or turns it into its negative"
         return _wrap_processor(processor, spec, processing, problem)
     return Processing(**{**normalization, **processing})
+
+
+def _process_color(
+    processor: Any, spec: str, color: Color, size: int = PROBE_SIZES[0]
+) -> Array:
+    """Return the output (3, h, w) of a processor for a square image of one color."""
+    image = np.full((size, size, 3), color, np.uint8)
+    return _run_processor(processor, image, spec)
+
+
+def _measure_channel_gains(
+    process_color: Callable[[Color], Array], offset: Array
+) -> Array:
+    """Return the gains (3, 3) of input channels (columns) in output channels (rows).
+
+    Args:
+        process_color: returns the output (3, h, w) for an image of one color.
+        offset: (3,) output for black.
+    """
+    primaries = ((255, 0, 0), (0, 255, 0), (0, 0, 255))
+    gains = [process_color(color).mean(axis=(1, 2)) - offset for color in primaries]
+    return np.stack(gains, axis=1)
 
 
 def _predicts_grays(
@@ -225,11 +244,8 @@ def _find_normalization(
     channels, gain = gain_of_order.popitem()
     if gain.min() <= 0.0:
         return None
-    return Processing(
-        mean=_round_triple(-offset / gain),
-        std=_round_triple(1.0 / gain),
-        channels=channels,
-    )
+    mean = _round_triple(-offset / gain)
+    return Processing(mean=mean, std=_round_triple(1.0 / gain), channels=channels)
 
 
 def _run_processor(processor: Any, picture: Any, spec: str) -> Array:
@@ -274,49 +290,58 @@ def _wrap_processor(
     """
     _check_reads_all_pixels(processor, spec)
     process = _disable_resizing(processor)
-
-    def call(images: Tensor) -> Tensor:
-        """Process images (N, 3, H, W) in [0, 1].
-
-        The processor expects values up to 255. They are not rounded to integers, since
-        rounding has no gradient.
-        """
-        outputs = [
-            process(images=255.0 * image, return_tensors="pt")["pixel_values"]
-            for image in images
-        ]
-        return torch.cat(outputs).to(images)
-
+    call = partial(_call_processor, process)
     # A processor without a fixed size takes any.
     default_size = (PROBE_SIZES[0], PROBE_SIZES[0])
-    height, width = processing.get("input_size", default_size)
-    levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    size = processing.get("input_size", default_size)
+    levels = np.random.default_rng(0).integers(0, 256, (*size, 3), np.uint8)
     expected = _run_processor(process, levels, spec)
     image = torch.from_numpy(levels).float() / 255.0
     try:
         output, has_gradient = _call_with_gradient(call, image.movedim(2, 0)[None])
     except Exception as error:  # a processor with numpy raises errors of many types
-        advice = ""
-        if getattr(processor, "backend", None) == "pil":
-            advice = "; with torchvision installed, transformers takes one that may"
+        problem = _explain_gradient_error(processor, error)
         raise _make_processor_error(
-            spec,
-            processor,
-            f"{what}, and lets no gradient through "
-            f"({models.get_first_line(error)}){advice}",
+            spec, processor, f"{what}, and {problem}"
         ) from error
+    if not has_gradient or not _is_as_expected(output, expected):
+        problem = (
+            "returns other values for floating-point images than for 8-bit images, or "
+            "no gradient"
+        )
+        raise _make_processor_error(spec, processor, f"{what}, and {problem}")
+    return Processing(processor=call, **processing)
+
+
+def _call_processor(process: Callable[..., Any], images: Tensor) -> Tensor:
+    """Process images (N, 3, H, W) in [0, 1].
+
+    The processor expects values up to 255. They are not rounded to integers, since
+    rounding has no gradient.
+    """
+    outputs = [
+        process(images=255.0 * image, return_tensors="pt")["pixel_values"]
+        for image in images
+    ]
+    return torch.cat(outputs).to(images)
+
+
+def _explain_gradient_error(processor: Any, error: Exception) -> str:
+    """Return the clause that a processor has no gradient, by the error that it raised."""
+    advice = ""
+    if getattr(processor, "backend", None) == "pil":
+        advice = "; with torchvision installed, transformers takes one that may"
+    return f"lets no gradient through ({models.get_first_line(error)}){advice}"
+
+
+def _is_as_expected(output: Tensor, expected: Array) -> bool:
+    """Return whether an output (1, 3, h, w) is the expected one (3, h, w), but for
+    rounding.
+    """
     max_error = np.inf
     if output.shape == (1, *expected.shape):
         max_error = np.abs(output.detach().double().numpy() - expected).max()
-    is_accurate = max_error <= TOLERANCE * np.ptp(expected)  # False for NaN
-    if not has_gradient or not is_accurate:
-        raise _make_processor_error(
-            spec,
-            processor,
-            f"{what}, and returns other values for floating-point images than for 8-bit "
-            "images, or no gradient",
-        )
-    return Processing(processor=call, **processing)
+    return bool(max_error <= TOLERANCE * np.ptp(expected))  # False for NaN
 
 
 def _call_with_gradient(
@@ -478,12 +503,11 @@ class LoadedNetwork:
             **fields: fields of `Source`; they take precedence over the measured
                 preprocessing.
         """
+        network = AdaptedNetwork(
+            self.network, run_network, returns_pixel_boxes=returns_pixel_boxes
+        )
         return models.make_source(
-            AdaptedNetwork(
-                self.network, run_network, returns_pixel_boxes=returns_pixel_boxes
-            ),
-            self.name,
-            **{**self.preprocessing, **fields},
+            network, self.name, **{**self.preprocessing, **fields}
         )
 
     def make_text_source(

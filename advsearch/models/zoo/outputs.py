@@ -12,6 +12,7 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,11 @@ def make_feature_source(
             f"prompt: task {TASK} compares pictures and reads no text; "
             "leave `prompt` out"
         )
+    return _make_comparing_source(loaded)
+
+
+def _make_comparing_source(loaded: LoadedNetwork) -> models.Source:
+    """Return the source of a network without its head, for the task of features."""
     network = loaded.network
     config = network.config
     # the network without a head: features are its output
@@ -108,28 +114,35 @@ def make_feature_source(
         config = getattr(config, "vision_config", config)
     elif "ForImageClassification" in type(network).__name__:
         backbone = _find_backbone(network, loaded.spec)
-    # The parameters of a class token have names such as "cls_token".
-    has_class_token = any(
+    compute_features = partial(_compute_features, token=_has_class_token(backbone))
+    loaded = replace(loaded, network=backbone)
+    fields = loaded.get_sized_preprocessing(config)
+    return loaded.make_source(compute_features, **fields)
+
+
+def _has_class_token(network: Any) -> bool:
+    """Return whether a network has a first token that stands for the full image.
+
+    The parameters of a class token have names such as "cls_token".
+    """
+    return any(
         word in name
-        for name, _ in backbone.named_parameters()
+        for name, _ in network.named_parameters()
         for word in CLASS_TOKEN_NAMES
     )
 
-    def compute_features(network: Any, images: Tensor) -> Any:
-        """Return the features (N, D) of images (N, 3, H, W).
 
-        If there are none, the network's own return value is returned.
-        """
-        reads_texts = zero_shot.encodes_images_and_texts(network)
-        encode = network.get_image_features if reads_texts else network
-        returned = encode(pixel_values=images)
-        features = models.pooled(returned, token=has_class_token)
-        return returned if features is None else features
+def _compute_features(network: Any, images: Tensor, *, token: bool) -> Any:
+    """Return the features (N, D) of images (N, 3, H, W).
 
-    loaded = replace(loaded, network=backbone)
-    return loaded.make_source(
-        compute_features, **loaded.get_sized_preprocessing(config)
-    )
+    If there are none, the network's own return value is returned. `token` states
+    whether they are those of the first token.
+    """
+    reads_texts = zero_shot.encodes_images_and_texts(network)
+    encode = network.get_image_features if reads_texts else network
+    returned = encode(pixel_values=images)
+    features = models.pooled(returned, token=token)
+    return returned if features is None else features
 
 
 def _find_backbone(network: Any, spec: str) -> Any:
@@ -179,24 +192,31 @@ def make_depth_source(loaded: LoadedNetwork) -> models.Source:
 
     def run_network(network: Any, images: Tensor) -> dict[str, Tensor]:
         """Return the values (N, h, w) under their kind for images (N, 3, H, W)."""
-        if not is_padded:
-            return {kind: network(pixel_values=images).predicted_depth}
-        # ZoeDepth was trained on images with a mirrored border. This repeats what its
-        # processor in transformers does: it adds a border of this size (the formula is
-        # that of the library) and resizes the result to the input size. The
-        # post-processing resizes back and cuts the border off.
-        height, width = images.shape[2:]
-        top = int(math.sqrt(height / 2.0) * 3.0)
-        left = int(math.sqrt(width / 2.0) * 3.0)
-        padded = functional.pad(images, (left, left, top, top), mode="reflect")
-        resized = functional.interpolate(
-            padded, size=(height, width), mode="bilinear", align_corners=True
-        )
-        depth = network(pixel_values=resized).predicted_depth[:, None]
-        depth = functional.interpolate(depth, size=padded.shape[2:], mode="bicubic")
-        return {kind: depth[:, 0, top : top + height, left : left + width]}
+        if is_padded:
+            return {kind: _predict_padded_depth(network, images)}
+        return {kind: network(pixel_values=images).predicted_depth}
 
     return loaded.make_source(run_network)
+
+
+def _predict_padded_depth(network: Any, images: Tensor) -> Tensor:
+    """Return the depth (N, H, W) that ZoeDepth predicts for images (N, 3, H, W).
+
+    ZoeDepth was trained on images with a mirrored border. This repeats what its
+    processor in transformers does: it adds a border of this size (the formula is that
+    of the library) and resizes the result to the input size. The post-processing
+    resizes back and cuts the border off.
+    """
+    height, width = images.shape[2:]
+    top = int(math.sqrt(height / 2.0) * 3.0)
+    left = int(math.sqrt(width / 2.0) * 3.0)
+    padded = functional.pad(images, (left, left, top, top), mode="reflect")
+    resized = functional.interpolate(
+        padded, size=(height, width), mode="bilinear", align_corners=True
+    )
+    depth: Tensor = network(pixel_values=resized).predicted_depth[:, None]
+    depth = functional.interpolate(depth, size=padded.shape[2:], mode="bicubic")
+    return depth[:, 0, top : top + height, left : left + width]
 
 
 MASKS = (
@@ -231,28 +251,38 @@ def make_mask_source(loaded: LoadedNetwork) -> models.Source:
     )
     family = str(loaded.network.config.model_type)
     sentence = _tokenize_sentence(loaded) if family == "oneformer" else None
-
-    def run_network(network: Any, images: Tensor) -> Tensor:
-        """Return logarithms of scores (N, classes, H, W) for images (N, 3, H, W)."""
-        size = (images.shape[2], images.shape[3])
-        # OneFormer also takes a sentence that states the task.
-        task_inputs = {}
-        if sentence is not None:
-            tokens = sentence.to(images.device).expand(len(images), -1)
-            task_inputs = {"task_inputs": tokens}
-        returned = network(pixel_values=images, **task_inputs)
-        masks = returned.masks_queries_logits  # (N, queries, h, w)
-        # (N, queries, classes) without the last class, which means no object
-        classes = returned.class_queries_logits.softmax(dim=-1)[..., :-1]
-        if family == "mask2former":
-            masks = functional.interpolate(masks, size=MASK_SIZE, mode="bilinear")
-        elif family.startswith("eomt"):
-            masks = functional.interpolate(masks, size=size, mode="bilinear")
-        scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
-        scores = functional.interpolate(scores, size=size, mode="bilinear")
-        return scores.float().clamp_min(models.MIN_PROBABILITY).log()
-
+    run_network = partial(_run_mask_network, family=family, sentence=sentence)
     return loaded.make_source(run_network, labels=loaded.class_names or None)
+
+
+def _run_mask_network(
+    network: Any, images: Tensor, *, family: str, sentence: Tensor | None
+) -> Tensor:
+    """Return logarithms of scores (N, classes, H, W) for images (N, 3, H, W).
+
+    Args:
+        network: network that returns masks and their classes.
+        images: (N, 3, H, W).
+        family: type of the network in its ``config``.
+        sentence: (1, L) tokens of a text that states the task; None without it.
+    """
+    size = (images.shape[2], images.shape[3])
+    task_inputs = {}
+    if sentence is not None:
+        tokens = sentence.to(images.device).expand(len(images), -1)
+        task_inputs = {"task_inputs": tokens}
+    returned = network(pixel_values=images, **task_inputs)
+    masks = returned.masks_queries_logits  # (N, queries, h, w)
+    # (N, queries, classes) without the last class, which means no object
+    classes = returned.class_queries_logits.softmax(dim=-1)[..., :-1]
+    if family == "mask2former":
+        masks = functional.interpolate(masks, size=MASK_SIZE, mode="bilinear")
+    elif family.startswith("eomt"):
+        masks = functional.interpolate(masks, size=size, mode="bilinear")
+    scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
+    scores = functional.interpolate(scores, size=size, mode="bilinear")
+    log_scores: Tensor = scores.float().clamp_min(models.MIN_PROBABILITY).log()
+    return log_scores
 
 
 def _tokenize_sentence(loaded: LoadedNetwork) -> Tensor:
@@ -370,22 +400,15 @@ def _make_timm_source(
     needs_features = purpose.task == TASK  # the task that compares features
     has_head = module.num_classes > 0
     if not has_head and not needs_features:
-        raise make_no_classes_error(
-            name, "is a network without a head (num_classes is 0)"
-        )
+        problem = "is a network without a head (num_classes is 0)"
+        raise make_no_classes_error(name, problem)
     options = {}
     if pretrained_config:
         options = {"pretrained_cfg": dict(pretrained_config)}
     config = timm.data.resolve_model_data_config(module, **options)
-
-    def compute_features(network: Any, images: Tensor) -> Any:
-        """Return the features (N, D) that the head turns into logits."""
-        # With `pre_logits`, timm leaves out the last layer of the head.
-        return network.forward_head(network.forward_features(images), pre_logits=True)
-
     network = module
     if needs_features and has_head:
-        network = AdaptedNetwork(module, compute_features)
+        network = AdaptedNetwork(module, _compute_timm_features)
     names = labels or _find_timm_names(timm, module)
     return models.make_source(
         network,
@@ -395,6 +418,12 @@ def _make_timm_source(
         std=tuple(map(float, config["std"])),
         labels=tuple(map(str, names)) if names and not needs_features else None,
     )
+
+
+def _compute_timm_features(network: Any, images: Tensor) -> Any:
+    """Return the features (N, D) that the head of a network of timm turns into logits."""
+    # With `pre_logits`, timm leaves out the last layer of the head.
+    return network.forward_head(network.forward_features(images), pre_logits=True)
 
 
 def _find_timm_names(timm: Any, module: Any) -> Sequence[str]:
@@ -435,29 +464,62 @@ def load_torchvision(spec: str) -> models.Source:
     detectors = zoo.list_models(module=zoo.detection)
     known_names = (*classifiers, *segmenters, *detectors)
     if name not in known_names:
-        # A network for videos, or a quantized one, has an error of its own.
-        _check_reads_images(zoo, name, spec)
-        raise errors.UnknownNameError(
-            "torchvision network", name, models.find_near_names(name, known_names)
-        )
+        raise _make_unknown_network_error(zoo, name, known_names, spec)
     default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
     # Without this option torchvision would fetch weights of the backbone, which are
     # replaced afterwards. Classifiers have no such option.
-    options = {} if name in classifiers else {"weights_backbone": None}
-    with report_library_errors(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
-        module: nn.Module = zoo.get_model(
-            name, weights=None if weights else default, **options
-        )
-    if weights is not None:
-        models.load_weights(module, weights, name)
+    options: dict[str, Any] = {}
+    if name not in classifiers:
+        options["weights_backbone"] = None
+    options["weights"] = None if weights else default
+    module = _build_torchvision_network(zoo, spec, options)
     if name in classifiers:
         return models.make_source(module, name, **_get_default_fields(default, module))
     fields = _get_default_fields(default, classifier=None)
     if name in segmenters:
-        return models.make_source(
-            AdaptedNetwork(module, _run_segmenter), name, **fields
-        )
+        network = AdaptedNetwork(module, _run_segmenter)
+        return models.make_source(network, name, **fields)
     return _make_detector_source(module, name, fields)
+
+
+def _build_torchvision_network(
+    zoo: Any, spec: str, options: Mapping[str, Any]
+) -> nn.Module:
+    """Return a network of torchvision with the weights that the user states, if any.
+
+    Args:
+        zoo: torchvision's networks.
+        spec: what the user wrote, ``torchvision:NAME[@weights.safetensors]``.
+        options: arguments of torchvision's function that builds a network.
+
+    Raises:
+        ModelError: torchvision cannot build it, or the user's weights do not fit.
+    """
+    name, weights = models.split_weights(spec.partition(":")[2])
+    with report_library_errors(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
+        module: nn.Module = zoo.get_model(name, **options)
+    if weights is not None:
+        models.load_weights(module, weights, name)
+    return module
+
+
+def _make_unknown_network_error(
+    zoo: Any, name: str, known_names: Sequence[str], spec: str
+) -> errors.UnknownNameError:
+    """Return the error of a network that torchvision does not have.
+
+    Args:
+        zoo: torchvision's networks.
+        name: name that the user wrote.
+        known_names: names of all networks that can be loaded.
+        spec: what the user wrote in full, for messages.
+
+    Raises:
+        ModelError: the network is for videos, or quantized.
+    """
+    _check_reads_images(zoo, name, spec)
+    similar_names = models.find_near_names(name, known_names)
+    return errors.UnknownNameError("torchvision network", name, similar_names)
 
 
 def _make_detector_source(
@@ -482,9 +544,8 @@ def _make_detector_source(
     input_size = _find_detector_size(module)
     if input_size is not None:
         fields["input_size"] = input_size
-    return models.make_source(
-        AdaptedNetwork(module, _run_detector, returns_pixel_boxes=True), name, **fields
-    )
+    network = AdaptedNetwork(module, _run_detector, returns_pixel_boxes=True)
+    return models.make_source(network, name, **fields)
 
 
 def _find_detector_size(module: nn.Module) -> tuple[int, int] | None:
@@ -551,7 +612,18 @@ def _get_default_fields(
     fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}
     if default is None:
         return fields
-    transforms = default.transforms()
+    fields |= _read_default_transforms(default.transforms())
+    labels = tuple(str(label) for label in default.meta.get("categories", ()))
+    # The user's weights may have other classes than the default weights.
+    fits_classes = classifier is None or _count_classes(classifier) == len(labels)
+    if labels and fits_classes:
+        fields["labels"] = labels
+    return fields
+
+
+def _read_default_transforms(transforms: Any) -> dict[str, Any]:
+    """Return size, mean and standard deviation that transforms of torchvision state."""
+    fields: dict[str, Any] = {}
     crop_size = getattr(transforms, "crop_size", None)
     size = crop_size or getattr(transforms, "resize_size", None)
     if size:
@@ -561,11 +633,6 @@ def _get_default_fields(
         numbers = getattr(transforms, key, None)
         if numbers is not None:
             fields[key] = tuple(map(float, numbers))
-    labels = tuple(str(label) for label in default.meta.get("categories", ()))
-    # The user's weights may have other classes than the default weights.
-    fits_classes = classifier is None or _count_classes(classifier) == len(labels)
-    if labels and fits_classes:
-        fields["labels"] = labels
     return fields
 
 

@@ -49,6 +49,17 @@ class Family(NamedTuple):
     loader: str | None
     source: Callable[[LoadedNetwork], models.Source]
 
+    def includes(self, architecture: str, network: Any) -> bool:
+        """Return whether an architecture belongs to the family.
+
+        Args:
+            architecture: its name.
+            network: network of this architecture, or its class.
+        """
+        if isinstance(self.matches, str):
+            return bool(re.search(self.matches, architecture))
+        return self.matches(architecture, network)
+
 
 HUB_TIMEOUT = 5.0
 """Timeout in seconds of the hub's first response. Without it, the hub's client would
@@ -82,18 +93,13 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
     name = _resolve_name(name, spec)
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
-    # arguments of the functions of transformers that read from the hub
-    hub_options: dict[str, Any] = {"revision": revision} if revision else {}
     with report_library_errors(spec, ADVICE):
-        # If the hub does not respond, its client would try each file for half a minute.
-        if not Path(name).is_dir() and _is_hub_unreachable(name):
-            hub_options["local_files_only"] = True
+        hub_options = _choose_hub_options(name, revision)
         saved = _load_config(transformers, name, spec, hub_options)
         # transformers reads the config of any network of timm as a "timm_wrapper". But
         # only a config that transformers has saved states "architectures".
         is_of_timm = saved.get("model_type") == "timm_wrapper"
-        is_saved_by_timm = is_of_timm and "architectures" not in saved
-        if is_saved_by_timm:
+        if is_of_timm and "architectures" not in saved:
             return outputs.load_timm_repository(spec, name, revision, purpose)
         family, network = _load_network(transformers, name, hub_options, spec)
         processor = load_processor(transformers, name, hub_options)
@@ -106,6 +112,22 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
         purpose=purpose,
     )
     return family.source(loaded)
+
+
+def _choose_hub_options(name: str, revision: str) -> dict[str, Any]:
+    """Return arguments of the functions of transformers that read from the hub.
+
+    Only files on this machine are read if the hub does not respond: its client would
+    try each file for half a minute.
+
+    Args:
+        name: name of the repository or directory.
+        revision: revision of the repository; "" for its default.
+    """
+    hub_options: dict[str, Any] = {"revision": revision} if revision else {}
+    if not Path(name).is_dir() and _is_hub_unreachable(name):
+        hub_options["local_files_only"] = True
+    return hub_options
 
 
 def _resolve_name(name: str, spec: str) -> str:
@@ -187,14 +209,8 @@ def find_transformers_source(
         # The repository or directory may not exist any more.
         with suppress(errors.ModelError), report_library_errors(spec, advice=""):
             processor = load_processor(transformers, origin, hub_options)
-    loaded = LoadedNetwork(
-        network=network,
-        name=spec,
-        spec=spec,
-        processor=processor,
-        load_component=partial(_load_part, transformers, spec, origin, hub_options),
-        purpose=purpose,
-    )
+    load_component = partial(_load_part, transformers, spec, origin, hub_options)
+    loaded = LoadedNetwork(network, spec, spec, processor, load_component, purpose)
     return family.source(loaded)
 
 
@@ -234,11 +250,7 @@ def _find_family(architecture: str, network: Any, spec: str) -> Family:
         ModelError: it belongs to no family.
     """
     for family in NETWORKS:
-        if isinstance(family.matches, str):
-            matches = bool(re.search(family.matches, architecture))
-        else:
-            matches = family.matches(architecture, network)
-        if matches:
+        if family.includes(architecture, network):
             return family
     raise errors.ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has "
@@ -268,11 +280,7 @@ def _load_config(
     find_file = partial(find_cached_file, transformers, name, hub_options=hub_options)
     try:
         if not find_file("config.json") and find_file("open_clip_config.json"):
-            raise errors.ModelError(
-                f"model {spec}: is a repository of open_clip, which transformers can't "
-                "read; give the network as transformers has it, such as "
-                "hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
-            )
+            raise _make_open_clip_error(spec)
         config: Mapping[str, Any] = transformers.PretrainedConfig.get_config_dict(
             name, **hub_options
         )[0]
@@ -280,19 +288,39 @@ def _load_config(
     except OSError as error:
         if Path(name).is_dir():
             raise  # the error of the library says what is wrong with the directory
-        cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
-        # names of repositories: "OWNER/NAME" is stored as "models--OWNER--NAME"
-        cached = [
-            folder.name.partition("--")[2].replace("--", "/")
-            for folder in cache.glob("models--*")
-        ]
-        raise errors.ModelError(
-            f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
-            "repository of that name is in the "
-            f"cache{_format_suggestions(models.find_similar_names(name, cached))} or "
-            f"can be downloaded ({models.get_first_line(error)}). Check the name and "
-            "the connection, or give a folder"
-        ) from error
+        raise _make_missing_error(name, spec, error) from error
+
+
+def _make_open_clip_error(spec: str) -> errors.ModelError:
+    """Return the error of a repository of open_clip."""
+    return errors.ModelError(
+        f"model {spec}: is a repository of open_clip, which transformers can't "
+        "read; give the network as transformers has it, such as "
+        "hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
+    )
+
+
+def _make_missing_error(name: str, spec: str, error: OSError) -> errors.ModelError:
+    """Return the error for a repository that cannot be found.
+
+    Args:
+        name: name of the repository.
+        spec: what the user wrote.
+        error: error of the library.
+    """
+    cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
+    # names of repositories: "OWNER/NAME" is stored as "models--OWNER--NAME"
+    cached = [
+        folder.name.partition("--")[2].replace("--", "/")
+        for folder in cache.glob("models--*")
+    ]
+    return errors.ModelError(
+        f"model {spec}: {name} is no folder here{_suggest_folders(name)}, and no "
+        "repository of that name is in the "
+        f"cache{_format_suggestions(models.find_similar_names(name, cached))} or "
+        f"can be downloaded ({models.get_first_line(error)}). Check the name and "
+        "the connection, or give a folder"
+    )
 
 
 def _is_hub_unreachable(name: str) -> bool:
@@ -509,23 +537,29 @@ def check_fits(
     free = _read_free_memory()
     if free is None:
         return
-    size = 0
-    index = find_cached_file(
-        transformers, name, "model.safetensors.index.json", hub_options
-    )
-    if index:  # the index of weights that are stored in several files
-        metadata = json.loads(Path(index).read_text(encoding="utf-8"))
-        size = int(metadata.get("metadata", {}).get("total_size", 0))
-    else:
-        weights = find_cached_file(transformers, name, "model.safetensors", hub_options)
-        if weights:
-            size = Path(weights).stat().st_size
+    size = _measure_weights(transformers, name, hub_options)
     if size > free:
         raise errors.ModelError(
             f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} "
             "GB of memory are free. Give a smaller network, one whose weights are "
             "stored in bfloat16, or a machine with more memory"
         )
+
+
+def _measure_weights(
+    transformers: Any, name: str, hub_options: Mapping[str, Any]
+) -> int:
+    """Return the size in bytes of the weights of a repository; 0 if it is unknown.
+
+    The arguments are those of `check_fits`.
+    """
+    find_file = partial(find_cached_file, transformers, name, hub_options=hub_options)
+    index = find_file("model.safetensors.index.json")
+    if index:  # the index of weights that are stored in several files
+        metadata = json.loads(Path(index).read_text(encoding="utf-8"))
+        return int(metadata.get("metadata", {}).get("total_size", 0))
+    weights = find_file("model.safetensors")
+    return Path(weights).stat().st_size if weights else 0
 
 
 def _read_free_memory() -> int | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -158,13 +159,7 @@ def _tokenize(
         int(network.config.text_config.max_position_embeddings),
         int(tokenizer.model_max_length),
     )
-    tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
-    for text, tokens in zip(texts, tokens_of_texts, strict=True):
-        if len(tokens) > max_tokens:
-            raise InputError(
-                f"prompt: expected texts of at most {max_tokens} tokens, got "
-                f"{len(tokens)}: {text[:80]!r}"
-            )
+    _check_text_lengths(tokenizer, texts, max_tokens)
     is_siglip = hasattr(network, "logit_bias")
     inputs = tokenizer(
         list(texts),
@@ -174,11 +169,19 @@ def _tokenize(
         return_tensors="pt",
     )
     parameters = inspect.signature(network.forward).parameters
-    return {
-        key: value.to(network.device)
-        for key, value in inputs.items()
-        if key in parameters
-    }
+    used_inputs = {key: value for key, value in inputs.items() if key in parameters}
+    return {key: value.to(network.device) for key, value in used_inputs.items()}
+
+
+def _check_text_lengths(tokenizer: Any, texts: Sequence[str], max_tokens: int) -> None:
+    """Raise InputError if one of several texts has too many tokens."""
+    tokens_of_texts = tokenizer(list(texts), verbose=False)["input_ids"]
+    for text, tokens in zip(texts, tokens_of_texts, strict=True):
+        if len(tokens) > max_tokens:
+            raise InputError(
+                f"prompt: expected texts of at most {max_tokens} tokens, got "
+                f"{len(tokens)}: {text[:80]!r}"
+            )
 
 
 def embed_words(
@@ -195,15 +198,20 @@ def embed_words(
     embeddings_of_prompts = []
     for prompt in prompts:
         texts = [prompt.replace("{}", word) for word in words]
-        batches = []
-        for begin in range(0, len(texts), TEXT_BATCH_SIZE):
-            batch = texts[begin : begin + TEXT_BATCH_SIZE]
-            inputs = _tokenize(network, tokenizer, batch)
-            batches.append(_get_features(network.get_text_features(**inputs)))
-        embeddings = functional.normalize(torch.cat(batches), dim=-1)
-        embeddings_of_prompts.append(embeddings)
+        features = _embed_texts(network, tokenizer, texts)
+        embeddings_of_prompts.append(functional.normalize(features, dim=-1))
     mean = torch.stack(embeddings_of_prompts).mean(dim=0)
     return functional.normalize(mean, dim=-1)
+
+
+def _embed_texts(network: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
+    """Return the features (texts, D) of texts, a batch at a time."""
+    batches = []
+    for begin in range(0, len(texts), TEXT_BATCH_SIZE):
+        batch = texts[begin : begin + TEXT_BATCH_SIZE]
+        inputs = _tokenize(network, tokenizer, batch)
+        batches.append(_get_features(network.get_text_features(**inputs)))
+    return torch.cat(batches)
 
 
 def _get_features(returned: Any) -> Tensor:
@@ -262,18 +270,15 @@ def _check_scores(
     Raises:
         ModelError: the scores differ.
     """
-    shape = (1, 3, *(source.input_size or (224, 224)))
-    noise = torch.rand(shape, generator=torch.Generator().manual_seed(0))
-    noise = noise.to(network.device, network.dtype)
+    noise = _sample_noise_image(network, source.input_size or (224, 224))
     inputs = _tokenize(network, tokenizer, [text])
     expected = network(**inputs, pixel_values=noise).logits_per_image.float()
     # The rows of the head are embeddings of length 1, multiplied by the scale of
     # cosines.
     scale = classifier.head.weight.norm(dim=-1).max()
     # With the prompt "{}" the text is used as it is.
-    embedding = scale * embed_words(network, tokenizer, [text], ["{}"])
-    bias = classifier.head.bias[0]  # the same for all names
-    computed = classifier.embed_images(noise) @ embedding.T + bias
+    embedding = embed_words(network, tokenizer, [text], ["{}"])
+    computed = _compute_score(classifier, noise, scale * embedding)
     # Scores are scaled cosines, whose rounding errors are in proportion to the scale.
     magnitude = max(float(scale), float(expected.abs().max()))
     are_equal = expected.shape == computed.shape and are_nearly_equal(
@@ -285,6 +290,26 @@ def _check_scores(
             "scaled cosine of a picture and a "
             "text; expected one such as CLIPModel or SiglipModel"
         )
+
+
+def _sample_noise_image(network: Any, size: tuple[int, int]) -> Tensor:
+    """Return an image (1, 3, height, width) of uniform noise for a network.
+
+    Args:
+        network: states the device and the dtype.
+        size: (height, width) in pixels.
+    """
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.rand((1, 3, *size), generator=generator)
+    return noise.to(network.device, network.dtype)
+
+
+def _compute_score(
+    classifier: _CosineClassifier, image: Tensor, embedding: Tensor
+) -> Tensor:
+    """Return the score (1, 1) of an image (1, 3, H, W) for a scaled embedding (1, D)."""
+    bias = classifier.head.bias[0]  # the same for all names
+    return classifier.embed_images(image) @ embedding.T + bias
 
 
 def warn_of_equal_texts(
@@ -326,26 +351,22 @@ def make_detector_source(loaded: LoadedNetwork) -> models.Source:
 
     Its network is one of `DETECTORS`.
     """
+    name = loaded.name
     names = loaded.purpose.require_names(
-        loaded.name, "finds objects by their names", "detection"
+        name, "finds objects by their names", "detection"
     )
     tokenizer = loaded.load_component("AutoTokenizer")
     words = get_spoken_names(names)
     with (
-        models.translate_errors(
-            f"model {loaded.name}: cannot read the names of `labels`"
-        ),
+        models.translate_errors(f"model {name}: cannot read the names of `labels`"),
         torch.no_grad(),
     ):
         network: Any = models.copy_sharing_weights(loaded.network).eval()
         build_detector = DETECTORS[type(network).__name__]
         run_network = build_detector(loaded, network, tokenizer, words)
-    warn_of_equal_texts(tokenizer, words, names, loaded.name)
-    return loaded.make_text_source(
-        AdaptedNetwork(network, run_network, returns_pixel_boxes=True),
-        names,
-        network.dtype,
-    )
+    warn_of_equal_texts(tokenizer, words, names, name)
+    module = AdaptedNetwork(network, run_network, returns_pixel_boxes=True)
+    return loaded.make_text_source(module, names, network.dtype)
 
 
 def _build_owl(
@@ -363,18 +384,24 @@ def _build_owl(
     embeddings = embed_words(base_model, tokenizer, words, prompts).to(network.dtype)
     base_model.text_model = None
     base_model.text_projection = None
+    return partial(_run_owl, embeddings)
 
-    def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return boxes and scores for images (N, 3, H, W)."""
-        features = network.image_embedder(pixel_values=images)[0]
-        patches = features.flatten(1, 2)
-        queries = embeddings.to(patches).expand(len(images), -1, -1)
-        # It also returns embeddings of the patches, which are not needed.
-        logits, _embeddings = network.class_predictor(patches, queries)
-        boxes = network.box_predictor(patches, features)
-        return to_pixel_corners(boxes, images), logits.sigmoid()
 
-    return run_network
+def _run_owl(embeddings: Tensor, network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Return boxes and scores of OWL-ViT for images (N, 3, H, W).
+
+    Args:
+        embeddings: (names, D) features of the names.
+        network: the network without its text encoder.
+        images: (N, 3, H, W).
+    """
+    features = network.image_embedder(pixel_values=images)[0]
+    patches = features.flatten(1, 2)
+    queries = embeddings.to(patches).expand(len(images), -1, -1)
+    # It also returns embeddings of the patches, which are not needed.
+    logits, _embeddings = network.class_predictor(patches, queries)
+    boxes = network.box_predictor(patches, features)
+    return to_pixel_corners(boxes, images), logits.sigmoid()
 
 
 def _build_grounding_dino(
@@ -390,23 +417,13 @@ def _build_grounding_dino(
         InputError: there are several prompts, the text is too long, or a name has a
             full stop in it.
     """
-    name = loaded.name
-    prompt, *other_prompts = models.get_patterns(loaded.purpose.prompts or ("{}",))
-    if other_prompts:
-        raise InputError(
-            f"prompt: model {name} reads all names in one text, in which several "
-            "prompts can't be averaged; give one, or none for the names alone"
-        )
+    prompt = _choose_prompt(loaded)
     text = ". ".join(prompt.replace("{}", word).strip().lower() for word in words) + "."
     tokens = torch.tensor(
         tokenizer(text, verbose=False)["input_ids"], device=network.device
     )
-    max_tokens = network.config.max_text_len
-    if len(tokens) > max_tokens:
-        raise InputError(
-            f"labels: model {name} reads a text of at most {max_tokens} tokens, and "
-            f"the names take {len(tokens)}; give fewer"
-        )
+    name = loaded.name
+    _check_token_count(len(tokens), network.config.max_text_len, name)
     # (names, longest name) indices of the tokens of each name. The full stop between
     # names is one of the special tokens, so that each run of other tokens is a name.
     token_index = _find_token_runs(tokens, network.model.special_tokens)
@@ -416,16 +433,47 @@ def _build_grounding_dino(
             f"them, in which it finds {len(token_index)} names instead of {len(words)}; "
             "leave . and ? out of names and prompt"
         )
+    return partial(_run_grounding_dino, tokens, token_index)
 
-    def run_network(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return boxes and scores for images (N, 3, H, W)."""
-        returned = network(
-            pixel_values=images, input_ids=tokens.expand(len(images), -1)
+
+def _check_token_count(count: int, max_tokens: int, name: str) -> None:
+    """Raise InputError if names take more tokens than a model reads."""
+    if count > max_tokens:
+        raise InputError(
+            f"labels: model {name} reads a text of at most {max_tokens} tokens, and "
+            f"the names take {count}; give fewer"
         )
-        name_logits = returned.logits[..., token_index].amax(dim=-1)
-        return to_pixel_corners(returned.pred_boxes, images), name_logits.sigmoid()
 
-    return run_network
+
+def _choose_prompt(loaded: LoadedNetwork) -> str:
+    """Return the prompt of a network that reads all names in one text.
+
+    Raises:
+        InputError: there are several.
+    """
+    prompt, *other_prompts = models.get_patterns(loaded.purpose.prompts or ("{}",))
+    if other_prompts:
+        raise InputError(
+            f"prompt: model {loaded.name} reads all names in one text, in which several "
+            "prompts can't be averaged; give one, or none for the names alone"
+        )
+    return prompt
+
+
+def _run_grounding_dino(
+    tokens: Tensor, token_index: Tensor, network: Any, images: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return boxes and scores of Grounding DINO for images (N, 3, H, W).
+
+    Args:
+        tokens: (L,) tokens of the text with all names.
+        token_index: (names, longest name) indices of the tokens of each name.
+        network: the network.
+        images: (N, 3, H, W).
+    """
+    returned = network(pixel_values=images, input_ids=tokens.expand(len(images), -1))
+    name_logits = returned.logits[..., token_index].amax(dim=-1)
+    return to_pixel_corners(returned.pred_boxes, images), name_logits.sigmoid()
 
 
 def _find_token_runs(tokens: Tensor, separators: Any) -> Tensor:
