@@ -595,7 +595,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
         objects.make_shapes(adversarial),
         objects.make_shapes(clean),
         to_world,
-        objects.describe(),
+        objects.describe_simplified(),
     )
     write_bytes(run.path / OBJECT_FILE, glb)
 
@@ -637,7 +637,7 @@ class _SimplifiedObjects:
             near_shapes.append(shape)
         return near_shapes
 
-    def describe(self) -> str:
+    def describe_simplified(self) -> str:
         """Return the note on meshes that have fewer faces in the file; empty if none."""
         full_counts = [
             f"{len(mesh.mesh.faces):,} of {mesh.name}"
