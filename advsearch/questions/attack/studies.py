@@ -12,7 +12,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -131,26 +131,34 @@ def _curve_chains(config: AttackConfig) -> list[Chain]:
     """Return the attacks of each object, with the smallest epsilon first."""
     # None if there is no list of epsilons: then `config.epsilon` stays as it is.
     epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
-    chains: list[Chain] = []
-    for index, name in enumerate(check_distinct(config.objects, "object")):
-        chain: Chain = []
-        for epsilon in epsilons:
-            name_parts = []
-            if epsilon is not None:
-                name_parts = [f"epsilon {epsilon:g}".replace(".", "_")]
-            attack_config = AttackConfig.from_config(
-                config,
-                object=name,
-                epsilon=config.epsilon if epsilon is None else epsilon,
-            )
-            directory = f"{index:02d}-" + make_default_name(name, name_parts)
-            chain.append(
-                StudyAttack(
-                    attack_config, directory, object_or_model=name, epsilon=epsilon
-                )
-            )
-        chains.append(chain)
-    return chains
+    names = check_distinct(config.objects, "object")
+    return [
+        [_make_curve_attack(config, index, name, epsilon) for epsilon in epsilons]
+        for index, name in enumerate(names)
+    ]
+
+
+def _make_curve_attack(
+    config: AttackConfig, index: int, name: str, epsilon: float | None
+) -> StudyAttack:
+    """Return the attack on an object with an epsilon.
+
+    Args:
+        config: settings of the study.
+        index: index of the object among all objects.
+        name: name of the object.
+        epsilon: the epsilon; None for that of the settings.
+    """
+    name_parts = []
+    if epsilon is not None:
+        name_parts = [f"epsilon {epsilon:g}".replace(".", "_")]
+    attack_config = AttackConfig.from_config(
+        config,
+        object=name,
+        epsilon=config.epsilon if epsilon is None else epsilon,
+    )
+    directory = f"{index:02d}-" + make_default_name(name, name_parts)
+    return StudyAttack(attack_config, directory, object_or_model=name, epsilon=epsilon)
 
 
 def make_chain_worker(settings: JsonObject) -> BatchFunction:
@@ -163,26 +171,30 @@ def make_chain_worker(settings: JsonObject) -> BatchFunction:
     Args:
         settings: settings of the study.
     """
-    chains = make_chains(AttackConfig(**settings))
+    return partial(_run_chain, make_chains(AttackConfig(**settings)))
 
-    def run_chain(batch: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
-        """Make the attacks of the chain whose index is the only item of the batch."""
-        finished = []
-        clean = CleanMatrix()  # shared by the attacks, which have the same clean scene
-        (chain_index,) = batch
-        with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
-            for study_attack in chains[chain_index]:
-                path = Path(directory) / study_attack.name
-                config = study_attack.config.model_copy(
-                    update={"run": str(path), "overwrite": True}
-                )
-                ending = attack_once(config, clean=clean).summary.ending
-                finished.append((study_attack.name, str(path), _read_files(path)))
-                if ending in SETTLED:
-                    break  # the attacks with larger epsilons are not needed
-        return finished
 
-    return run_chain
+def _run_chain(
+    chains: Sequence[Chain], batch: Sequence[int]
+) -> list[tuple[str, str, dict[str, bytes]]]:
+    """Make the attacks of the chain whose index is the only item of a batch.
+
+    See `make_chain_worker` for what is returned.
+    """
+    finished = []
+    clean = CleanMatrix()  # shared by the attacks, which have the same clean scene
+    (chain_index,) = batch
+    with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
+        for study_attack in chains[chain_index]:
+            path = Path(directory) / study_attack.name
+            config = study_attack.config.model_copy(
+                update={"run": str(path), "overwrite": True}
+            )
+            ending = attack_once(config, clean=clean).summary.ending
+            finished.append((study_attack.name, str(path), _read_files(path)))
+            if ending in SETTLED:
+                break  # the attacks with larger epsilons are not needed
+    return finished
 
 
 def _read_files(directory: Path) -> dict[str, bytes]:
@@ -216,17 +228,8 @@ def distribute_attacks(
         for index, chain in enumerate(chains)
         if not any(is_run(run / PARTS / attack.name) for attack in chain)
     ]
-    in_process = {"workers": None, "cluster": None}  # workers start no workers
-    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
-    work = WorkerTask(
-        "advsearch.questions.attack.studies:make_chain_worker",
-        worker_settings,
-        path_setting_names=FILES,
-        threads=config.n_used_threads or 1,
-        min_timeout_seconds=MAX_ATTACK_SECONDS,
-    )
     with open_workers(
-        work,
+        _make_study_task(config),
         # without work no workers are started
         workers=config.workers if missing_chains else None,
         cluster=config.cluster if missing_chains else None,
@@ -244,6 +247,19 @@ def distribute_attacks(
             stats = executor.stats
             worker_counts = {} if stats is None else {"workers": stats.workers}
             progress.advance(1, **worker_counts)
+
+
+def _make_study_task(config: AttackConfig) -> WorkerTask:
+    """Return how workers make the attacks of a study from its settings."""
+    in_process = {"workers": None, "cluster": None}  # workers start no workers
+    worker_settings = config.make_repeatable().model_copy(update=in_process).to_json()
+    return WorkerTask(
+        "advsearch.questions.attack.studies:make_chain_worker",
+        worker_settings,
+        path_setting_names=FILES,
+        threads=config.n_used_threads or 1,
+        min_timeout_seconds=MAX_ATTACK_SECONDS,
+    )
 
 
 def _check_not_lost(chains: Sequence[Chain], result: BatchResult) -> None:
@@ -341,9 +357,19 @@ class StudyRun:
         """
         if self.interrupted:
             return None
-        config = attack.config
-        path = self.run.path / PARTS / attack.name
         self.names.append(attack.name)
+        self._report_attack(attack.config)
+        summary = self._make_or_read(attack, clean)
+        self.warnings += [
+            text for text in summary.warnings if text not in self.warnings
+        ]
+        if summary.ending == INTERRUPTED:
+            self.context.ending = INTERRUPTED  # the study is interrupted, too
+            return None
+        return summary
+
+    def _report_attack(self, config: AttackConfig) -> None:
+        """Report which attack is made now."""
         # None and a mapping by control are not reported.
         budget = ""
         if isinstance(config.epsilon, float):
@@ -354,23 +380,23 @@ class StudyRun:
             f"{config.model}, {' and '.join(config.controls)}{budget}"
         )
 
+    def _make_or_read(
+        self, attack: StudyAttack, clean: CleanMatrix | None
+    ) -> AttackSummary:
+        """Make an attack, or read its result if it is done; see `run_attack`."""
+        path = self.run.path / PARTS / attack.name
+
         def attack_with_matrix(
             part_config: AttackConfig, **options: Any
         ) -> AttackSummary:
             """Make the attack with the shared matrix, and return its result."""
             return attack_once(part_config, clean=clean, **options).summary
 
-        summary = run_part(path, config, self.progress, attack_with_matrix)
+        summary = run_part(path, attack.config, self.progress, attack_with_matrix)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(
                 f"{path}: expected the run of an attack, got one of {summary.command}"
             )
-        self.warnings += [
-            text for text in summary.warnings if text not in self.warnings
-        ]
-        if summary.ending == INTERRUPTED:
-            self.context.ending = INTERRUPTED  # the study is interrupted, too
-            return None
         return summary
 
     def make_result(self, kind: type[ResultType], **fields: Any) -> ResultType:
@@ -436,28 +462,41 @@ def _attack_object(study: StudyRun, chain: Chain) -> ObjectRow:
         if summary is None:  # interrupted
             break
         renders.update(summary.renders)
-        # Without an epsilon of the curve, each control has its own, which may be a
-        # mapping by control.
-        epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
-        margin = None
-        if summary.verified is not None:
-            margin = summary.verified.margin
-        row = ObjectRow(
-            object=attack.object_or_model,
-            clean=summary.clean.control,
-            ending=summary.ending,
-            epsilon=epsilon,
-            flips_at=epsilon if summary.ending == "found" else None,
-            verified=summary.verified,
-            margin=margin,
-            run=summary.run,
-            tried=attack.epsilon,  # the epsilon of the curve only
-            average=summary.average,
-            renders=dict(renders),
-        )
+        row = _make_object_row(attack, summary, renders)
         if row.ending in SETTLED:
             break
     return row
+
+
+def _make_object_row(
+    attack: StudyAttack, summary: AttackSummary, renders: Mapping[str, int]
+) -> ObjectRow:
+    """Return the row of an object after an attack.
+
+    Args:
+        attack: the attack.
+        summary: its result.
+        renders: renders of all attacks on the object so far, by what they are for.
+    """
+    # Without an epsilon of the curve, each control has its own, which may be a mapping
+    # by control.
+    epsilon = summary.epsilon if attack.epsilon is None else attack.epsilon
+    margin = None
+    if summary.verified is not None:
+        margin = summary.verified.margin
+    return ObjectRow(
+        object=attack.object_or_model,
+        clean=summary.clean.control,
+        ending=summary.ending,
+        epsilon=epsilon,
+        flips_at=epsilon if summary.ending == "found" else None,
+        verified=summary.verified,
+        margin=margin,
+        run=summary.run,
+        tried=attack.epsilon,  # the epsilon of the curve only
+        average=summary.average,
+        renders=dict(renders),
+    )
 
 
 def _is_known(row: ObjectRow, epsilon: float | None) -> bool:
@@ -500,19 +539,14 @@ def _compute_accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> Curve
     n_wrong = sum(row.ending == "already wrong" for row in known)
     n_found = sum(_has_flipped(row, epsilon) for row in known)
     n_robust = n_objects - n_wrong - n_found
-    accuracy = None
-    interval = (0.0, 1.0)
-    if known:
-        accuracy = n_robust / n_objects
-        interval = clopper_pearson(n_robust, n_objects)
     return CurvePoint(
         epsilon=epsilon,
         objects=n_objects,
         robust=n_robust,
         found=n_found,
         already_wrong=n_wrong,
-        accuracy=accuracy,
-        interval=interval,
+        accuracy=n_robust / n_objects if known else None,
+        interval=clopper_pearson(n_robust, n_objects) if known else (0.0, 1.0),
     )
 
 
@@ -555,11 +589,7 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
         check_from_config(_with_model(config, name))  # raises before any attack
 
     study = StudyRun(context)
-    attacked = dict[str, AttackSummary]()
-    for (attack,) in study.chains:  # a chain of a matrix is a single attack
-        summary = study.run_attack(attack)
-        if summary is not None:  # None: not made, after an interrupt
-            attacked[attack.object_or_model] = summary
+    attacked = _attack_models(study)
     # `_try_on_models` fills these: an interrupt leaves what was done before it
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
@@ -568,7 +598,30 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
         spp = config.verify_spp or _choose_trial_spp(attacked.values())
         with context.until_interrupted():
             _try_on_models(study, names, spp, configurations, models, cells)
-    rows = [
+    return study.make_result(
+        MatrixResult,
+        models=list(names),
+        ensemble=config.ensemble,
+        tested=models,
+        table=_list_matrix_rows(attacked, cells),
+    )
+
+
+def _attack_models(study: StudyRun) -> dict[str, AttackSummary]:
+    """Make the attacks of a matrix, and return their results by the attacked model."""
+    attacked = dict[str, AttackSummary]()
+    for (attack,) in study.chains:  # a chain of a matrix is a single attack
+        summary = study.run_attack(attack)
+        if summary is not None:  # None: not made, after an interrupt
+            attacked[attack.object_or_model] = summary
+    return attacked
+
+
+def _list_matrix_rows(
+    attacked: Mapping[str, AttackSummary], cells: Mapping[str, list[MatrixCell]]
+) -> list[MatrixRow]:
+    """Return the row of each attack, with its cells; both are by the attacked model."""
+    return [
         MatrixRow(
             attacked=name,
             ending=summary.ending,
@@ -578,13 +631,6 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
         )
         for name, summary in attacked.items()
     ]
-    return study.make_result(
-        MatrixResult,
-        models=list(names),
-        ensemble=config.ensemble,
-        tested=models,
-        table=rows,
-    )
 
 
 def _read_configurations(attacked: Mapping[str, AttackSummary]) -> dict[str, Tensor]:
@@ -639,19 +685,23 @@ def _try_on_models(
             seed=seeds.derive_seed(config.seed, "matrix"),
             executor=executor,
         )
-        n_predictions = config.trial_count * len(names)
-        hint = f"{n_predictions} predictions; `trials` or `verify_spp` shorten it"
-        title = "trying the clean scene on every model"
-        study.progress.stage(title, n_predictions, hint=hint)
+        _begin_trials(study, "trying the clean scene on every model", len(names))
         for condition in conditions:
             models.append(_try_clean(retrials, condition))
         for name, u in configurations.items():
             title = f"trying the scene against {name} on every model"
-            study.progress.stage(title, n_predictions, hint=hint)
+            _begin_trials(study, title, len(names))
             cells[name] = [
                 _try_adversarial(retrials, name, u, condition)
                 for condition in conditions
             ]
+
+
+def _begin_trials(study: StudyRun, title: str, n_models: int) -> None:
+    """Report that a scene is tried on all models."""
+    n_predictions = study.context.config.trial_count * n_models
+    hint = f"{n_predictions} predictions; `trials` or `verify_spp` shorten it"
+    study.progress.stage(title, n_predictions, hint=hint)
 
 
 def _make_conditions(
