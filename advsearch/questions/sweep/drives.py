@@ -343,7 +343,7 @@ class Drives:
         first_distance = _first_right_distance(drives)
         # Only drives with a right frame have a distance of first detection.
         has_right = np.asarray((outcomes == RIGHT).any(axis=1))
-        draw_of_drive = self._find_draws(drives)
+        draw_of_drive = self._find_draw_of_drives(drives)
         n_drives = len(np.unique(draw_of_drive))
         n_right_drives = len(np.unique(draw_of_drive[has_right]))
         # The largest values that are possible: every frame is wrong, and the prediction
@@ -376,7 +376,7 @@ class Drives:
             per_drive=self._describe_drives(drives, first_distance),
         )
 
-    def _find_draws(self, drives: _CompleteDrives) -> npt.NDArray[np.int64]:
+    def _find_draw_of_drives(self, drives: _CompleteDrives) -> npt.NDArray[np.int64]:
         """Return the draw (n,) of each drive.
 
         Drives of one draw differ only in noise and count as one. All frames of a drive

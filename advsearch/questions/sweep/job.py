@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TypeAlias
@@ -170,15 +170,18 @@ class Job:
         """
         if scene not in self._points_by_scene:
             self._points_by_scene.clear()
-            named_scene = self.scenes[scene]
-            sizes = dict.fromkeys(self.image_sizes)
             self._points_by_scene[scene] = {
-                size: self.make_scene_configurations(
-                    self.bind_controls(named_scene, size)
-                )
-                for size in sizes
+                size: self._make_configurations_of_size(scene, size)
+                for size in dict.fromkeys(self.image_sizes)
             }
         return self._points_by_scene[scene]
+
+    def _make_configurations_of_size(
+        self, scene: int, size: ImageSize
+    ) -> SceneConfigurations:
+        """Return the configurations of a scene for one size of images."""
+        space = self.bind_controls(self.scenes[scene], size)
+        return self.make_scene_configurations(space)
 
     def make_queries(self, numbers: range) -> list[WorkItem]:
         """Return the queries of all models about images of one scene.
@@ -303,16 +306,7 @@ class Job:
         space = make_space(controls, description)
         if named_scene.fixed_controls:
             space = _fix_controls(named_scene, space)
-        # What the user fixed with `set` must not be sampled, except for the
-        # environment, for which `check_scenes` has other rules.
-        set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
-        for group in space.groups:
-            if group.setting in set_by_user:
-                raise InputError(
-                    f"`controls` {group.control}: draws {group.parameter} by chance, "
-                    f"and `set` {group.setting} fixes it; leave it out of one of the "
-                    "two"
-                )
+        _check_not_set(named_scene, space)
         return space
 
     def make_scene_configurations(self, space: Space) -> SceneConfigurations:
@@ -385,6 +379,25 @@ def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     return space.fix_first_controls(named_scene.adversarial_configuration)
 
 
+def _check_not_set(named_scene: NamedScene, space: Space) -> None:
+    """Raise an error if a sampled parameter is fixed with `set`.
+
+    Args:
+        named_scene: the scene.
+        space: space of what is sampled.
+    """
+    # What the user fixed with `set` must not be sampled, except for the environment, for
+    # which `check_scenes` has other rules.
+    set_by_user = named_scene.scene.description.requested - {ENVIRONMENT}
+    for group in space.groups:
+        if group.setting in set_by_user:
+            raise InputError(
+                f"`controls` {group.control}: draws {group.parameter} by chance, "
+                f"and `set` {group.setting} fixes it; leave it out of one of the "
+                "two"
+            )
+
+
 def check_scenes(
     named_scenes: Sequence[NamedScene],
     controls: Sequence[Control],
@@ -401,24 +414,8 @@ def check_scenes(
         InputError: an axis varies what `set` fixes, or an axis or a control chooses the
             environment although several environments are named.
     """
-    # settings that the user has fixed in any scene with `set`
-    fixed_settings = {
-        name
-        for named_scene in named_scenes
-        for name in named_scene.scene.description.requested
-    }
     # the axes and controls that choose the environment, as the user wrote them
-    environment_choices = list[str]()
-    for axis in axes:
-        setting = _find_setting(axis, controls)
-        # If `set` fixes the environment, an axis may still choose it.
-        if setting == ENVIRONMENT:
-            environment_choices.append(f"`grid` {axis.name}")
-        elif setting in fixed_settings:
-            raise InputError(
-                f"`grid` {axis.name}: `set` fixes it already; leave it "
-                "out of one of the two"
-            )
+    environment_choices = _list_environment_axes(named_scenes, controls, axes)
     for control in controls:
         for parameter in control.parameters:
             # A control's settings contain the parameters that it varies.
@@ -434,6 +431,38 @@ def check_scenes(
             "choose what lights the scene; name all of "
             "them in one of the two, and leave the other out"
         )
+
+
+def _list_environment_axes(
+    named_scenes: Sequence[NamedScene],
+    controls: Sequence[Control],
+    axes: Sequence[Axis],
+) -> list[str]:
+    """Return the axes that choose the environment, as the user wrote them.
+
+    See `check_scenes` for the arguments.
+
+    Raises:
+        InputError: an axis varies what `set` fixes.
+    """
+    # settings that the user has fixed in any scene with `set`
+    fixed_settings = {
+        name
+        for named_scene in named_scenes
+        for name in named_scene.scene.description.requested
+    }
+    environment_axes = list[str]()
+    for axis in axes:
+        setting = _find_setting(axis, controls)
+        # If `set` fixes the environment, an axis may still choose it.
+        if setting == ENVIRONMENT:
+            environment_axes.append(f"`grid` {axis.name}")
+        elif setting in fixed_settings:
+            raise InputError(
+                f"`grid` {axis.name}: `set` fixes it already; leave it "
+                "out of one of the two"
+            )
+    return environment_axes
 
 
 def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
@@ -469,18 +498,9 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
             (named_scene, configurations)
             for configurations in job.load_configurations_by_size(scene).values()
         ]
-        facts = job.make_ground_truth_facts(named_scene, {})
-        for task, model in zip(job.tasks, job.models, strict=True):
-            check_truth(
-                task, model, named_scene.scene, facts, job.config.image_settings
-            )
+        _check_truths(job, named_scene)
     _, first_configurations = pairs[0]
-    for named_scene, configurations in pairs:
-        if configurations.sampled_layout != first_configurations.sampled_layout:
-            raise InputError(
-                f"`object` {named_scene.object_name}: its controls draw other numbers than "
-                f"those of {job.scenes[0].object_name}; sweep the two by themselves"
-            )
+    _check_same_layout(pairs)
     # A number may have another range in another scene or size: it has a version in
     # each.
     numbers_of_pair = [configurations.sampled_numbers for _, configurations in pairs]
@@ -489,6 +509,24 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
         for versions in zip(*numbers_of_pair, strict=True)
     ]
     return first_configurations, tuple(sampled)
+
+
+def _check_truths(job: Job, named_scene: NamedScene) -> None:
+    """Check that each model of a sweep can be right about a scene."""
+    facts = job.make_ground_truth_facts(named_scene, {})
+    for task, model in zip(job.tasks, job.models, strict=True):
+        check_truth(task, model, named_scene.scene, facts, job.config.image_settings)
+
+
+def _check_same_layout(pairs: Sequence[tuple[NamedScene, SceneConfigurations]]) -> None:
+    """Raise an error if controls sample other numbers in one scene than in another."""
+    first_scene, first_configurations = pairs[0]
+    for named_scene, configurations in pairs:
+        if configurations.sampled_layout != first_configurations.sampled_layout:
+            raise InputError(
+                f"`object` {named_scene.object_name}: its controls draw other numbers than "
+                f"those of {first_scene.object_name}; sweep the two by themselves"
+            )
 
 
 def _merge_versions(versions: Sequence[SampledNumber], n_parts: int) -> SampledNumber:
@@ -606,31 +644,21 @@ class SweptScene:
         """
         begin = time.perf_counter()
         not_finite_before = self.n_non_finite
-        n_models = len(self.job.models)
         images = {
             size: self._make_images(size, queries)
             for size in self.configurations_by_size
         }
         judgements = self._make_judgements(queries, images)
-        # queries are numbered by image, then by model
-        wrong_images = {
-            row_number // n_models
-            for row_number, judgement in judgements.items()
-            if not judgement.right
-        }
         # Queries are evaluated together, so each gets an equal part of the time.
         seconds = (time.perf_counter() - begin) / len(queries)
-        evaluations = self._make_evaluations(
-            queries, images, judgements, seconds, wrong_images
-        )
+        evaluations = self._make_evaluations(queries, images, judgements, seconds)
         # A predictor that was released since is no longer counted, so that the
         # difference could be negative.
         n_new_non_finite = max(0, self.n_non_finite - not_finite_before)
+        predictors = self.predictor_of_size.values()
         evaluations[-1] = replace(
             evaluations[-1],
-            collected_light=[
-                predictor.summarize() for predictor in self.predictor_of_size.values()
-            ],
+            collected_light=[predictor.summarize() for predictor in predictors],
             n_non_finite=n_new_non_finite,
         )
         return evaluations
@@ -641,7 +669,6 @@ class SweptScene:
         images: Mapping[ImageSize, Mapping[int, SweptImage]],
         judgements: Mapping[int, Judgement],
         seconds: float,
-        wrong_images: Collection[int],
     ) -> list[Evaluation]:
         """Return the evaluation of each query.
 
@@ -653,8 +680,8 @@ class SweptScene:
             images: images by size, then by the number of the image.
             judgements: judgements by the number of the query.
             seconds: seconds that each query took.
-            wrong_images: numbers of the images in which any model is wrong.
         """
+        wrong_images = self._find_wrong_images(judgements)
         evaluations = list[Evaluation]()
         for query in queries:
             number, model = divmod(query.row_index, len(self.job.models))
@@ -674,6 +701,20 @@ class SweptScene:
             evaluations.append(evaluation)
         return evaluations
 
+    def _find_wrong_images(self, judgements: Mapping[int, Judgement]) -> set[int]:
+        """Return the numbers of the images in which any model is wrong.
+
+        Args:
+            judgements: judgements by the number of the query.
+        """
+        n_models = len(self.job.models)
+        # queries are numbered by image, then by model
+        return {
+            row_number // n_models
+            for row_number, judgement in judgements.items()
+            if not judgement.right
+        }
+
     def _make_judgements(
         self,
         queries: Sequence[Query],
@@ -688,33 +729,42 @@ class SweptScene:
             queries: queries of all models.
             images: images by size, then by the number of the image.
         """
-        job = self.job
-        n_models = len(job.models)
+        n_models = len(self.job.models)
         judgement_of_query: dict[int, Judgement] = {}
-        for model, problem in enumerate(self.problems):  # one for each model
-            size = job.image_sizes[model]
+        for model in range(len(self.problems)):  # one for each model
             model_queries = [
                 query for query in queries if query.row_index % n_models == model
             ]
             if not model_queries:
                 continue
-            batch = torch.stack(
-                [
-                    images[size][query.row_index // n_models].image
-                    for query in model_queries
-                ]
-            )
-            judgements = problem.judge_images(
-                batch,
-                [query.u for query in model_queries],
-                [query.values for query in model_queries],
-            )
-            judgements = self._add_change_metrics(
-                problem, size, model_queries, batch, judgements
-            )
+            judgements = self._judge_model(model, model_queries, images)
             for query, judgement in zip(model_queries, judgements, strict=True):
                 judgement_of_query[query.row_index] = judgement
         return judgement_of_query
+
+    def _judge_model(
+        self,
+        model: int,
+        queries: Sequence[Query],
+        images: Mapping[ImageSize, Mapping[int, SweptImage]],
+    ) -> list[Judgement]:
+        """Return the judgements of the queries of one model.
+
+        Args:
+            model: index of the model.
+            queries: its queries.
+            images: images by size, then by the number of the image.
+        """
+        size = self.job.image_sizes[model]
+        problem = self.problems[model]
+        n_models = len(self.job.models)
+        batch = torch.stack(
+            [images[size][query.row_index // n_models].image for query in queries]
+        )
+        judgements = problem.judge_images(
+            batch, [query.u for query in queries], [query.values for query in queries]
+        )
+        return self._add_change_metrics(problem, size, queries, batch, judgements)
 
     def _attach_images(
         self, evaluation: Evaluation, query: Query, image: SweptImage, is_wrong: bool
@@ -736,13 +786,19 @@ class SweptScene:
             thumbnail = thumbnails.make_thumbnail(image.image)
             evaluation = replace(evaluation, jpeg=thumbnail)
         if job.aovs:
-            surfaces = self.renderer_of_size[job.image_sizes[0]].find_surfaces(query.u)
-            layers = {
-                name: layer.numpy()
-                for name, layer in surfaces.make_layers(job.aovs, OBJECT).items()
-            }
-            notes = surfaces.describe_layers(job.aovs)
-            evaluation = replace(evaluation, layers=(layers, notes))
+            evaluation = self._attach_layers(evaluation, query)
+        return evaluation
+
+    def _attach_layers(self, evaluation: Evaluation, query: Query) -> Evaluation:
+        """Return an evaluation of the first model with layers of ground truth."""
+        job = self.job
+        surfaces = self.renderer_of_size[job.image_sizes[0]].find_surfaces(query.u)
+        layers = {
+            name: layer.numpy()
+            for name, layer in surfaces.make_layers(job.aovs, OBJECT).items()
+        }
+        notes = surfaces.describe_layers(job.aovs)
+        evaluation = replace(evaluation, layers=(layers, notes))
         return evaluation
 
     def _add_change_metrics(
@@ -778,15 +834,10 @@ class SweptScene:
             changed_judgements = problem.judge_images(
                 changed_images, configurations, values
             )
-            for index, (before, after) in enumerate(
-                zip(judgements, changed_judgements, strict=True)
-            ):
-                is_met = meets_claim(claim, before.prediction, after.prediction)
-                metrics = {
-                    **(before.metrics or {}),
-                    f"{claim} {change}": float(is_met),
-                }
-                judgements[index] = replace(before, metrics=metrics)
+            judgements = [
+                _add_change_metric(claim, change, before, after)
+                for before, after in zip(judgements, changed_judgements, strict=True)
+            ]
         return judgements
 
     def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
@@ -825,20 +876,33 @@ class SweptScene:
             size: the size.
             queries: queries of all models, which are numbered by image, then by model.
         """
-        n_models = len(self.job.models)
         images_before = self.number * self.configurations_by_size[size].n_images
-        # The predictor numbers the images of this scene from 0. Queries of several
-        # models about an image differ in nothing that concerns the image.
-        query_of_image = {
-            query.row_index // n_models - images_before: query
-            for query in queries
-            if self.job.image_sizes[query.row_index % n_models] == size
-        }
+        query_of_image = self._find_query_of_image(size, queries, images_before)
         with torch.no_grad():
             images = self.predictor_of_size[size].make_images(query_of_image)
         return {
             images_before + number: replace(image, image=round_to_8_bit(image.image))
             for number, image in images.items()
+        }
+
+    def _find_query_of_image(
+        self, size: ImageSize, queries: Sequence[Query], images_before: int
+    ) -> dict[int, Query]:
+        """Return a query of each image of a size, by the number of the image.
+
+        The predictor numbers the images of this scene from 0. Queries of several models
+        about an image differ in nothing that concerns the image.
+
+        Args:
+            size: the size.
+            queries: queries of all models, which are numbered by image, then by model.
+            images_before: number of images in the scenes before this one.
+        """
+        n_models = len(self.job.models)
+        return {
+            query.row_index // n_models - images_before: query
+            for query in queries
+            if self.job.image_sizes[query.row_index % n_models] == size
         }
 
     def render_image(self, query: Query) -> Tensor:
@@ -911,6 +975,22 @@ def _change_images(images: Tensor, change: str, n_cameras: int) -> Tensor:
     return torch.stack([change_image(image, change, n_cameras) for image in images])
 
 
+def _add_change_metric(
+    claim: str, change: str, before: Judgement, after: Judgement
+) -> Judgement:
+    """Return a judgement with the metric of a claim about a changed image.
+
+    Args:
+        claim: the claim, such as "must_change".
+        change: name of the change, such as "black".
+        before: judgement of the unchanged image.
+        after: judgement of the changed image.
+    """
+    is_met = meets_claim(claim, before.prediction, after.prediction)
+    metrics = {**(before.metrics or {}), f"{claim} {change}": float(is_met)}
+    return replace(before, metrics=metrics)
+
+
 def verify_worst(
     problem: Problem,
     config: SweepConfig,
@@ -941,15 +1021,12 @@ def verify_worst(
     ladder = choose_ladder(config.verify_spp, config.pixel_sampler)
     # The rows of a sweep state no success, so the journal stores none either; trials in
     # memory have one.
-    verifier = Verifier(
-        Journal(run, ParallelEvaluator(problem)), ladder, stages, has_success=False
-    )
+    journal = Journal(run, ParallelEvaluator(problem))
+    verifier = Verifier(journal, ladder, stages, has_success=False)
     verifier.choose_spp({"worst": u})  # sets `spp` and `sample_count` of its state
-    verifier.begin_stage(
-        "checking the worst configuration with fresh renders", config.trials
-    )
+    title = "checking the worst configuration with fresh renders"
+    verifier.begin_stage(title, config.trials)
     spp = verifier.run_state.spp
-    sample_count = verifier.run_state.sample_count
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
     )
@@ -957,10 +1034,18 @@ def verify_worst(
     wrong_trials = [trial for trial in trials if trial.success]
     counts = TrialCounts(len(wrong_trials), len(trials), spp)
     verified_rate = make_rate(counts, trials, wrong_trials)
-    has_converged = sample_count is not None and sample_count.converged
-    is_spp_set = len(verifier.spp_ladder) == 1
     return WorstVerified(
         **vars(verified_rate),
-        converged=is_spp_set or has_converged,
+        converged=_has_converged(verifier),
         renders=verifier.run_state.verification_renders,
     )
+
+
+def _has_converged(verifier: Verifier) -> bool:
+    """Return whether more samples would not change the sign of the margin.
+
+    A sample count that the settings state always counts as converged.
+    """
+    is_spp_set = len(verifier.spp_ladder) == 1
+    sample_count = verifier.run_state.sample_count
+    return is_spp_set or (sample_count is not None and sample_count.converged)
