@@ -306,7 +306,7 @@ class Job:
         space = make_space(controls, description)
         if named_scene.fixed_controls:
             space = _fix_controls(named_scene, space)
-        _check_not_set(named_scene, space)
+        _check_sampled_not_set(named_scene, space)
         return space
 
     def make_scene_configurations(self, space: Space) -> SceneConfigurations:
@@ -379,7 +379,7 @@ def _fix_controls(named_scene: NamedScene, space: Space) -> Space:
     return space.fix_first_controls(named_scene.adversarial_configuration)
 
 
-def _check_not_set(named_scene: NamedScene, space: Space) -> None:
+def _check_sampled_not_set(named_scene: NamedScene, space: Space) -> None:
     """Raise an error if a sampled parameter is fixed with `set`.
 
     Args:
