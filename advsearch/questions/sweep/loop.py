@@ -777,14 +777,14 @@ class Sweep:
         formation = Formation.from_values(renderer.formation)
         gains: dict[str, float] = {}
         if len(self.job.scenes) <= MAX_LISTED_GAINS:
-            gains = self._compute_gains()
+            gains = self._list_scene_gains()
         have_same_gain = len(set(gains.values())) == 1  # False without gains
         if not have_same_gain:
             formation = formation.model_copy(update={"gain": None})
         return formation, gains
 
-    def _compute_gains(self) -> dict[str, float]:
-        """Return the gain of each scene by its names."""
+    def _list_scene_gains(self) -> dict[str, float]:
+        """Return the gain of each scene, the factor of its exposure, by its names."""
         gains: dict[str, float] = {}
         for named_scene in self.job.scenes:
             description = fit_camera(

@@ -564,7 +564,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
         ending=FINISHED,
         planned=len(rows),
         answers=dict(wrong_labels.most_common(MAX_LISTED_PREDICTIONS)),
-        axes=_make_parameter_tables(rows, right),
+        axes=_count_by_parameter(rows, right),
         grid={},
         samples=1,
         renders={"sweep": len(rows)},
@@ -574,7 +574,7 @@ def _summarize_threedb(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSumm
     )
 
 
-def _make_parameter_tables(
+def _count_by_parameter(
     rows: pd.DataFrame, right: npt.NDArray[np.bool_]
 ) -> list[AxisRow]:
     """Return the rows of the tables of all parameters that vary.
