@@ -14,6 +14,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -108,13 +109,14 @@ class Groups:
         self.samples = samples
         # Samples are like one more axis, the last and fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
-        is_within = []  # for each axis
-        for axis, may_differ in enumerate(within):
-            # Two images along any axis but that of the frames have different draws.
-            shares_draw = axis == frame_axis
-            is_within.append(may_differ and (may_draws_differ or shares_draw))
-        is_within.append(may_draws_differ)  # the axis of the samples
-        self._is_within = tuple(is_within)
+        # Two images along any axis but that of the frames have different draws.
+        self._is_within = (
+            *(
+                may_differ and (may_draws_differ or axis == frame_axis)
+                for axis, may_differ in enumerate(within)
+            ),
+            may_draws_differ,  # the axis of the samples
+        )
         within_sizes = self._select(self._all_axes.sizes, is_within=True)
         between_sizes = self._select(self._all_axes.sizes, is_within=False)
         self._within = ProductIndex(tuple(within_sizes))
@@ -217,15 +219,12 @@ class BasisPictures:
             make_groups: returns the groups whose images differ in some parameters.
             spp: samples per pixel of the images.
         """
-        renderer = self._renderer
         groups = make_groups(self.parameters)
         # Only an image without noise can be predicted from basis images.
-        is_denoised = renderer.formation.denoiser == "oidn"
+        is_denoised = self._renderer.formation.denoiser == "oidn"
         if not is_denoised:
             return NOISE
-        # The number of lights is the same in all configurations: take the first one.
-        inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
-        n_lights = len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
+        n_lights = self._count_lights()
         prediction_samples = n_lights * COLLECTED_SPP + _count_check_samples(spp)
         # Rendering a group takes `spp` for each image.
         min_images = math.ceil(MIN_SAVING_FACTOR * prediction_samples / spp)
@@ -234,7 +233,17 @@ class BasisPictures:
                 f"basis pictures pay where {min_images} pictures or more differ in "
                 f"light alone; here {groups.group_size} do"
             )
-        height, width = renderer.formation.resolution
+        return self._find_memory_refusal(groups, n_lights)
+
+    def _count_lights(self) -> int:
+        """Count the lights, whose number is the same in all configurations."""
+        renderer = self._renderer
+        inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
+        return len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
+
+    def _find_memory_refusal(self, groups: Groups, n_lights: int) -> Refusal | None:
+        """Return a refusal if the basis images take too much memory; else None."""
+        height, width = self._renderer.formation.resolution
         # about 8 bytes for each pixel of a basis image
         n_bytes = groups.n_groups_to_cache * n_lights * 8 * height * width
         if n_bytes > scale_limit(MAX_BYTES):
@@ -378,6 +387,17 @@ class LightOnSurfaces:
         refusal = find_scene_refusal(self._renderer)
         if refusal is not None:
             return refusal
+        return self._find_light_memory_refusal(arrangement_groups, light_groups)
+
+    def _find_light_memory_refusal(
+        self, arrangement_groups: Groups, light_groups: Groups
+    ) -> Refusal | None:
+        """Return a refusal if arrangements and light take too much memory; else None.
+
+        Args:
+            arrangement_groups: groups whose images have the same arrangement.
+            light_groups: groups whose images have the same light.
+        """
         environment = self._renderer.scene.get_base_value(ENVIRONMENT_INPUT)
         light_bytes = LIGHT_BYTES + 4 * environment.numel()  # 4 bytes for a float32
         n_bytes = (
@@ -517,17 +537,13 @@ class SweepPredictor:
         """
         axis_names = [axis.name for axis in self.axes]
         # Here a group is the coordinates of one parameter.
-        sampled_names = [
-            group.name
-            for group in self.renderer.space.groups
-            if group.name not in axis_names
-        ]
-        may_draws_differ = parameters.issuperset(sampled_names)
+        parameter_names = [group.name for group in self.renderer.space.groups]
+        sampled_names = [name for name in parameter_names if name not in axis_names]
         return Groups(
             self.configurations.grid,
             samples=self.configurations.samples_per_grid_point,
             within=tuple(name in parameters for name in axis_names),
-            may_draws_differ=may_draws_differ,
+            may_draws_differ=parameters.issuperset(sampled_names),
             frame_axis=self.configurations.independent_units.frames,
         )
 
@@ -551,24 +567,25 @@ class SweepPredictor:
                 group = self._groups.find_group_of_image(number)
                 predictor = self._load_predictor(group, number)
             if predictor is None:
-                image = self.renderer(
-                    query.u, seed=query.seed, spp=self.problem.search_spp
-                )
-                # Images may have been traced for a predictor that was then rejected.
-                n_traced = self._count_traced(number) + 1
-                images[number] = SweptImage(image, prediction_spp=0, n_traced=n_traced)
+                images[number] = self._render_image(number, query)
             else:
                 numbers_by_predictor.setdefault(predictor, []).append(number)
         for predictor, numbers in numbers_by_predictor.items():
-            predicted = predictor.predict_images(
-                [query_of_image[number].u for number in numbers]
-            )
+            configurations = [query_of_image[number].u for number in numbers]
+            predicted = predictor.predict_images(configurations)
             for number, image in zip(numbers, predicted, strict=True):
                 n_traced = self._count_traced(number)
                 images[number] = SweptImage(
                     image, prediction_spp=self.method.samples, n_traced=n_traced
                 )
         return images
+
+    def _render_image(self, number: int, query: Query) -> SweptImage:
+        """Render an image by its number in the scene."""
+        image = self.renderer(query.u, seed=query.seed, spp=self.problem.search_spp)
+        # Images may have been traced for a predictor that was then rejected.
+        n_traced = self._count_traced(number) + 1
+        return SweptImage(image, prediction_spp=0, n_traced=n_traced)
 
     def _count_traced(self, number: int) -> int:
         """Return how many images were traced to prepare the predictor of an image.
@@ -584,11 +601,8 @@ class SweepPredictor:
     def _load_predictor(self, group: int, number: int) -> Predictor | None:
         """Return the predictor of a group; None if its images are rendered.
 
-        A new predictor is compared with traced images first. If it deviates too much,
-        the images of its group are rendered. A predictor depends only on the index of
-        its group, not on the image that needs it first, so that a sweep that was
-        stopped continues with the same predictors. If too many are cached, the one that
-        was made first is released.
+        A predictor is cached. If too many are cached, the one that was made first is
+        released.
 
         Args:
             group: index of the group.
@@ -600,6 +614,24 @@ class SweepPredictor:
             oldest = next(iter(self._predictors))
             self._predictors.pop(oldest)
         begin = time.perf_counter()
+        self._predictors[group] = self._make_accurate_predictor(group, number)
+        self.seconds += time.perf_counter() - begin
+        return self._predictors[group]
+
+    def _make_accurate_predictor(self, group: int, number: int) -> Predictor | None:
+        """Make the predictor of a group, and compare it with traced images.
+
+        It depends only on the index of its group, not on the image that needs it first,
+        so that a sweep that was stopped continues with the same predictors.
+
+        Args:
+            group: index of the group.
+            number: number of an image of the group, in the scene.
+
+        Returns:
+            The predictor; None if it deviates too much. Then the images of its group
+            are rendered.
+        """
         # A scene has no more groups than images. So no two groups of the sweep have
         # the same index.
         group_index = self.images_before + group
@@ -613,12 +645,9 @@ class SweepPredictor:
         self.deviations.append(deviation)
         self._n_traced_of_group[group] = predictor.n_traced_images + deviation.n_traced
         if deviation.is_accepted:
-            self._predictors[group] = predictor
-        else:
-            self._predictors[group] = None
-            self.rendered_groups.add(group)
-        self.seconds += time.perf_counter() - begin
-        return self._predictors[group]
+            return predictor
+        self.rendered_groups.add(group)
+        return None
 
     def _compare(self, predictor: Predictor, number: int, seed: int) -> Deviation:
         """Compare predicted images of a group with traced ones.
@@ -631,36 +660,38 @@ class SweepPredictor:
             number: number of an image of the group, in the scene.
             seed: seed of the comparison.
         """
-
-        def compute_margin(image: Tensor, u: Tensor) -> float:
-            """Return the margin of the model's prediction about an image.
-
-            The model gets images in 8 bits; other deviations are computed without
-            rounding.
-            """
-            return self.problem.judge(round_to_8_bit(image), u).margin
-
-        def compare_view(check: int) -> ComparedView:
-            """Compare a random image of the group with a traced one.
-
-            Args:
-                check: index of the comparison, for the seeds.
-            """
-            index = seeds.derive_seed(seed, "check", check) % self._groups.group_size
-            u = self._make_configuration(number, index)
-            (predicted,) = predictor.predict_images([u])
-            noise_seed = seeds.derive_seed(seed, "traced", check)
-            return compare_with_traced(
-                self.renderer,
-                predicted,
-                u,
-                noise_seed,
-                self.problem.search_spp,
-                compute_margin,
-            )
-
+        compare_view = partial(self._compare_view, predictor, number, seed)
         with torch.no_grad():
             return compare_views(compare_view)  # calls it once for each view
+
+    def _compare_view(
+        self, predictor: Predictor, number: int, seed: int, check: int
+    ) -> ComparedView:
+        """Compare a random image of a group with a traced one.
+
+        See `_compare` for the other arguments.
+
+        Args:
+            check: index of the comparison, for the seeds.
+        """
+        index = seeds.derive_seed(seed, "check", check) % self._groups.group_size
+        u = self._make_configuration(number, index)
+        (predicted,) = predictor.predict_images([u])
+        return compare_with_traced(
+            self.renderer,
+            predicted,
+            u,
+            seeds.derive_seed(seed, "traced", check),
+            self.problem.search_spp,
+            self._compute_margin,
+        )
+
+    def _compute_margin(self, image: Tensor, u: Tensor) -> float:
+        """Return the margin of the model's prediction about an image.
+
+        The model gets images in 8 bits; other deviations are computed without rounding.
+        """
+        return self.problem.judge(round_to_8_bit(image), u).margin
 
     def _make_configuration(self, number: int, index: int) -> Tensor:
         """Return the configuration (d,) of an image of a group.
@@ -701,21 +732,24 @@ class SweepPredictor:
                 f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were "
                 "rendered: predicted pictures were too far off"
             )
-        predictor_bytes = sum(
-            predictor.n_bytes
-            for predictor in self._predictors.values()
-            if predictor is not None
-        )
         # `entries` and `renewed` are about the matrix of an attack. Sweeps have none.
         return LinearTransport(
             used=True,
             method=self.method.name,
             reason=reason,
             entries=0,
-            bytes=self.method.bytes + predictor_bytes,
+            bytes=self.method.bytes + self._count_predictor_bytes(),
             seconds=self.seconds,
             renewed=0,
             error=error,
+        )
+
+    def _count_predictor_bytes(self) -> int:
+        """Count the memory of the cached predictors."""
+        return sum(
+            predictor.n_bytes
+            for predictor in self._predictors.values()
+            if predictor is not None
         )
 
 
@@ -738,13 +772,14 @@ def combine_transport(
         return summaries[-1] if summaries else None
     reasons = [summary.reason for summary in with_predictions if summary.reason]
     errors = [summary.error for summary in with_predictions if summary.error]
-    # `levels` is how far an image was off, in levels of 8 bits.
-    worst_error = max(errors, key=lambda error: error.levels or 0.0, default=None)
+    all_bytes = [summary.bytes or 0 for summary in with_predictions]
+    all_seconds = [summary.seconds or 0.0 for summary in with_predictions]
     update = {
         "reason": reasons[0] if reasons else None,  # as an example for all
-        "bytes": max(summary.bytes or 0 for summary in with_predictions),
-        "seconds": math.fsum(summary.seconds or 0.0 for summary in with_predictions),
-        "error": worst_error,
+        "bytes": max(all_bytes),
+        "seconds": math.fsum(all_seconds),
+        # `levels` is how far an image was off, in levels of 8 bits.
+        "error": max(errors, key=lambda error: error.levels or 0.0, default=None),
     }
     # The other fields, such as the method, are the same in all scenes.
     return with_predictions[0].model_copy(update=update)
@@ -767,18 +802,7 @@ def prepare_surface_light(
         n_images: about how many trials there are.
     """
     problem = verifier.problem
-    varying = set(coordinates.tolist())
-    # the parameters that have any of these coordinates
-    parameter_names = [
-        group.name
-        for group in problem.space.groups
-        if not varying.isdisjoint(range(group.begin, group.begin + group.size))
-    ]
-    changed_inputs = find_changed_inputs(problem.renderer, parameter_names)
-    moves_camera = bool(changed_inputs & CAMERA_INPUTS)
-    # light on surfaces cannot follow a change of any other input
-    can_follow = changed_inputs <= FREE_INPUTS
-    if not moves_camera or not can_follow:
+    if not _can_light_follow(problem, coordinates):
         return
     state = verifier.run_state
     refusal = _find_light_refusal(problem.renderer, state.spp, n_images)
@@ -795,6 +819,27 @@ def prepare_surface_light(
     state.predictor_refusal = light.accuracy_refusal
     is_accurate = light.accuracy_refusal is None
     state.predictor = light if is_accurate else None
+
+
+def _can_light_follow(problem: Problem, coordinates: Tensor) -> bool:
+    """Return whether the camera moves, and light on surfaces can follow what varies.
+
+    Args:
+        problem: problem of the trials.
+        coordinates: (k,) indices of the coordinates that vary.
+    """
+    varying = set(coordinates.tolist())
+    # the parameters that have any of these coordinates
+    parameter_names = [
+        group.name
+        for group in problem.space.groups
+        if not varying.isdisjoint(range(group.begin, group.begin + group.size))
+    ]
+    changed_inputs = find_changed_inputs(problem.renderer, parameter_names)
+    moves_camera = bool(changed_inputs & CAMERA_INPUTS)
+    # light on surfaces cannot follow a change of any other input
+    can_follow = changed_inputs <= FREE_INPUTS
+    return moves_camera and can_follow
 
 
 def _find_light_refusal(renderer: Renderer, spp: int, n_images: int) -> Refusal | None:
