@@ -567,7 +567,7 @@ class SweepPredictor:
                 group = self._groups.find_group_of_image(number)
                 predictor = self._load_predictor(group, number)
             if predictor is None:
-                images[number] = self._render_image(number, query)
+                images[number] = self._render_swept_image(number, query)
             else:
                 numbers_by_predictor.setdefault(predictor, []).append(number)
         for predictor, numbers in numbers_by_predictor.items():
@@ -580,7 +580,7 @@ class SweepPredictor:
                 )
         return images
 
-    def _render_image(self, number: int, query: Query) -> SweptImage:
+    def _render_swept_image(self, number: int, query: Query) -> SweptImage:
         """Render an image by its number in the scene."""
         image = self.renderer(query.u, seed=query.seed, spp=self.problem.search_spp)
         # Images may have been traced for a predictor that was then rejected.
@@ -683,10 +683,10 @@ class SweepPredictor:
             u,
             seeds.derive_seed(seed, "traced", check),
             self.problem.search_spp,
-            self._compute_margin,
+            self._compute_margin_in_8_bits,
         )
 
-    def _compute_margin(self, image: Tensor, u: Tensor) -> float:
+    def _compute_margin_in_8_bits(self, image: Tensor, u: Tensor) -> float:
         """Return the margin of the model's prediction about an image.
 
         The model gets images in 8 bits; other deviations are computed without rounding.
