@@ -21,6 +21,7 @@ import numpy.typing as npt
 import pandas as pd
 import torch
 from scipy.special import xlogy
+from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.domain import split_into_batches
@@ -28,7 +29,7 @@ from advsearch.engine.loading import fit_camera, load_scene
 from advsearch.engine.record import read_judgement
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
-from advsearch.questions.sweep.job import Job, SceneLoader
+from advsearch.questions.sweep.job import Job, SceneLoader, SweptScene
 from advsearch.questions.sweep.result import count_independent_predictions
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
 from advsearch.report.figures import render_figure
@@ -162,10 +163,10 @@ def compare_parts(
     if is_compared.any():
         compared_parts = part_indices[is_compared]
         parts.loc[compared_parts] = _compute_comparison(counts, compared_parts)
+    significant = parts.p <= SIGNIFICANCE_LEVEL
+    strength = _compute_strength(parts)
     return parts.assign(
-        compared=is_compared,
-        significant=parts.p <= SIGNIFICANCE_LEVEL,
-        strength=_compute_strength(parts),
+        compared=is_compared, significant=significant, strength=strength
     )
 
 
@@ -230,25 +231,34 @@ def _compute_permutation_p_value(
         n: (m,) number of these images.
         parts: (m,) indices of the compared parts.
     """
-    images = counts.n_images
-    failures = counts.n_failures
     # The number of images that show a part is the same in all permutations. Only the
     # number of failures among them changes.
     max_statistics = np.sort(
         [
-            _compute_likelihood_ratio(
-                failure_counts[parts].astype(np.int64), n, failures, images
-            ).max()
+            _compute_statistic(counts, failure_counts[parts].astype(np.int64), n).max()
             for failure_counts in counts.permuted_counts
         ]
     )
-    statistic = _compute_likelihood_ratio(k, n, failures, images)
+    statistic = _compute_statistic(counts, k, n)
     n_permutations = len(max_statistics)
     # number of permutations whose largest statistic is at least that of the part; the
     # tolerance is for rounding
     tolerance = 1e-9
     n_above = n_permutations - np.searchsorted(max_statistics, statistic - tolerance)
     return np.asarray((1 + n_above) / (1 + n_permutations))
+
+
+def _compute_statistic(
+    counts: PartCounts, k: Int64Array, n: Int64Array
+) -> Float64Array:
+    """Compute the likelihood ratio statistic (m,) of parts from `counts` of all images.
+
+    Args:
+        counts: counts of all parts.
+        k: (m,) number of failures among the images that show each part.
+        n: (m,) number of these images.
+    """
+    return _compute_likelihood_ratio(k, n, counts.n_failures, counts.n_images)
 
 
 def _compute_likelihood_ratio(
@@ -388,12 +398,11 @@ class SurfaceCounts:
         """
         is_worse = compared.significant & (compared.difference > 0)
         is_better = compared.significant & (compared.difference < 0)
-        strongest = list[SurfacePart]()
-        for is_candidate in (is_worse, is_better):
-            strongest += [
-                self._describe_part(part, counts, compared)
-                for part in self._select_spread(compared[is_candidate])
-            ]
+        strongest = [
+            self._describe_part(part, counts, compared)
+            for is_candidate in (is_worse, is_better)
+            for part in self._select_spread(compared[is_candidate])
+        ]
         # `counts` has the parts of all kinds, `compared` only those of this one.
         visible_counts = counts.visible_counts[self.parts.part_slices[kind]]
         return SurfaceTable(
@@ -443,6 +452,7 @@ class SurfaceCounts:
         n_visible_right = n_visible - n_visible_wrong
         n_hidden_right = n_hidden - n_hidden_wrong
         u, v = self.parts.center_uvs[part].tolist()
+        numbers = compared.loc[part]
         return SurfacePart(
             face=int(self.parts.face_of_part[part]),
             u=u,
@@ -450,12 +460,9 @@ class SurfaceCounts:
             center=self.parts.centers[part].tolist(),
             visible=count_independent_predictions(n_visible_right, n_visible),
             hidden=count_independent_predictions(n_hidden_right, n_hidden),
-            difference=float(compared.loc[part, "difference"]),
-            interval=(
-                float(compared.loc[part, "low"]),
-                float(compared.loc[part, "high"]),
-            ),
-            p=float(compared.loc[part, "p"]),
+            difference=float(numbers["difference"]),
+            interval=(float(numbers["low"]), float(numbers["high"])),
+            p=float(numbers["p"]),
         )
 
 
@@ -514,23 +521,14 @@ def _make_counts(
         assets: the objects by name.
         wrong: (scenes, images, models) 1, 0 or UNKNOWN, from `_read_wrong`.
     """
-    job = scenes.job
-    draws = _find_draws(scenes, wrong, job)
-    n_models = len(job.models)
+    draws = _find_draws(scenes, wrong, scenes.job)
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
-        parts = SurfaceParts(asset.mesh)
         has_object = np.array(
-            [named_scene.object_name == name for named_scene in job.scenes]
+            [named_scene.object_name == name for named_scene in scenes.job.scenes]
         )
-        # Each pair of an object and a model has a seed of its own, and so permutations
-        # of its own.
-        model_seeds = [
-            seeds.derive_seed(
-                job.config.seed, "surface", object_index * n_models + model
-            )
-            for model in range(n_models)
-        ]
+        model_seeds = _make_model_seeds(scenes.job, object_index)
+        parts = SurfaceParts(asset.mesh)
         part_counts = [
             _make_part_counts(
                 parts, wrong[has_object][..., model], draws[has_object], seed
@@ -539,6 +537,19 @@ def _make_counts(
         ]
         counts[name] = SurfaceCounts(parts, part_counts)
     return counts
+
+
+def _make_model_seeds(job: Job, object_index: int) -> list[int]:
+    """Return the seed of the permutations of an object for each model.
+
+    Each pair of an object and a model has a seed of its own, and so permutations of its
+    own.
+    """
+    n_models = len(job.models)
+    pair_numbers = [object_index * n_models + model for model in range(n_models)]
+    return [
+        seeds.derive_seed(job.config.seed, "surface", number) for number in pair_numbers
+    ]
 
 
 def _find_draws(
@@ -596,27 +607,44 @@ def _count_scene(
         counts: counts of the scene's object.
         progress: advances by the number of predictions.
     """
-    job = scenes.job
     swept_scene = scenes.load_scene(scene)
     n_images, n_models = wrong.shape
     for batch in split_into_batches(0, n_images, BATCH_SIZE):
-        for size in dict.fromkeys(job.image_sizes):
-            models = [
-                model for model in range(n_models) if job.image_sizes[model] == size
-            ]
+        for size in dict.fromkeys(scenes.job.image_sizes):
             # The scenes before this one have the same number of images each.
-            configurations = swept_scene.configurations_by_size[
-                size
-            ].make_configurations(batch.start, len(batch), before=scene * n_images)
-            # at least `MIN_RAYS` rays along the shorter side of the image
-            rays_per_pixel = ceil(MIN_RAYS / min(size))
-            renderer = swept_scene.renderer_of_size[size]
-            for number_in_scene, u in zip(batch, configurations, strict=True):
-                surfaces = renderer.find_surfaces(u, rays_per_pixel)
-                counts.add_image(
-                    surfaces, _select_known(wrong[number_in_scene], models)
-                )
+            configurations = swept_scene.configurations_by_size[size]
+            batch_u = configurations.make_configurations(
+                batch.start, len(batch), before=scene * n_images
+            )
+            images_surfaces = _find_batch_surfaces(swept_scene, size, batch_u)
+            models = _list_models_of_size(scenes.job, size)
+            for number, surfaces in zip(batch, images_surfaces, strict=True):
+                counts.add_image(surfaces, _select_known(wrong[number], models))
         progress.advance(len(batch) * n_models)
+
+
+def _find_batch_surfaces(
+    scene: SweptScene, size: tuple[int, int], batch_u: Tensor
+) -> Iterator[Surfaces]:
+    """Find the visible surface in each of several images of a scene, one by one.
+
+    Args:
+        scene: the scene.
+        size: (height, width) of the images.
+        batch_u: (n, d) configurations of the images.
+    """
+    renderer = scene.renderer_of_size[size]
+    # at least `MIN_RAYS` rays along the shorter side of the image
+    rays_per_pixel = ceil(MIN_RAYS / min(size))
+    for u in batch_u:
+        yield renderer.find_surfaces(u, rays_per_pixel)
+
+
+def _list_models_of_size(job: Job, size: tuple[int, int]) -> list[int]:
+    """Return the indices of the models that get images of a size."""
+    return [
+        model for model, model_size in enumerate(job.image_sizes) if model_size == size
+    ]
 
 
 def _select_known(
@@ -652,12 +680,12 @@ def permute_draws(
         wrong. None if each image has a draw of its own.
     """
     _, draw_sizes = np.unique(draws, return_counts=True)
-    n_draws = len(draw_sizes)
     is_independent = draw_sizes.max(initial=1) == 1
     if is_independent:
         return None
     is_known = wrong != UNKNOWN
     is_wrong = wrong == 1
+    n_draws = len(draw_sizes)
     # (draws, images of a draw): row k has the indices of the images of draw k
     images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
     generator = np.random.default_rng(seed)
@@ -806,14 +834,26 @@ def _list_arrays(
         "wrong": np.stack([part_counts.wrong_counts for part_counts in model_counts]),
     }
     for column in ("difference", "low", "high", "p"):
-        # The columns of all kinds, one after the other, are in the order of the parts.
-        column_of_model = [
-            np.concatenate([compared[column] for compared in compared_by_kind.values()])
-            for compared_by_kind in comparisons
-        ]
-        arrays[column] = np.stack(column_of_model).astype(np.float32)
+        arrays[column] = _stack_comparisons(comparisons, column)
     arrays["map"] = counts.parts.face_uvs.astype(np.float32)
     return arrays
+
+
+def _stack_comparisons(
+    comparisons: Sequence[Mapping[str, pd.DataFrame]], column: str
+) -> npt.NDArray[np.float32]:
+    """Return a column of the comparisons of all models, (models, parts).
+
+    Args:
+        comparisons: for each model, the comparison of its parts by kind.
+        column: name of the column.
+    """
+    # The columns of all kinds, one after the other, are in the order of the parts.
+    column_of_model = [
+        np.concatenate([compared[column] for compared in compared_by_kind.values()])
+        for compared_by_kind in comparisons
+    ]
+    return np.stack(column_of_model).astype(np.float32)
 
 
 def _compute_grey_colors(
@@ -910,15 +950,26 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         )
         to_world = camera_to_world(viewed, aspect=1.0).astype(np.float32)
         surfaces = scene.find_surfaces({"camera.to_world": torch.from_numpy(to_world)})
-        is_object = surfaces.visible_mask(OBJECT).numpy()
-        face = surfaces.face_index.numpy()[is_object]
-        uv = surfaces.uv.numpy()[is_object].astype(np.float64)
-        cells = np.full(is_object.shape, -1, np.int64)
-        cells[is_object] = parts.find_cells(face, uv)
+        cells = _find_cell_of_pixels(surfaces, parts)
         cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
         # never so dark that colors are hard to distinguish
         shade = MIN_SHADE + LIT_SHADE * cosine
         yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
+
+
+def _find_cell_of_pixels(surfaces: Surfaces, parts: SurfaceParts) -> Int64Array:
+    """Return the cell of the object's map in each pixel (H, W); -1 without the object.
+
+    Args:
+        surfaces: the surface that each pixel shows.
+        parts: parts of the object's surface.
+    """
+    is_object = surfaces.visible_mask(OBJECT).numpy()
+    face = surfaces.face_index.numpy()[is_object]
+    uv = surfaces.uv.numpy()[is_object].astype(np.float64)
+    cells = np.full(is_object.shape, -1, np.int64)
+    cells[is_object] = parts.find_cells(face, uv)
+    return cells
 
 
 def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
@@ -941,14 +992,7 @@ def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
     )
     for (map_axes, view_axes), panel in zip(axes, panels, strict=True):
         cell_colors = _color_cells(panel, scale)
-        map_axes.imshow(
-            # Row 0 of the cells is at v = 1, the top of the image.
-            cell_colors.reshape(MAP_SIZE, MAP_SIZE, 3),
-            extent=(0, 1, 0, 1),
-            interpolation="nearest",
-        )
-        map_axes.set(xlabel="u", ylabel="v")
-        map_axes.set_title(panel.title)
+        _draw_cells(map_axes, panel.title, cell_colors)
         _draw_views(view_axes, panel.views, cell_colors)
 
     # One color bar for all rows stands at their right; it need not be as high.
@@ -962,6 +1006,18 @@ def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
         for color, label in GREY_LABELS.items()
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=2)
+
+
+def _draw_cells(axes: Any, title: str, cell_colors: Float64Array) -> None:
+    """Draw the map of a surface; `cell_colors` (cells, 3) has its cells row by row."""
+    axes.imshow(
+        # Row 0 of the cells is at v = 1, the top of the image.
+        cell_colors.reshape(MAP_SIZE, MAP_SIZE, 3),
+        extent=(0, 1, 0, 1),
+        interpolation="nearest",
+    )
+    axes.set(xlabel="u", ylabel="v")
+    axes.set_title(title)
 
 
 def _color_cells(panel: Panel, scale: Any) -> Float64Array:
@@ -1002,21 +1058,25 @@ def _draw_views(axes: Any, views: Sequence[MapView], cell_colors: Float64Array) 
         row, column = divmod(number, n_columns)
         top = row * VIEW_SIZE
         left = column * VIEW_SIZE
-        is_object = view.cells[..., None] >= 0
-        # Pixels without the object have -1. They are looked up as cell 0 here, and made
-        # white below.
-        shaded = cell_colors[np.maximum(view.cells, 0)] * view.shade[..., None]
-        image = np.where(is_object, shaded, 1.0)
+        image = _shade_view(view, cell_colors)
         mosaic[top : top + VIEW_SIZE, left : left + VIEW_SIZE] = image
-        axes.text(
-            left + 0.5 * VIEW_SIZE,
-            top + 4,
-            view.title,
-            ha="center",
-            va="top",
-            fontsize=7,
-        )
+        center = left + 0.5 * VIEW_SIZE
+        axes.text(center, top + 4, view.title, ha="center", va="top", fontsize=7)
     axes.imshow(mosaic)
+
+
+def _shade_view(view: MapView, cell_colors: Float64Array) -> Float64Array:
+    """Return a view of an object as an image (H, W, 3), white around the object.
+
+    Args:
+        view: the view, with the cell, or -1, and the shade of every pixel.
+        cell_colors: (cells, 3) color of each cell.
+    """
+    is_object = view.cells[..., None] >= 0
+    # Pixels without the object have -1. They are looked up as cell 0 here, and made
+    # white below.
+    shaded = cell_colors[np.maximum(view.cells, 0)] * view.shade[..., None]
+    return np.where(is_object, shaded, 1.0)
 
 
 def _format_percent(value: float, _: object) -> str:
