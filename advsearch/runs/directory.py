@@ -166,18 +166,33 @@ class RunDirectory:
             with storage_errors(path):
                 _clear(path)
             try:
-                if config is not None:
-                    write_text(path / CONFIG, config.make_repeatable().to_yaml())
-                run_directory = cls(path, lock)
-                undo.callback(run_directory.store.close)
-                if config is not None:
-                    run_directory._note_start(config)
+                run_directory = cls._write_start(path, config, lock, undo)
             except BaseException:
                 with suppress(OSError):  # the first error is raised in any case
                     _clear(path)
                 raise
             undo.pop_all()  # nothing failed: the caller closes it
             return run_directory
+
+    @classmethod
+    def _write_start(
+        cls, path: Path, config: Config | None, lock: RunLock, undo: ExitStack
+    ) -> RunDirectory:
+        """Write the first files of a run into its directory, which is locked.
+
+        Args:
+            path: path of the directory.
+            config: configuration of the run, which is written as `run.yaml`, or None.
+            lock: lock of the directory.
+            undo: gets what closes the store after an error.
+        """
+        if config is not None:
+            write_text(path / CONFIG, config.make_repeatable().to_yaml())
+        run_directory = cls(path, lock)
+        undo.callback(run_directory.store.close)
+        if config is not None:
+            run_directory._note_start(config)
+        return run_directory
 
     @classmethod
     def open(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
@@ -273,16 +288,9 @@ class RunDirectory:
         Raises:
             InputError: some are not, so that it would give other numbers.
         """
-        # A run without stored settings was killed before `_note_start` ended. It has no
-        # rows, and begins now.
         has_settings = self.store.read_note(SETTINGS_NOTE) is not None
         if not has_settings:
-            if self.store.count_rows():
-                raise FileFormatError(
-                    f"{self.store.path}: expected the settings the "
-                    "run began with, got none"
-                )
-            self._note_start(config)
+            self._begin_killed_run(config)
             return
         self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
         # Only files that a resumed run reads again are compared. One that the run has
@@ -296,6 +304,20 @@ class RunDirectory:
         self.check_unchanged(
             summary.VERSIONS_NOTE, summary.collect_versions(settings_of_files)
         )
+
+    def _begin_killed_run(self, config: Config) -> None:
+        """Begin a run that was killed before `_note_start` ended.
+
+        It has no stored settings and no rows.
+
+        Raises:
+            FileFormatError: it has rows.
+        """
+        if self.store.count_rows():
+            raise FileFormatError(
+                f"{self.store.path}: expected the settings the run began with, got none"
+            )
+        self._note_start(config)
 
     def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
         """Check that facts on which the numbers of a run depend have not changed.
@@ -312,14 +334,7 @@ class RunDirectory:
             InputError: a fact differs from the stored one; the run
                 can't go on.
         """
-        stored = self.store.read_json_note(note)
-        before = {} if stored is None else stored  # None at the first call
-        if not isinstance(before, dict):
-            type_name = type(before).__name__
-            raise FileFormatError(
-                f"{self.store.path}: expected what the run began with in the note "
-                f"{note!r}, got {type_name}"
-            )
+        before = self._read_facts(note)
         if changed := summary.find_changed_facts(before, facts):
             changes = ", ".join(
                 _format_change(name, before.get(name)) for name in changed
@@ -331,6 +346,22 @@ class RunDirectory:
         has_new_facts = not facts.keys() <= before.keys()
         if has_new_facts:  # the stored values of known facts stay
             self.store.write_note(note, json.dumps({**facts, **before}))
+
+    def _read_facts(self, note: str) -> dict[str, Any]:
+        """Return the facts in a note; empty if there is no such note.
+
+        Raises:
+            FileFormatError: the note has something else.
+        """
+        stored = self.store.read_json_note(note)
+        before = {} if stored is None else stored  # None at the first call
+        if not isinstance(before, dict):
+            type_name = type(before).__name__
+            raise FileFormatError(
+                f"{self.store.path}: expected what the run began with in the note "
+                f"{note!r}, got {type_name}"
+            )
+        return before
 
     def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
         """Check that the files that settings name are those with which the run began.
@@ -528,15 +559,25 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
     try:
         yield path
     except BaseException:
-        # The directory cannot be opened if it was removed meanwhile, for instance.
-        with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
-            if run.is_empty:
-                run.discard()
-        # `rmdir` raises for a folder that is not empty, and so ends the loop
-        with suppress(OSError):
-            for folder in new_folders:
-                folder.rmdir()
+        _discard_if_empty(path, new_folders)
         raise
+
+
+def _discard_if_empty(path: Path, new_folders: Sequence[Path]) -> None:
+    """Remove the directory of a run without results, and empty folders around it.
+
+    Args:
+        path: path of the directory.
+        new_folders: parent folders that were made for it, the innermost first.
+    """
+    # The directory cannot be opened if it was removed meanwhile, for instance.
+    with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
+        if run.is_empty:
+            run.discard()
+    # `rmdir` raises for a folder that is not empty, and so ends the loop
+    with suppress(OSError):
+        for folder in new_folders:
+            folder.rmdir()
 
 
 def make_default_name(object_name: str, controls: Iterable[str]) -> str:
@@ -654,16 +695,7 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
             `overwrite`, a run.
     """
     path = locate_run(run)
-    if "\0" in str(path):
-        raise InputError(
-            f"expected a name or a folder for the run, got {str(path)!r} "
-            "with a zero byte in it"
-        )
-    if os.path.exists(path) and not path.is_dir():
-        raise RunExistsError(
-            f"{path}: expected a folder for the run, got a file; "
-            "choose another name with `run`"
-        )
+    _check_possible_folder(path)
     with storage_errors(path):
         is_free = not path.exists() or all(
             _is_leftover(entry) for entry in path.iterdir()
@@ -682,6 +714,25 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
         )
 
 
+def _check_possible_folder(path: Path) -> None:
+    """Check that a path may be that of a folder.
+
+    Raises:
+        InputError: it is no possible path.
+        RunExistsError: it is a file.
+    """
+    if "\0" in str(path):
+        raise InputError(
+            f"expected a name or a folder for the run, got {str(path)!r} "
+            "with a zero byte in it"
+        )
+    if os.path.exists(path) and not path.is_dir():
+        raise RunExistsError(
+            f"{path}: expected a folder for the run, got a file; "
+            "choose another name with `run`"
+        )
+
+
 def _make_numbered_directory(default: str) -> Path:
     """Make and return the first free directory of ``default-001``, ``default-002`` and
     so on.
@@ -696,15 +747,22 @@ def _make_numbered_directory(default: str) -> Path:
             for path in HOME.iterdir()
             if (match := pattern.fullmatch(path.name))
         ]
-        # Another process may take a number between listing and mkdir: then the next one
-        # is tried.
-        for number in itertools.count(max(used_numbers, default=0) + 1):
-            path = HOME / f"{default}-{number:03d}"
-            try:
-                path.mkdir()
-            except FileExistsError:
-                continue
-            return path
+        return _make_first_free(default, max(used_numbers, default=0) + 1)
+
+
+def _make_first_free(default: str, first: int) -> Path:
+    """Make and return the first free directory of a name with a number, from `first` on.
+
+    Another process may take a number between listing and mkdir: then the next one is
+    tried.
+    """
+    for number in itertools.count(first):
+        path = HOME / f"{default}-{number:03d}"
+        try:
+            path.mkdir()
+        except FileExistsError:
+            continue
+        return path
     raise AssertionError("unreachable: `count` does not end")
 
 
