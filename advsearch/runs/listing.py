@@ -192,8 +192,8 @@ def _make_listed_run(
         path.name,
         str(path),
         command=str(command),
-        object=_name_objects(config, result),
-        controls=_name_controls(config, result),
+        object=_name_listed_objects(config, result),
+        controls=_name_listed_controls(config, result),
         rows=sum(kinds.values()),
         state=_find_state(result, running),
         outcome=result.outcome_summary if result else "",
@@ -219,7 +219,7 @@ def _count_stored_rows(path: Path, faults: list[str]) -> dict[str, int]:
     return kinds
 
 
-def _name_objects(config: Mapping[str, object], result: Result | None) -> str:
+def _name_listed_objects(config: Mapping[str, object], result: Result | None) -> str:
     """Return the objects of a run, from its settings or else from its result."""
     object_name = config.get("object") or _get_object_names(result)
     # If the settings could be read, the command has no object, and the name is empty.
@@ -228,7 +228,7 @@ def _name_objects(config: Mapping[str, object], result: Result | None) -> str:
     return str(object_name)
 
 
-def _name_controls(
+def _name_listed_controls(
     config: Mapping[str, object], result: Result | None
 ) -> tuple[str, ...]:
     """Return the names of the controls of a run, from its result or its settings."""

@@ -132,7 +132,8 @@ class Measurements:
         """
         collected_rows = self._collect_rows(rows, make_result)
         result = make_result(collected_rows)
-        return self._find_earlier_result(type(result)) or result
+        earlier_result = self._find_earlier_result(type(result))
+        return result if earlier_result is None else earlier_result
 
     def _collect_rows(
         self, rows: Iterable[Row], make_result: Callable[[list[Row]], AnyResult]

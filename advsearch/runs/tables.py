@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import islice
@@ -171,16 +171,20 @@ def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
         # are repetitions with other noise.
         if not is_sampled and units.noise == 1:
             units = replace(units, samples=1, noise=units.samples)
-        is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
-        # larger numbers would overflow int64
-        n_rows = prod(units.sizes) * units.samples * units.noise * units.models
-        n_photograph_images = units.photographs * units.scene
-        are_counts_valid = max(n_rows, n_photograph_images) <= MAX_ROWS
-        if is_frame_axis_valid and are_counts_valid:
+        if _are_possible(units):
             return units
     raise FileFormatError(
         f"{store.path}: expected the units of a sweep, got {str(noted)[:80]}"
     )
+
+
+def _are_possible(units: Units) -> bool:
+    """Return whether the frames are an axis, and all numbers fit into int64."""
+    is_frame_axis_valid = units.frames is None or units.frames < len(units.sizes)
+    n_rows = prod(units.sizes) * units.samples * units.noise * units.models
+    n_photograph_images = units.photographs * units.scene
+    are_counts_valid = max(n_rows, n_photograph_images) <= MAX_ROWS
+    return is_frame_axis_valid and are_counts_valid
 
 
 KIND = "sweep"  # rows of the sweep itself
@@ -312,20 +316,26 @@ def make_sweep_frame(
         {**_make_cells(row, number, units), **get_extra_columns(row)}
         for number, row in enumerate(rows, 1)
     )
-    frames = list[pd.DataFrame]()
-    # in chunks, since a list of all cells would take far more memory than the frame
-    while chunk := list(islice(cells, CHUNK_ROWS)):
-        frames.append(_make_chunk_frame(chunk))
-    if frames:
-        frame = pd.concat(frames, ignore_index=True)
-    else:
-        frame = pd.DataFrame(dict.fromkeys(FIXED_COLUMNS, np.zeros(0)))
+    frame = _make_joined_frame(cells)
     for name in frame.select_dtypes("object"):
         frame[name] = _to_categories(frame[name])
     frame = frame.astype({"id": np.int64, "step": np.int64})
     frame["unit"] = frame["step"]
     frame.attrs |= {"units": units, "edges": {}}
     return frame
+
+
+def _make_joined_frame(cells: Iterator[Mapping[str, Any]]) -> pd.DataFrame:
+    """Return rows of cells as a frame, made in chunks of `CHUNK_ROWS` rows.
+
+    A list of all cells would take far more memory than the frame.
+    """
+    frames = list[pd.DataFrame]()
+    while chunk := list(islice(cells, CHUNK_ROWS)):
+        frames.append(_make_chunk_frame(chunk))
+    if frames:
+        return pd.concat(frames, ignore_index=True)
+    return pd.DataFrame(dict.fromkeys(FIXED_COLUMNS, np.zeros(0)))
 
 
 def _make_chunk_frame(cells: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
@@ -347,12 +357,6 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         units: units of measurement by column, to which those of the row's parameters
             are added.
     """
-    if row.label:
-        label = row.label
-    elif row.correct is None:  # the prediction was not evaluated
-        label = ""
-    else:  # it was, and the output of the model was NaN or infinite
-        label = NOT_A_NUMBER
     outcome = get_outcome(row.payload)
     # in the order of `FIXED_COLUMNS`
     fixed_values = (
@@ -362,7 +366,7 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         row.margin,
         row.probability,
         row.seconds,
-        label,
+        _find_row_label(row),
         "" if outcome is None else outcome.value,
     )
     cells: dict[str, Any] = dict(zip(FIXED_COLUMNS, fixed_values, strict=True))
@@ -375,6 +379,14 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
                 value = sys.intern(value)  # equal texts of many rows share their memory
             cells[column] = value
     return cells
+
+
+def _find_row_label(row: Row) -> str:
+    """Return the label of a row, or a text for one that has none."""
+    if row.label:
+        return row.label
+    # If the prediction was evaluated, the output of the model was NaN or infinite.
+    return "" if row.correct is None else NOT_A_NUMBER
 
 
 def _to_categories(column: pd.Series) -> pd.Categorical:

@@ -11,6 +11,7 @@ import logging
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from queue import Full, Queue
 from typing import Any
@@ -158,7 +159,7 @@ class Tracker:
 
 def _open_tracker(
     name: str, folder: Path, settings: Mapping[str, str]
-) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
+) -> tuple[LogMetrics, Callable[[], object]]:
     """Open a run of a tracker.
 
     Args:
@@ -174,37 +175,42 @@ def _open_tracker(
     if name == "mlflow":
         package.start_run(run_name=folder.name, nested=True)
         package.log_params(settings)
-
-        def log_metrics(numbers: MetricValues, step: int) -> None:
-            package.log_metrics(dict(numbers), step=step)
-
-        return log_metrics, package.end_run
+        return partial(_log_to_mlflow, package), package.end_run
     # The settings are not sent to TensorBoard: its files are in the folder of the run,
     # where run.yaml has them.
     if name == "tensorboard":
         writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
-
-        def add_scalars(numbers: MetricValues, step: int) -> None:
-            for metric, value in numbers.items():
-                writer.add_scalar(metric, value, step)
-
-        return add_scalars, writer.close
+        return partial(_log_to_tensorboard, writer), writer.close
     run = package.init(
         project="advsearch",
         name=folder.name,
         config=dict(settings),
         reinit="create_new",
     )
+    return partial(_log_to_wandb, run), run.finish
 
-    def log(numbers: MetricValues, step: int) -> None:
-        # The step of wandb itself may never decrease, but the steps of each kind of
-        # rows begin at 0. So the step is sent as a metric of its own, such as
-        # "search/step" with the metric "search/margin".
-        first_metric = next(iter(numbers), "rows/")  # "rows/" if there are no metrics
-        kind = first_metric.partition("/")[0]
-        run.log({**numbers, f"{kind}/step": step})
 
-    return log, run.finish
+def _log_to_mlflow(package: Any, numbers: MetricValues, step: int) -> None:
+    """Send metrics with their step to MLflow; `package` is its module."""
+    package.log_metrics(dict(numbers), step=step)
+
+
+def _log_to_tensorboard(writer: Any, numbers: MetricValues, step: int) -> None:
+    """Send metrics with their step to TensorBoard, by its writer."""
+    for metric, value in numbers.items():
+        writer.add_scalar(metric, value, step)
+
+
+def _log_to_wandb(run: Any, numbers: MetricValues, step: int) -> None:
+    """Send metrics with their step to Weights & Biases, into one of its runs."""
+    # The step of wandb itself may never decrease, but the steps of each kind of
+    # rows begin at 0. So the step is sent as a metric of its own, such as
+    # "search/step" with the metric "search/margin".
+    first_metric = next(iter(numbers), "rows/")  # "rows/" if there are no metrics
+    kind = first_metric.partition("/")[0]
+    run.log({**numbers, f"{kind}/step": step})
 
 
 MetricValues = Mapping[str, float]
+# sends metrics by name with their step
+LogMetrics = Callable[[MetricValues, int], object]

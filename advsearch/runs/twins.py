@@ -78,40 +78,61 @@ def find_twin_evidence(
     result = read_twins(run)
     table: Sequence[TwinAgreement] = getattr(result, "table", ())
     rows = [row for row in table if row.surroundings != WITHOUT_OBJECT]
-    if not rows:
-        return _make_empty(run, TwinMatch.NOTHING)
-    rows = [row for row in rows if _name_model(row.model) == _name_model(model)]
-    if not rows:
-        return _make_empty(run, TwinMatch.OTHER_MODEL)
-    rows = [row for row in rows if row.task == task]
-    if not rows:
-        return _make_empty(run, TwinMatch.OTHER_TASK)
+    model_name = _name_model(model)
+    rows_of_model = [row for row in rows if _name_model(row.model) == model_name]
+    rows_of_task = [row for row in rows_of_model if row.task == task]
+    if not rows_of_task:
+        return _make_empty(run, _explain_no_row(rows, rows_of_model))
     surroundings = IN_PHOTOGRAPH if in_photograph else environment
     object_stem = PurePath(object_name).stem
-
-    def rank(row: TwinAgreement) -> tuple[bool, ...]:
-        """Return how similar the conditions of a row are, as a key for sorting.
-
-        The first entry counts most: the same object, all objects together, the same
-        surroundings, and any environment rather than a photograph.
-        """
-        is_of_all_objects = not row.object
-        return (
-            row.object == object_stem,
-            is_of_all_objects,
-            row.surroundings == surroundings,
-            row.surroundings != IN_PHOTOGRAPH,
-        )
-
     # A row with a condition is about a part of the photographs. For each model and task
     # the table also has rows without one, about all of them.
-    row = max((row for row in rows if not row.condition), key=rank)
+    row = max(
+        (row for row in rows_of_task if not row.condition),
+        key=lambda row: _rank_similarity(row, object_stem, surroundings),
+    )
     return TwinEvidence(
         run=run,
         match=TwinMatch.MEASURED,
         same_object=row.object == object_stem,
         same_surroundings=row.surroundings == surroundings,
         row=row,
+    )
+
+
+def _explain_no_row(
+    rows: Sequence[TwinAgreement], rows_of_model: Sequence[TwinAgreement]
+) -> TwinMatch:
+    """Return why no row of a run of twins is about the model and the task.
+
+    Args:
+        rows: all rows with the object in view.
+        rows_of_model: those about the model.
+    """
+    if not rows:
+        return TwinMatch.NOTHING
+    return TwinMatch.OTHER_TASK if rows_of_model else TwinMatch.OTHER_MODEL
+
+
+def _rank_similarity(
+    row: TwinAgreement, object_stem: str, surroundings: str
+) -> tuple[bool, ...]:
+    """Return how similar the conditions of a row are, as a key for sorting.
+
+    The first entry counts most: the same object, all objects together, the same
+    surroundings, and any environment rather than a photograph.
+
+    Args:
+        row: row of the table of a run of twins.
+        object_stem: name of the object to compare with.
+        surroundings: environment to compare with, or `IN_PHOTOGRAPH`.
+    """
+    is_of_all_objects = not row.object
+    return (
+        row.object == object_stem,
+        is_of_all_objects,
+        row.surroundings == surroundings,
+        row.surroundings != IN_PHOTOGRAPH,
     )
 
 
