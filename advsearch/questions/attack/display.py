@@ -210,8 +210,19 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
     light = summary.ambient
     if light is None:
         return []
-    success = wording.format_success_word(summary)
-    columns: Mapping[str, Column] = {
+    part = ResultPart.make_table(
+        light.points,
+        _make_ambient_columns(wording.format_success_word(summary)),
+        title="Ambient light",
+        text=[_ambient_text(light)],
+        note=AMBIENT_NOTE,
+    )
+    return [part]
+
+
+def _make_ambient_columns(success: str) -> dict[str, Column]:
+    """Return the columns of the table of ambient light; `success` names a success."""
+    return {
         "ambient light": "{0.lux:.3g} lux",
         "wrong": lambda point: words.format_tally(
             success, point.verified.successes, point.verified.trials
@@ -219,14 +230,6 @@ def make_ambient_parts(summary: AttackSummary) -> list[ResultPart]:
         "95 % interval": lambda point: words.format_interval(point.verified.interval),
         "": lambda point: "holds" if point.holds else "ends",
     }
-    part = ResultPart.make_table(
-        light.points,
-        columns,
-        title="Ambient light",
-        text=[_ambient_text(light)],
-        note=AMBIENT_NOTE,
-    )
-    return [part]
 
 
 def _ambient_text(light: AmbientLight) -> str:
@@ -594,25 +597,35 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     heads += [
         f"tested on {words.shorten_name(tested.model)}" for tested in result.tested
     ]
-    rows = list[list[str]]()
-    runs = list[str | None]()  # run of each row
+    clean_rows = []
     if result.tested:
-        rows.append(["clean scene", "", *_clean_rate_cells(result)])
-        runs.append(None)
-    rate_of_cell = dict[tuple[int, int], float]()
-    for row in result.table:
-        for column, cell in enumerate(row.tested, start=N_LEADING_COLUMNS):
-            rate_of_cell[len(rows), column] = cell.verified.rate
-        rows.append(_make_matrix_row(row))
-        runs.append(row.run)
+        clean_rows = [["clean scene", "", *_clean_rate_cells(result)]]
+    rows = [*clean_rows, *map(_make_matrix_row, result.table)]
+    clean_runs: list[str | None] = [None] * len(clean_rows)
     return ResultPart(
         "Attacked on, tested on",
         column_heads=heads,
         rows=rows,
         note=_matrix_note(result),
-        parts=runs,
-        cell_fractions=rate_of_cell,
+        parts=[*clean_runs, *(row.run for row in result.table)],
+        cell_fractions=_find_cell_rates(result, first_row=len(clean_rows)),
     )
+
+
+def _find_cell_rates(
+    result: MatrixResult, first_row: int
+) -> dict[tuple[int, int], float]:
+    """Return the rate of each cell by its row and its column in the table.
+
+    Args:
+        result: the matrix.
+        first_row: row of the first attack.
+    """
+    return {
+        (row_index, column_index): cell.verified.rate
+        for row_index, row in enumerate(result.table, start=first_row)
+        for column_index, cell in enumerate(row.tested, start=N_LEADING_COLUMNS)
+    }
 
 
 def _make_matrix_row(row: MatrixRow) -> list[str]:

@@ -467,16 +467,10 @@ def _search_part(
         objectives: objectives of the "search" and of the "baseline", the random search,
             in order of evaluation; None if an objective was not a number.
     """
-    curves = dict[str, list[float | None]]()
-    ranges = []
-    for kind, name in (("search", summary.policy), ("baseline", "random search")):
-        values = objectives.get(kind, [])
-        known = [value for value in values if value is not None]
-        if known:
-            curves[name] = values
-            ranges.append(f"{name}: from {known[0]:.3g} to {max(known):.3g}")
+    curves = _select_curves(summary, objectives)
     if not curves:
         return ResultPart()
+    ranges = [_curve_range_text(name, values) for name, values in curves.items()]
     label = words.format_objective(summary.objective)
     zero_means = _zero_line_text(summary)
     return ResultPart(
@@ -486,6 +480,24 @@ def _search_part(
         note="Lines: the best so far. Dots: each evaluation. These are claims of the "
         "search; the table above is verified.",
     )
+
+
+def _select_curves(
+    summary: AttackSummary, objectives: Mapping[str, list[float | None]]
+) -> dict[str, list[float | None]]:
+    """Return the objectives of the searches with any, by the name of the policy."""
+    curves = dict[str, list[float | None]]()
+    for kind, name in (("search", summary.policy), ("baseline", "random search")):
+        values = objectives.get(kind, [])
+        if any(value is not None for value in values):
+            curves[name] = values
+    return curves
+
+
+def _curve_range_text(name: str, values: Sequence[float | None]) -> str:
+    """Return the first and the largest objective of a search, with its name."""
+    known = [value for value in values if value is not None]
+    return f"{name}: from {known[0]:.3g} to {max(known):.3g}"
 
 
 def _zero_line_text(summary: AttackSummary) -> str:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster import BatchFunction, BatchResult, WorkerTask
+from advsearch.cluster import BatchFunction, BatchResult, Workers, WorkerTask
 from advsearch.cluster.workers import open_workers
 from advsearch.engine.journal import make_worker_call
 from advsearch.engine.judging import find_label_warnings
@@ -244,9 +244,14 @@ def distribute_attacks(
             _check_not_lost(chains, result)
             for name, worker_path, files in result.value:
                 _write_part(run, name, worker_path, files)
-            stats = executor.stats
-            worker_counts = {} if stats is None else {"workers": stats.workers}
-            progress.advance(1, **worker_counts)
+            _report_chain(executor, progress)
+
+
+def _report_chain(executor: Workers, progress: Progress) -> None:
+    """Report that the attacks of a chain are done, and how many workers there are."""
+    stats = executor.stats
+    worker_counts = {} if stats is None else {"workers": stats.workers}
+    progress.advance(1, **worker_counts)
 
 
 def _make_study_task(config: AttackConfig) -> WorkerTask:
@@ -677,14 +682,7 @@ def _try_on_models(
     conditions = _make_conditions(names, spp, config)
     worker = "advsearch.questions.attack.studies:models_worker"
     with open_executor(config, worker, study.progress) as executor:
-        retrials = Retrials(
-            conditions,
-            study.run,
-            study.progress,
-            trials=config.trial_count,
-            seed=seeds.derive_seed(config.seed, "matrix"),
-            executor=executor,
-        )
+        retrials = _make_retrials(study, conditions, executor)
         _begin_trials(study, "trying the clean scene on every model", len(names))
         for condition in conditions:
             models.append(_try_clean(retrials, condition))
@@ -695,6 +693,27 @@ def _try_on_models(
                 _try_adversarial(retrials, name, u, condition)
                 for condition in conditions
             ]
+
+
+def _make_retrials(
+    study: StudyRun, conditions: Sequence[RetrialCondition], executor: Workers | None
+) -> Retrials:
+    """Return what makes the trials of a matrix.
+
+    Args:
+        study: study of the attacks.
+        conditions: what trials need of each model.
+        executor: makes the trials; None makes them in this process.
+    """
+    config = study.context.config
+    return Retrials(
+        conditions,
+        study.run,
+        study.progress,
+        trials=config.trial_count,
+        seed=seeds.derive_seed(config.seed, "matrix"),
+        executor=executor,
+    )
 
 
 def _begin_trials(study: StudyRun, title: str, n_models: int) -> None:
