@@ -369,7 +369,18 @@ def _make_cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
         _find_row_label(row),
         "" if outcome is None else outcome.value,
     )
-    cells: dict[str, Any] = dict(zip(FIXED_COLUMNS, fixed_values, strict=True))
+    fixed_cells = dict(zip(FIXED_COLUMNS, fixed_values, strict=True))
+    return {**fixed_cells, **_make_parameter_cells(row, units)}
+
+
+def _make_parameter_cells(row: Row, units: dict[str, str]) -> dict[str, Any]:
+    """Return the values of the parameters of a row by column.
+
+    Args:
+        row: the row.
+        units: units of measurement by column, to which those of the row are added.
+    """
+    cells: dict[str, Any] = {}
     for name, described in row.values.items():
         # The name of a parameter may be that of another column.
         parameter_name = f"parameter {name}" if name in RESERVED_NAMES else name

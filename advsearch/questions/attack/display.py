@@ -597,7 +597,7 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     heads += [
         f"tested on {words.shorten_name(tested.model)}" for tested in result.tested
     ]
-    clean_rows = []
+    clean_rows: list[list[str]] = []
     if result.tested:
         clean_rows = [["clean scene", "", *_clean_rate_cells(result)]]
     rows = [*clean_rows, *map(_make_matrix_row, result.table)]

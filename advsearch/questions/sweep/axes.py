@@ -162,17 +162,9 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         return _parse_key_axis(name, values, control)
 
     parameters = _find_parameters(values, instances, control, parameter_name, instance)
-    _check_parameter_name(where, parameter_name, parameters)
-    if colon_instance is not None:
-        families.check_instance_name(where, colon_instance)  # raises if it is empty
-    if parameter_name not in parameters:
-        raise UnknownNameError(
-            f"parameter of control {control.kind}",
-            parameter_name,
-            list(parameters),
-            f"In {where}.",
-        )
-    parameter = parameters[parameter_name]
+    parameter = _select_parameter(
+        where, parameters, parameter_name, colon_instance, control.kind
+    )
     _check_scalar(where, control, parameter, instance)
     return Axis(
         control_kind=control.kind,
@@ -182,21 +174,38 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
     )
 
 
-def _check_parameter_name(
-    where: str, parameter_name: str, parameters: Mapping[str, Any]
-) -> None:
-    """Raise an error if the name of an axis has no parameter.
+def _select_parameter(
+    where: str,
+    parameters: Mapping[str, Any],
+    parameter_name: str,
+    colon_instance: str | None,
+    kind: str,
+) -> Any:
+    """Return the parameter that the name of an axis states.
 
     Args:
         where: the axis, as messages name it.
-        parameter_name: the parameter in the name; empty without one.
         parameters: the parameters of the control by name.
+        parameter_name: the parameter in the name; empty without one.
+        colon_instance: the instance after a colon in the name; None without one.
+        kind: kind of the control.
+
+    Raises:
+        InputError, UnknownNameError: there is no such parameter, or no instance after
+            the colon.
     """
     if not parameter_name:
         raise InputError(
             f"{where}: expected CONTROL.PARAMETER, got no parameter; "
             f"choose one of {', '.join(parameters)}"
         )
+    if colon_instance is not None:
+        families.check_instance_name(where, colon_instance)  # raises if it is empty
+    if parameter_name not in parameters:
+        what = f"parameter of control {kind}"
+        hint = f"In {where}."
+        raise UnknownNameError(what, parameter_name, list(parameters), hint)
+    return parameters[parameter_name]
 
 
 def _split_axis_name(name: str) -> tuple[str, str, str | None]:
@@ -852,19 +861,15 @@ class SceneConfigurations:
         ):
             if group.name in self._axes:
                 axis_index, _ = self._axes[group.name]
-                self._grid_coordinates.append(
-                    _GridCoordinate(coordinates.start, axis_index)
-                )
+                grid_coordinate = _GridCoordinate(coordinates.start, axis_index)
+                self._grid_coordinates.append(grid_coordinate)
                 continue
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
+            columns = _find_free_columns(blocks, block)
             blocks.append(
                 _SampledBlock(
-                    group.control,
-                    group.parameter,
-                    block,
-                    coordinates,
-                    columns=_find_free_columns(blocks, block),
+                    group.control, group.parameter, block, coordinates, columns
                 )
             )
 

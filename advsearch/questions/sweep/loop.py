@@ -147,19 +147,22 @@ class Sweep:
         # Problems are loaded by the name of the scene in each work item.
         self.journal = Journal(run, ParallelEvaluator(None, executor))
         self._reset_counts()
-        # images, also predicted ones, since this sweep was resumed
-        self._n_rendered = 0
+        self._reset_progress()
         # Summaries of the predictors of images, by worker and scene. There is one for
         # each size of images; None if nothing that they predict moves.
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._has_non_finite = (
             run is not None and run.store.read_note(NOT_FINITE) is not None
         )
+        self._surface: SurfaceMap | None = None
+        self._drives: list[DriveRates] | None = None
+
+    def _reset_progress(self) -> None:
+        """Set what is counted for the progress since this sweep was resumed to 0."""
+        self._n_rendered = 0  # images, also predicted ones
         self._sweep_begin = 0.0
         self._last_report = 0.0
         self._n_unreported = 0
-        self._surface: SurfaceMap | None = None
-        self._drives: list[DriveRates] | None = None
 
     def _reset_counts(self) -> None:
         """Set the counts of the full sweep to 0, also of what was done before a stop."""
@@ -899,12 +902,7 @@ class Sweep:
         """
         yield from make_lost_remarks(self._n_lost)
         yield from self.journal.remarks
-        units = self.independent_units
-        n_repeats = units.noise  # images that differ only in noise
-        # With a folder of photographs, a unit is a photograph, and not such images.
-        if n_repeats > 1 and units.photographs == 1:
-            n_units = self.n_rows // units.size
-            yield explain_repeats(units.name, n_repeats, n_units)
+        yield from self._list_repeat_remarks()
         yield from self._list_drive_remarks()
         yield from self._list_prediction_remarks(predictions)
         if self._has_non_finite:
@@ -917,13 +915,16 @@ class Sweep:
             )
         for rates in changes:
             if _is_blind(rates):
-                # `correct` counts the predictions that changed.
-                n_same = rates.configurations - rates.correct
-                yield (
-                    f"{rates.model} says the same in {n_same} of "
-                    f"{rates.configurations} pictures when {BLIND[rates.when]}: it may "
-                    "not be looking at the object."
-                )
+                yield _make_blind_remark(rates)
+
+    def _list_repeat_remarks(self) -> Iterator[str]:
+        """Yield a remark on images that differ only in noise."""
+        units = self.independent_units
+        n_repeats = units.noise
+        # With a folder of photographs, a unit is a photograph, and not such images.
+        if n_repeats > 1 and units.photographs == 1:
+            n_units = self.n_rows // units.size
+            yield explain_repeats(units.name, n_repeats, n_units)
 
     def _list_drive_remarks(self) -> Iterator[str]:
         """Yield a remark on what few drives can show at best.
@@ -984,6 +985,17 @@ def _is_blind(rates: ChangeRates) -> bool:
     # interval is known.
     upper_bound = rates.interval[1] if rates.interval is not None else 1.0
     return rates.claim == "must_change" and upper_bound < 0.5
+
+
+def _make_blind_remark(rates: ChangeRates) -> str:
+    """Return that most predictions of a model stay the same without the object."""
+    # `correct` counts the predictions that changed.
+    n_same = rates.configurations - rates.correct
+    return (
+        f"{rates.model} says the same in {n_same} of "
+        f"{rates.configurations} pictures when {BLIND[rates.when]}: it may "
+        "not be looking at the object."
+    )
 
 
 def _format_megabytes(megabytes: float) -> str:

@@ -571,13 +571,27 @@ class SweepPredictor:
             else:
                 numbers_by_predictor.setdefault(predictor, []).append(number)
         for predictor, numbers in numbers_by_predictor.items():
-            configurations = [query_of_image[number].u for number in numbers]
-            predicted = predictor.predict_images(configurations)
-            for number, image in zip(numbers, predicted, strict=True):
-                n_traced = self._count_traced(number)
-                images[number] = SweptImage(
-                    image, prediction_spp=self.method.samples, n_traced=n_traced
-                )
+            queries = [query_of_image[number] for number in numbers]
+            images |= self._predict_swept_images(predictor, numbers, queries)
+        return images
+
+    def _predict_swept_images(
+        self, predictor: Predictor, numbers: Sequence[int], queries: Sequence[Query]
+    ) -> dict[int, SweptImage]:
+        """Predict images by one predictor, by their numbers in the scene.
+
+        Args:
+            predictor: the predictor.
+            numbers: (n,) numbers of the images.
+            queries: (n,) their queries.
+        """
+        predicted = predictor.predict_images([query.u for query in queries])
+        images: dict[int, SweptImage] = {}
+        for number, image in zip(numbers, predicted, strict=True):
+            n_traced = self._count_traced(number)
+            images[number] = SweptImage(
+                image, prediction_spp=self.method.samples, n_traced=n_traced
+            )
         return images
 
     def _render_swept_image(self, number: int, query: Query) -> SweptImage:

@@ -375,6 +375,13 @@ class SurfaceCounts:
         for model, failed in wrong_by_model.items():
             self.part_counts_of_model[model].add_image(visible_parts, failed)
 
+    def compare_all(self) -> list[dict[str, pd.DataFrame]]:
+        """Return for each model the comparison of its parts, by the kind of the parts."""
+        return [
+            _compare_kinds(part_counts, self.parts)
+            for part_counts in self.part_counts_of_model
+        ]
+
     def summarize_kind(
         self,
         object_name: str,
@@ -718,10 +725,7 @@ def _write_map(
         "models": np.array(models),
     }
     for number, (name, object_counts) in enumerate(counts.items()):
-        comparisons = [
-            _compare_kinds(model_counts, object_counts.parts)
-            for model_counts in object_counts.part_counts_of_model
-        ]
+        comparisons = object_counts.compare_all()
         for array_name, array in _list_arrays(object_counts, comparisons).items():
             arrays[f"{array_name}_{number}"] = array
         panels += _make_panels(assets[name], object_counts, comparisons, name, models)
