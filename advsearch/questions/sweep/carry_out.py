@@ -174,18 +174,14 @@ def sweep(
         metrics=metrics,
         tracker=tracker,
     )
-    set_options = _drop_unset(settings)
-    # The settings as `run.yaml` states them, with names in place of objects.
-    described = {
-        **request.describe_parts(),
+    varied = {
         "grid": dict(grid or {}),
         "samples": samples,
         "adversarial_of": attack_run,
     }
-    if request.loaded_scenes:
-        naming.check_no_scene_settings(set_options)
-    described |= _describe_scenes(scenes, request.loaded_scenes)
+    set_options = _drop_unset(settings)
     run_setting = {"run": None if run is None else str(run)}
+    described = {**request.to_settings(set_options), **varied}
     # A later mapping overrides earlier ones: what is passed overrides the attack.
     config = SweepConfig(**{**defaults, **described, **set_options, **run_setting})
     config = config.with_python_only_parts(request.find_python_only(config))
@@ -226,15 +222,25 @@ class SweepRequest:
     metrics: Mapping[str, str | Metric] | None
     tracker: Callable[[], Step] | None
 
-    def describe_parts(self) -> dict[str, Any]:
-        """Return the settings that describe what was passed, without the scenes."""
+    def to_settings(self, set_options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings that describe what was passed, with names of objects.
+
+        Args:
+            set_options: the other settings that the caller passed.
+
+        Raises:
+            InputError: scenes are loaded, and a setting of a scene was passed.
+        """
         task = self.task
-        return {
+        described: dict[str, Any] = {
             "model": ",".join(get_model_name(model) for model in self.models),
             "task": convert_to_setting(task) if isinstance(task, Task) else task,
             "controls": loading.controls_to_settings(self.controls),
             "metrics": judging.metrics_to_settings(self.metrics or {}),
         }
+        if self.loaded_scenes:
+            naming.check_no_scene_settings(set_options)
+        return described | _describe_scenes(self.scenes, self.loaded_scenes)
 
     def find_python_only(self, config: SweepConfig) -> list[PythonOnly]:
         """Return what exists only in this session, so that no command can repeat it.

@@ -266,12 +266,8 @@ class Job:
                 if the scene keeps its own.
             values: values of the controls.
         """
-        named_scene = self.scenes[scene]
-        fixed_names = {control.name for control in named_scene.fixed_controls}
-        names = named_scene.value_of_scene_axis  # a new dict, which may be changed
-        if environment is not None:
-            names["environment"] = environment
-        names["model"] = self.models[model].name
+        fixed_names = {control.name for control in self.scenes[scene].fixed_controls}
+        names = self._name_row(scene, model, environment)
         row_values: dict[str, Value] = {
             name: {"value": text, "unit": ""} for name, text in names.items()
         }
@@ -280,6 +276,19 @@ class Job:
             if control_name not in fixed_names:
                 row_values[name] = value
         return row_values
+
+    def _name_row(
+        self, scene: int, model: int, environment: str | None
+    ) -> dict[str, str]:
+        """Return the names of scene and model in a row, by axis.
+
+        See `_make_row_values` for the arguments.
+        """
+        names = self.scenes[scene].value_of_scene_axis  # a new dict
+        if environment is not None:
+            names["environment"] = environment
+        names["model"] = self.models[model].name
+        return names
 
     def bind_controls(self, named_scene: NamedScene, size: ImageSize) -> Space:
         """Bind all controls of the sweep to a scene.
@@ -415,13 +424,10 @@ def check_scenes(
             environment although several environments are named.
     """
     # the axes and controls that choose the environment, as the user wrote them
-    environment_choices = _list_environment_axes(named_scenes, controls, axes)
-    for control in controls:
-        for parameter in control.parameters:
-            # A control's settings contain the parameters that it varies.
-            is_varied = parameter.name in control.to_settings()
-            if control.get_setting_name(parameter) == ENVIRONMENT and is_varied:
-                environment_choices.append(f"`controls` {control.name}")
+    environment_choices = [
+        *_list_environment_axes(named_scenes, controls, axes),
+        *_list_environment_controls(controls),
+    ]
     environments = list(
         dict.fromkeys(named_scene.environment_name for named_scene in named_scenes)
     )
@@ -463,6 +469,18 @@ def _list_environment_axes(
                 "out of one of the two"
             )
     return environment_axes
+
+
+def _list_environment_controls(controls: Sequence[Control]) -> list[str]:
+    """Return the controls that choose the environment, as the user wrote them."""
+    environment_controls = list[str]()
+    for control in controls:
+        for parameter in control.parameters:
+            # A control's settings contain the parameters that it varies.
+            is_varied = parameter.name in control.to_settings()
+            if control.get_setting_name(parameter) == ENVIRONMENT and is_varied:
+                environment_controls.append(f"`controls` {control.name}")
+    return environment_controls
 
 
 def _find_setting(axis: Axis, controls: Sequence[Control]) -> str:
@@ -686,20 +704,34 @@ class SweptScene:
         for query in queries:
             number, model = divmod(query.row_index, len(self.job.models))
             image = images[self.job.image_sizes[model]][number]
-            # Models of one size share the image: its cost counts for the first.
-            cost = image.n_traced if self.job.is_first_of_size[model] else 0
-            evaluation = Evaluation.from_judgement(
-                judgements[query.row_index],
-                cost=cost,
-                # its samples per pixel; 0 if the image was rendered
-                predicted=image.prediction_spp,
-                seconds=seconds,
-            )
+            judgement = judgements[query.row_index]
+            evaluation = self._make_evaluation(model, image, judgement, seconds)
             if model == 0:
                 is_wrong = number in wrong_images
                 evaluation = self._attach_images(evaluation, query, image, is_wrong)
             evaluations.append(evaluation)
         return evaluations
+
+    def _make_evaluation(
+        self, model: int, image: SweptImage, judgement: Judgement, seconds: float
+    ) -> Evaluation:
+        """Return the evaluation of a query without images.
+
+        Args:
+            model: index of the model.
+            image: image of the query.
+            judgement: judgement of the image.
+            seconds: seconds that the query took.
+        """
+        # Models of one size share the image: its cost counts for the first.
+        cost = image.n_traced if self.job.is_first_of_size[model] else 0
+        return Evaluation.from_judgement(
+            judgement,
+            cost=cost,
+            # its samples per pixel; 0 if the image was rendered
+            predicted=image.prediction_spp,
+            seconds=seconds,
+        )
 
     def _find_wrong_images(self, judgements: Mapping[int, Judgement]) -> set[int]:
         """Return the numbers of the images in which any model is wrong.
@@ -831,13 +863,9 @@ class SweptScene:
                 changed_images = self._render_empty(size, queries)
             else:
                 changed_images = _change_images(images, change, problem.model.cameras)
-            changed_judgements = problem.judge_images(
-                changed_images, configurations, values
-            )
-            judgements = [
-                _add_change_metric(claim, change, before, after)
-                for before, after in zip(judgements, changed_judgements, strict=True)
-            ]
+            after = problem.judge_images(changed_images, configurations, values)
+            metric = f"{claim} {change}"
+            judgements = _add_metric(judgements, after, claim, metric)
         return judgements
 
     def _render_empty(self, size: ImageSize, queries: Sequence[Query]) -> Tensor:
@@ -975,20 +1003,23 @@ def _change_images(images: Tensor, change: str, n_cameras: int) -> Tensor:
     return torch.stack([change_image(image, change, n_cameras) for image in images])
 
 
-def _add_change_metric(
-    claim: str, change: str, before: Judgement, after: Judgement
-) -> Judgement:
-    """Return a judgement with the metric of a claim about a changed image.
+def _add_metric(
+    before: Sequence[Judgement], after: Sequence[Judgement], claim: str, metric: str
+) -> list[Judgement]:
+    """Return judgements with the metric of a claim about changed images.
 
     Args:
+        before: (n,) judgements of the unchanged images.
+        after: (n,) judgements of the changed images.
         claim: the claim, such as "must_change".
-        change: name of the change, such as "black".
-        before: judgement of the unchanged image.
-        after: judgement of the changed image.
+        metric: name of the metric, which is 1 if a prediction meets the claim, else 0.
     """
-    is_met = meets_claim(claim, before.prediction, after.prediction)
-    metrics = {**(before.metrics or {}), f"{claim} {change}": float(is_met)}
-    return replace(before, metrics=metrics)
+    judgements = list[Judgement]()
+    for judgement, changed in zip(before, after, strict=True):
+        is_met = meets_claim(claim, judgement.prediction, changed.prediction)
+        metrics = {**(judgement.metrics or {}), metric: float(is_met)}
+        judgements.append(replace(judgement, metrics=metrics))
+    return judgements
 
 
 def verify_worst(
