@@ -970,8 +970,10 @@ class _SmallestSearch:
             check_index: index of the check, which decides the seeds of its trials.
             min_trials: number of trials that suffices if none fails.
         """
+        rule = self.searches.problem.verification_rule
+        max_failures = rule.count_allowed_failures(self.verifier.n_trials)
         scores, has_passed = _try_until_decided(
-            self.verifier, u, check_index, min_trials
+            self.verifier, u, check_index, min_trials, max_failures
         )
         if self.transport is not None:
             self.transport.update_score_bias(u, scores)
@@ -1039,24 +1041,23 @@ def _confirm(
 
 
 def _try_until_decided(
-    verifier: Verifier, u: Tensor, check_index: int, min_trials: int
+    verifier: Verifier, u: Tensor, check_index: int, min_trials: int, max_failures: int
 ) -> tuple[list[float], bool]:
     """Try a configuration until it passes a check or fails it.
 
-    The check ends when more trials have failed than the rule of verification allows, or
-    `min_trials` were made and none failed, or after all trials.
+    The check ends when more than `max_failures` trials have failed, or `min_trials`
+    were made and none failed, or after all trials.
 
     Args:
         verifier: verifier that tries it.
         u: (d,) the configuration.
         check_index: index of the check, which decides the seeds of its trials.
         min_trials: number of trials that suffices if none fails.
+        max_failures: maximum number of failed trials with which a configuration passes.
 
     Returns:
         The scores of the trials, and whether the configuration has passed.
     """
-    rule = verifier.problem.verification_rule
-    max_failures = rule.count_allowed_failures(verifier.n_trials)
     scores = list[float]()
     n_failures = 0
     for trial_index in range(verifier.n_trials):
