@@ -226,49 +226,48 @@ def _write_parquet(
     They are written in groups of `ROWS_PER_GROUP`, so that no more are in memory. The
     types of columns follow from the first group.
     """
-    parquet = _import_parquet()
+    pyarrow = _import_pyarrow()
     rows = map(_encode_payload, records)
     group = list(itertools.islice(rows, ROWS_PER_GROUP))
     schema = _make_schema(names, group)
-    with parquet.ParquetWriter(stream, schema) as writer:
+    with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
         while group:
-            writer.write_table(_make_table_of_group(group, names, schema))
+            columns = _make_columns(group, names, schema.types)
+            writer.write_table(pyarrow.table(columns, schema))
             group = list(itertools.islice(rows, ROWS_PER_GROUP))
 
 
-def _import_parquet() -> Any:
-    """Return the module that writes Parquet, which comes with the extra `parquet`.
+def _import_pyarrow() -> Any:
+    """Return the package that writes Parquet.
 
     Raises:
         InputError: it is not installed.
     """
     try:
+        # comes with the extra `parquet`
         import pyarrow.parquet
     except ImportError:
         raise InputError(
             "format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"
         ) from None
-    return pyarrow.parquet
+    return pyarrow
 
 
-def _make_table_of_group(
-    group: Sequence[JsonObject], names: Sequence[str], schema: Any
-) -> Any:
-    """Return a group of records as a table of Arrow.
+def _make_columns(
+    group: Sequence[JsonObject], names: Sequence[str], arrow_types: Sequence[Any]
+) -> dict[str, list[Any]]:
+    """Return a group of records as columns with values of their types.
 
     Args:
         group: the records.
         names: names of the columns.
-        schema: names and types of the columns, of Arrow.
+        arrow_types: types of the columns, of Arrow.
     """
-    # an optional package
-    import pyarrow
-
     columns: dict[str, list[Any]] = {}
-    for name, arrow_type in zip(names, schema.types, strict=True):
+    for name, arrow_type in zip(names, arrow_types, strict=True):
         values = [record.get(name) for record in group]
         columns[name] = _convert_column(values, arrow_type)
-    return pyarrow.table(columns, schema)
+    return columns
 
 
 def _make_schema(names: list[str], first_records: Sequence[JsonObject]) -> Any:
