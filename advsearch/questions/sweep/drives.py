@@ -473,20 +473,20 @@ class Drives:
         tracker = self._job.tracker
         if not isinstance(task, Detection):
             return None
-        if any(step not in self._frame_of_step for step in steps.flat):
+        frames = self._collect_frames(steps)
+        if frames is None:
             return None
-        # for each drive, its frames
-        frames = [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
         tracked_drives = [
             track_drive(drive_frames, tracker, task.iou) for drive_frames in frames
         ]
         # fraction of frames that are lost even if a small overlap is enough
         lost_loosely = _compute_lost_loosely(task, tracker, frames)
         lost = np.array([tracked.lost for tracked in tracked_drives], dtype=float)
-        switches = [tracked.switches for tracked in tracked_drives]
+        switches = np.array(
+            [tracked.switches for tracked in tracked_drives], dtype=float
+        )
         gaps = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
         n_frames = len(self.times)
-        max_gap = n_frames * self._frame_interval
         summarize = partial(summarize_drives, drive_of_value=drive)
         # In the worst drive each of these rates is largest: therefore `max`.
         return TrackRates(
@@ -495,13 +495,25 @@ class Drives:
             # frames that are lost, but not if a small overlap is enough
             loose=summarize(lost - lost_loosely, max),
             # at most one switch between two frames
-            switches=summarize(
-                np.array(switches, dtype=float), max, bounds=(0.0, n_frames - 1.0)
-            ),
+            switches=summarize(switches, max, bounds=(0.0, n_frames - 1.0)),
             longest_gap=summarize(
-                gaps * self._frame_interval, max, bounds=(0.0, max_gap)
+                gaps * self._frame_interval,
+                max,
+                bounds=(0.0, n_frames * self._frame_interval),
             ),
         )
+
+    def _collect_frames(
+        self, steps: npt.NDArray[np.int64]
+    ) -> list[list[DetectedFrame]] | None:
+        """Return the frames of each drive; None unless every frame has its boxes.
+
+        Args:
+            steps: (n, frames) numbers of the rows.
+        """
+        if any(step not in self._frame_of_step for step in steps.flat):
+            return None
+        return [[self._frame_of_step[step] for step in row] for row in steps.tolist()]
 
     def save_worst(self, scenes: SceneLoader, run: RunDirectory) -> None:
         """Save a strip and an animation of the first model's worst drive.
