@@ -368,6 +368,24 @@ def choose_predictor(
         problem, surface_refusal, findings, specialise=specialise
     ):
         refusal = matrix_refusal
+    return _render_search(problem, refusal, stages, findings, specialise=specialise)
+
+
+def _render_search(
+    problem: Problem,
+    refusal: Refusal,
+    stages: Stages,
+    findings: RunState,
+    *,
+    specialise: bool,
+) -> PredictedSearch | None:
+    """Prepare a search whose images are rendered, in part if renders may be cropped.
+
+    See `_crop_search` for the other arguments and for what is returned.
+
+    Args:
+        specialise: whether renders may leave out what the search does not need.
+    """
     if not specialise:
         _report_rendering(refusal, stages, findings)
         return None
@@ -750,7 +768,6 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     findings = verifier.run_state
     candidate = findings.search_result
     baseline = findings.random_search_result
-    unprinted = findings.result_without_print_terms
     if candidate is None:
         raise RuntimeError("nothing was searched, so there is nothing to verify")
     results = _list_results(findings)
@@ -766,10 +783,7 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
         # that of the search. So no change is needed, and bounds of the smallest change
         # mean nothing.
         findings.smallest_change_bracket = None
-    if unprinted is not None:
-        findings.unprinted_verification = verifier.verify(
-            "unprinted verification", unprinted
-        )
+    _verify_unprinted(verifier)
     if baseline is not None:
         _verify_baseline(verifier, candidate, baseline)
     if not is_smallest:
@@ -801,6 +815,15 @@ def _begin_verification(verifier: Verifier, n_results: int) -> None:
         n_groups += 1
     title = "checking what was found with fresh renders"
     verifier.begin_stage(title, n_groups * verifier.n_trials, at_most=True)
+
+
+def _verify_unprinted(verifier: Verifier) -> None:
+    """Verify the result of the search without print terms, if there was one."""
+    findings = verifier.run_state
+    unprinted = findings.result_without_print_terms
+    if unprinted is not None:
+        kind = "unprinted verification"
+        findings.unprinted_verification = verifier.verify(kind, unprinted)
 
 
 def _verify_baseline(
@@ -846,9 +869,8 @@ def _replace_if_random_is_worse(
     random_verification = findings.baseline_verification
     if policy_verification is None or random_verification is None:
         return
-    if random_verification.ending is not Ending.FOUND:
-        return
-    if _rank(random_verification) <= _rank(policy_verification):
+    is_found = random_verification.ending is Ending.FOUND
+    if not is_found or _rank(random_verification) <= _rank(policy_verification):
         return
     # twice the trials: of the configuration, and of the clean scene with their seeds
     title = "checking what the random search found again"

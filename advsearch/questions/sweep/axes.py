@@ -350,10 +350,7 @@ def parse_axis_values(
     spec = parse_spec(where, parameter, {"choices": choices})
     assert isinstance(spec, OneOf)  # it is what choices are parsed to
     _check_distinct(where, spec.values, is_angle)
-    has_names = any(isinstance(value, str) for value in spec.values)
-    has_numbers = not parameter.options and not has_names
-    if has_numbers:
-        _check_single_precision(where, spec.values)
+    _check_number_precision(where, parameter, spec.values)
     return spec.values
 
 
@@ -418,8 +415,19 @@ def _describe_repetition(earlier: ParameterValue, value: ParameterValue) -> str:
     return f"{_format_value(earlier)} and {_format_value(value)}, the same angle"
 
 
-def _check_single_precision(where: str, values: Sequence[Any]) -> None:
-    """Check that the values differ in single precision, which scenes have."""
+def _check_number_precision(
+    where: str, parameter: Parameter, values: Sequence[Any]
+) -> None:
+    """Check that numbers differ in single precision, which scenes have.
+
+    Args:
+        where: the axis, as messages name it.
+        parameter: the parameter that varies.
+        values: values of the axis; names are not checked.
+    """
+    has_names = any(isinstance(value, str) for value in values)
+    if parameter.options or has_names:
+        return
     singles = sorted(np.float32(value) for value in values)
     if any(lower == upper for lower, upper in pairwise(singles)):
         raise InputError(

@@ -565,10 +565,7 @@ class Sweep:
         scene = self._find_scene(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
-            values={
-                name: DescribedValue.from_values(value)
-                for name, value in query.values.items()
-            },
+            values=_describe_values(query),
             seed=query.seed,
             label_set=self._find_right_labels(scene, model, query),
             claimed=claim,
@@ -1052,3 +1049,10 @@ def _make_claim(judgement: Judgement) -> WorstClaim:
         margin=judgement.margin,
         payload=judgement.payload,
     )
+
+
+def _describe_values(query: Query) -> dict[str, DescribedValue]:
+    """Return the values of a query by parameter, as a result states them."""
+    return {
+        name: DescribedValue.from_values(value) for name, value in query.values.items()
+    }
