@@ -86,9 +86,8 @@ def make_page(run: Path, result: Result) -> str | None:
     data = make_object_data(object_file)
     if frames:
         data = [_frames_data(frames, objectives.get("search", [])), *data]
-    scripts = ["make.js", "attack.js"]
-    if object_file:
-        scripts.append("object.js")
+    object_scripts = ["object.js"] if object_file else []
+    scripts = ["make.js", "attack.js", *object_scripts]
     return make_view_page(run, result, view, data=data, scripts=scripts)
 
 

@@ -709,10 +709,7 @@ def evaluate_drive(
     if path is None:
         return None
     path_names, frames = _make_frames(problem, path, time_column)
-    # All paths have the same range of times: the last frame is the end of any path.
-    first_time = _read_time(problem, path, frames[0])
-    last_time = _read_time(problem, path, frames[-1])
-    seconds = last_time - first_time
+    seconds = _measure_path_seconds(problem, path, frames)
     # The animation has the paths one after another.
     n_paths = max(1, len(path_names))  # a single path has no name
     right_counts: dict[str, int] = {}
@@ -733,6 +730,21 @@ def evaluate_drive(
         adversarial=right_counts.get("drive"),
         spp=spp,
     )
+
+
+def _measure_path_seconds(problem: Problem, path: Any, frames: Tensor) -> float:
+    """Return the seconds from the first frame of a path to the last.
+
+    All paths have the same range of times: the last frame is the end of any path.
+
+    Args:
+        problem: problem of the attack.
+        path: the control that moves things along a path.
+        frames: (n, d) configurations of the frames.
+    """
+    first_time = _read_time(problem, path, frames[0])
+    last_time = _read_time(problem, path, frames[-1])
+    return last_time - first_time
 
 
 def _find_path(problem: Problem) -> tuple[Any, int]:

@@ -837,9 +837,8 @@ def _load_models_and_tasks(
     )
     # Remarks are collected before `make_each_thing_task` wraps the tasks below: the
     # wrappers have none.
-    warnings += [
-        remark for network_task in tasks for remark in network_task.output_remarks
-    ]
+    for network_task in tasks:
+        warnings += network_task.output_remarks
     if config.judge == ALL_THINGS:
         tasks = tuple(map(make_each_thing_task, tasks))
     labels = {
