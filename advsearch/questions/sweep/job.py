@@ -206,15 +206,23 @@ class Job:
                 first_in_scene, len(numbers), before=images_before
             )
             descriptions = configurations.describe_images(all_u, first_in_scene)
+            models = self.list_models_of_size(size)
             for number, u, values in zip(numbers, all_u, descriptions, strict=True):
                 queries += [
                     self._make_query(number, model, configurations, u, values)
-                    for model, model_size in enumerate(self.image_sizes)
-                    if model_size == size
+                    for model in models
                 ]
         # The loop above is by size; rows are by image, then by model.
         queries.sort(key=lambda query: query.row_index)
         return [(str(scene), None, query) for query in queries]
+
+    def list_models_of_size(self, size: ImageSize) -> list[int]:
+        """Return the indices of the models that get images of a size."""
+        return [
+            model
+            for model, model_size in enumerate(self.image_sizes)
+            if model_size == size
+        ]
 
     def _make_query(
         self,

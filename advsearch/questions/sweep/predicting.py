@@ -824,9 +824,8 @@ def prepare_surface_light(
     if refusal is not None:
         return
     title = "finding the light on surfaces"
-    verifier.progress_stages.begin(
-        "transport", title, N_LIGHTS, hint="`specialise=false` leaves it out"
-    )
+    hint = "`specialise=false` leaves it out"
+    verifier.progress_stages.begin("transport", title, N_LIGHTS, hint=hint)
     light = SurfaceLight(problem, 0, light_u=at, moving_coordinates=coordinates)
     # `prepare` compares predicted images with traced ones, and may refuse.
     light.prepare(verifier.progress_stages.progress.advance)

@@ -405,11 +405,6 @@ class SurfaceCounts:
         """
         is_worse = compared.significant & (compared.difference > 0)
         is_better = compared.significant & (compared.difference < 0)
-        strongest = [
-            self._describe_part(part, counts, compared)
-            for is_candidate in (is_worse, is_better)
-            for part in self._select_spread(compared[is_candidate])
-        ]
         # `counts` has the parts of all kinds, `compared` only those of this one.
         visible_counts = counts.visible_counts[self.parts.part_slices[kind]]
         return SurfaceTable(
@@ -421,8 +416,26 @@ class SurfaceCounts:
             compared=int(compared["compared"].sum()),
             worse=int(is_worse.sum()),
             better=int(is_better.sum()),
-            strongest=strongest,
+            strongest=[
+                *self._list_strongest(counts, compared, is_worse),
+                *self._list_strongest(counts, compared, is_better),
+            ],
         )
+
+    def _list_strongest(
+        self, counts: PartCounts, compared: pd.DataFrame, is_candidate: pd.Series
+    ) -> list[SurfacePart]:
+        """Return the strongest of some parts, no two of them close to each other.
+
+        Args:
+            counts: counts of a model.
+            compared: comparison of the parts, from `compare_parts`.
+            is_candidate: whether each part may be listed.
+        """
+        return [
+            self._describe_part(part, counts, compared)
+            for part in self._select_spread(compared[is_candidate])
+        ]
 
     def _select_spread(self, candidates: pd.DataFrame) -> list[int]:
         """Select the strongest parts such that no two are close to each other.
@@ -536,14 +549,31 @@ def _make_counts(
         )
         model_seeds = _make_model_seeds(scenes.job, object_index)
         parts = SurfaceParts(asset.mesh)
-        part_counts = [
-            _make_part_counts(
-                parts, wrong[has_object][..., model], draws[has_object], seed
-            )
-            for model, seed in enumerate(model_seeds)
-        ]
+        part_counts = _make_all_part_counts(
+            parts, wrong[has_object], draws[has_object], model_seeds
+        )
         counts[name] = SurfaceCounts(parts, part_counts)
     return counts
+
+
+def _make_all_part_counts(
+    parts: SurfaceParts,
+    wrong: npt.NDArray[np.int8],
+    draws: Int64Array,
+    model_seeds: Sequence[int],
+) -> list[PartCounts]:
+    """Create the counts of one object for each model, before any image is added.
+
+    Args:
+        parts: parts of the object.
+        wrong: (scenes, images, models) 1, 0 or UNKNOWN.
+        draws: (scenes, images) the draw of each image.
+        model_seeds: seed of the permutations for each model.
+    """
+    return [
+        _make_part_counts(parts, wrong[..., model], draws, seed)
+        for model, seed in enumerate(model_seeds)
+    ]
 
 
 def _make_model_seeds(job: Job, object_index: int) -> list[int]:
@@ -624,7 +654,7 @@ def _count_scene(
                 batch.start, len(batch), before=scene * n_images
             )
             images_surfaces = _find_batch_surfaces(swept_scene, size, batch_u)
-            models = _list_models_of_size(scenes.job, size)
+            models = scenes.job.list_models_of_size(size)
             for number, surfaces in zip(batch, images_surfaces, strict=True):
                 counts.add_image(surfaces, _select_known(wrong[number], models))
         progress.advance(len(batch) * n_models)
@@ -645,13 +675,6 @@ def _find_batch_surfaces(
     rays_per_pixel = ceil(MIN_RAYS / min(size))
     for u in batch_u:
         yield renderer.find_surfaces(u, rays_per_pixel)
-
-
-def _list_models_of_size(job: Job, size: tuple[int, int]) -> list[int]:
-    """Return the indices of the models that get images of a size."""
-    return [
-        model for model, model_size in enumerate(job.image_sizes) if model_size == size
-    ]
 
 
 def _select_known(
