@@ -370,20 +370,23 @@ def _encode_gif(pictures: Sequence[Image.Image]) -> bytes:
         picture.quantize(palette=palette, dither=Image.Dither.NONE)
         for picture in pictures
     ]
-    is_animated = len(frames) > 1
-    durations: Any = LAST_FRAME_MS
-    if is_animated:
-        durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
     buffer = io.BytesIO()
     frames[0].save(
         buffer,
         "GIF",
         loop=0,
-        duration=durations,
-        save_all=is_animated,
+        duration=_list_durations(len(frames)),
+        save_all=len(frames) > 1,
         append_images=frames[1:],
     )
     return buffer.getvalue()
+
+
+def _list_durations(n_frames: int) -> int | list[int]:
+    """Return the milliseconds of each frame of an animation, or of a single image."""
+    if n_frames == 1:
+        return LAST_FRAME_MS
+    return [FRAME_MS] * (n_frames - 1) + [LAST_FRAME_MS]
 
 
 def _make_palette(pictures: Sequence[Image.Image]) -> Image.Image:

@@ -62,7 +62,7 @@ from advsearch.report.wording import (
     percent,
     shorten_name,
 )
-from advsearch.runs.results import INTERRUPTED, CountedPredictions
+from advsearch.runs.results import INTERRUPTED, CountedPredictions, VerifiedRate
 from advsearch.settings import split_names
 from advsearch.statistics.monotone import Dip, _fit_falling, find_dips
 
@@ -312,25 +312,31 @@ SURFACE_COLUMNS: dict[str, Column] = {
 def make_sweep_view(summary: SweepSummary) -> ShownResult:
     """Return the view of a sweep: what a text, a page and a notebook show of it."""
     axes = _group_axes(summary)
-    sections = [*_make_text_sections(summary, axes)]
-    size = figure_size(summary)
-    if size is not None:
-        sections.append(
-            ResultPart(
-                draw=lambda figure_axes: draw_sweep_on(summary, figure_axes),
-                size=size,
-                only_medium="notebook",
-            )
-        )
-    sections += (
+    page_parts = (
         replace(part, only_medium="page") for part in _make_page_parts(summary, axes)
     )
+    sections = [
+        *_make_text_sections(summary, axes),
+        *_make_figure_parts(summary),
+        *page_parts,
+    ]
     return ShownResult(
         _verdict(summary),
         sections,
         _make_sweep_facts(summary),
         says_interrupted=_has_ended_early(summary),
     )
+
+
+def _make_figure_parts(summary: SweepSummary) -> Iterator[ResultPart]:
+    """Yield the figure of a sweep for a notebook, if there is anything to draw."""
+    size = figure_size(summary)
+    if size is not None:
+        yield ResultPart(
+            draw=lambda figure_axes: draw_sweep_on(summary, figure_axes),
+            size=size,
+            only_medium="notebook",
+        )
 
 
 def _make_sweep_facts(summary: SweepSummary) -> dict[str, str]:
@@ -475,13 +481,7 @@ def _make_page_parts(
     """
     distance = find_detection_distance(summary)
     if distance:
-        sentence = describe_detection_distance(distance)
-        yield ResultPart(
-            "How far away it is seen",
-            [sentence],
-            draw=partial(draw_detection_distance, distance),
-            note=sentence,
-        )
+        yield _make_distance_part(distance)
     for index, rates in enumerate(summary.drives or ()):
         yield _make_drive_part(rates, is_first=index == 0)
     yield ResultPart.make_table(
@@ -492,6 +492,17 @@ def _make_page_parts(
     for name, rows in axes.items():
         if len(rows) <= MAX_PAGE_ROWS:
             yield _make_folded_axis_table(name, rows, summary.task)
+
+
+def _make_distance_part(distance: DetectionDistance) -> ResultPart:
+    """Return the chart of the detection distance, with its sentence."""
+    sentence = describe_detection_distance(distance)
+    return ResultPart(
+        "How far away it is seen",
+        [sentence],
+        draw=partial(draw_detection_distance, distance),
+        note=sentence,
+    )
 
 
 def _make_drive_part(rates: DriveRates, *, is_first: bool) -> ResultPart:
@@ -655,13 +666,17 @@ def make_sweep_claims(result: SweepSummary) -> Iterator[Claim]:
         yield make_claim("measured", describe_detection_distance(distance), None)
     for rates in result.drives or ():
         yield _make_drive_claim(rates)
-    verified = result.worst.verified if result.worst else None
-    if verified is not None:
-        text = (
-            "In the worst of these configurations the model is wrong in "
-            f"{wording.format_rate(verified)}. No search looked for a worse one."
-        )
-        yield make_claim("measured", text, make_rate_extent("wrong", verified))
+    if result.worst is not None and result.worst.verified is not None:
+        yield _make_worst_claim(result.worst.verified)
+
+
+def _make_worst_claim(verified: VerifiedRate) -> Claim:
+    """Return how often the worst of the configurations is wrong, as a claim."""
+    text = (
+        "In the worst of these configurations the model is wrong in "
+        f"{wording.format_rate(verified)}. No search looked for a worse one."
+    )
+    return make_claim("measured", text, make_rate_extent("wrong", verified))
 
 
 def _make_drive_claim(rates: DriveRates) -> Claim:

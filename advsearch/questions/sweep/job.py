@@ -459,12 +459,7 @@ def _list_environment_axes(
     Raises:
         InputError: an axis varies what `set` fixes.
     """
-    # settings that the user has fixed in any scene with `set`
-    fixed_settings = {
-        name
-        for named_scene in named_scenes
-        for name in named_scene.scene.description.requested
-    }
+    fixed_settings = _find_fixed_settings(named_scenes)
     environment_axes = list[str]()
     for axis in axes:
         setting = _find_setting(axis, controls)
@@ -477,6 +472,15 @@ def _list_environment_axes(
                 "out of one of the two"
             )
     return environment_axes
+
+
+def _find_fixed_settings(named_scenes: Sequence[NamedScene]) -> set[str]:
+    """Return the settings that the user has fixed in any scene with `set`."""
+    return {
+        name
+        for named_scene in named_scenes
+        for name in named_scene.scene.description.requested
+    }
 
 
 def _list_environment_controls(controls: Sequence[Control]) -> list[str]:
