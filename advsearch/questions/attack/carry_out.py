@@ -235,6 +235,7 @@ def move_to_photographs(
             "scene"
         )
     used_photographs = list_used_photographs(parts.scene.description)
+    # by the name of the photograph's file
     parts_in_unused: dict[str, AttackParts] = {}
     parts_in_used: dict[str, AttackParts] = {}
     for name, description in photographs.scenes.items():
@@ -284,11 +285,7 @@ def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
         FileFormatError: the folder cannot be used.
         InputError: the folder has no photographs with camera files.
     """
-    if not is_photograph_folder(folder):
-        raise InputError(
-            f"backdrop: expected a folder of photographs with their camera files, got "
-            f"{folder}"
-        )
+    _check_photograph_folder(folder)
     # all photographs of a folder have the same kinds of camera files
     view = next(iter(read_photograph_folder(folder).values()))
     other_settings = _drop_settings(config.set_, view.replaced_settings)
@@ -297,6 +294,15 @@ def _set_photograph_folder(config: AttackConfig, folder: str) -> AttackConfig:
     if view.camera is not None:
         changes["camera"] = None
     return config.model_copy(update=changes)
+
+
+def _check_photograph_folder(folder: str) -> None:
+    """Raise an error if a folder has no photographs with their camera files."""
+    if not is_photograph_folder(folder):
+        raise InputError(
+            f"backdrop: expected a folder of photographs with their camera files, got "
+            f"{folder}"
+        )
 
 
 def _drop_settings(
@@ -617,12 +623,9 @@ def _bind_task(
     """
     config = parts.config
     task = _bind_to_model(parts)
+    scene = parts.scene.description
     make_scene_facts = partial(
-        make_facts,
-        parts.scene.description,
-        config.object,
-        config.label,
-        judge=config.judge,
+        make_facts, scene, config.object, config.label, judge=config.judge
     )
     task = _prepare_bound_task(
         parts, task, make_scene_facts, is_calibrated=is_calibrated
@@ -718,9 +721,10 @@ def _choose_default_size(
         problem: problem of the attack.
         n_random_numbers: how many numbers vary by chance.
     """
-    size_if_predicted = SIZE_OVER_PREDICTED
-    if n_random_numbers == 1:
-        size_if_predicted = SIZE_OVER_SINGLE_PARAMETER
+    varies_single_number = n_random_numbers == 1
+    size_if_predicted = (
+        SIZE_OVER_SINGLE_PARAMETER if varies_single_number else SIZE_OVER_PREDICTED
+    )
     # Preparing a matrix costs more than it saves if there are few steps. So whether
     # images are predicted depends on the number of steps.
     steps_if_predicted, _ = size_if_predicted

@@ -131,6 +131,7 @@ def make_result(
     u = _find_adversarial_u(problem, findings)
     scene_images = _render_scenes(problem, findings, u)
     artifacts = problem.searched_space.get_artifact_images(u)
+    run_path = None if run is None else run.path
     if run is not None:
         _write_files(run, problem, findings, u, scene_images, artifacts)
     summary = _summarize(
@@ -139,7 +140,7 @@ def make_result(
         scene_images["clean"],
         scene_images["adversarial"],
         drive=_evaluate_finished_drive(problem, findings, u, run),
-        run=None if run is None else str(run.path),
+        run=None if run_path is None else str(run_path),
         object=object_name,
         judge=judge,
         policy=policy,
@@ -155,7 +156,7 @@ def make_result(
         _store_summary(run, summary, is_finished=not findings.interrupted)
     return AttackResult(
         summary=summary,
-        run=None if run is None else run.path,
+        run=run_path,
         u=u,
         clean=scene_images["clean"].image,
         adversarial=scene_images["adversarial"].image,
@@ -315,6 +316,9 @@ def _summarize(
         adversarial_prediction = _make_prediction(
             adversarial.judgement, adversarial.trial
         )
+    shared_work = SharedWork.from_worker_stats(
+        journal.evaluator.worker_stats, journal.machines
+    )
     return AttackSummary(
         **fields,
         **_summarize_controls(problem),
@@ -325,9 +329,7 @@ def _summarize(
         clean=_make_clean_prediction(problem, findings, clean),
         adversarial=adversarial_prediction,
         transport=findings.transport_summary,
-        shared=SharedWork.from_worker_stats(
-            journal.evaluator.worker_stats, journal.machines
-        ),
+        shared=shared_work,
         renders=_count_renders(findings, problem),
     )
 
@@ -525,19 +527,27 @@ def _summarize_ambient(findings: RunState) -> AmbientLight | None:
     if not findings.verification_by_lux:
         return None
     points = [
-        AmbientPoint(
-            lux=lux,
-            holds=verification.ending is Ending.FOUND,
-            verified=make_verified_rate(verification),
-        )
+        _make_ambient_point(lux, verification)
         for lux, verification in sorted(findings.verification_by_lux.items())
     ]
     n_holding = _count_holding(points)
+    limit_lux = None  # it holds in all lights
+    if n_holding < len(points):
+        limit_lux = points[n_holding].lux
     return AmbientLight(
         lux=points[0].lux,
         holds_to=points[n_holding - 1].lux,
-        limit_lux=points[n_holding].lux if n_holding < len(points) else None,
+        limit_lux=limit_lux,
         points=points,
+    )
+
+
+def _make_ambient_point(lux: float, verification: Verification) -> AmbientPoint:
+    """Return whether the adversarial scene holds in an ambient light, in lux."""
+    return AmbientPoint(
+        lux=lux,
+        holds=verification.ending is Ending.FOUND,
+        verified=make_verified_rate(verification),
     )
 
 
@@ -592,10 +602,9 @@ def _summarize_bracket(problem: Problem, findings: RunState) -> SmallestEpsilon 
     bracket = findings.smallest_change_bracket
     if bracket is None:
         return None
-    passing = None
+    passing = failing = None
     if bracket.u is not None:
         passing = _scale_budgets(problem, bracket.smallest_passing_scale)
-    failing = None
     if bracket.largest_failing_scale > 0.0:  # 0 until a search fails
         failing = _scale_budgets(problem, bracket.largest_failing_scale)
     return SmallestEpsilon(
@@ -784,8 +793,8 @@ def _describe_ranges(problem: Problem) -> dict[str, tuple[float, float]]:
     """
     column_of_number = _find_number_columns(problem)
     columns = [*column_of_number.values()]
-    values_at_0 = _describe_with(problem, columns, 0.0)
-    values_at_1 = _describe_with(problem, columns, 1.0)
+    values_at_0 = _describe_with(problem, columns, coordinate=0.0)
+    values_at_1 = _describe_with(problem, columns, coordinate=1.0)
     ranges = dict[str, tuple[float, float]]()
     for name in column_of_number:
         low = _get_value(values_at_0, name)
@@ -847,9 +856,11 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
     for group, block in zip(problem.space.groups, full_domain.blocks, strict=True):
         # The searched controls come first in the space.
         is_random = group.begin >= len(problem.domain.start)
-        if group.size != 1 or not is_random:
-            continue
-        described = _describe_along(problem, group.name, group.begin, block.n_options)
+        described = list[Value]()
+        if is_random and group.size == 1:
+            described = _describe_along(
+                problem, group.name, group.begin, block.n_options
+            )
         if described:
             ranges[group.name] = _to_range(described, is_choice=bool(block.n_options))
     return ranges
@@ -932,16 +943,25 @@ def _count_renders(findings: RunState, problem: Problem) -> dict[str, int]:
     for kind, search in _list_searches(findings).items():
         images = _count_search_images(findings, problem, kind, search)
         counts["products"] += images.predicted
-        if kind == UNPRINTED:
-            counts["unprinted"] = images.rendered + images.of_gradients
-        else:
-            counts[kind] = images.rendered
-            if kind == "search":  # the random search has no gradients
-                counts["gradient"] += images.of_gradients
+        counts |= _count_rendered_by_purpose(kind, images)
     if findings.predictor:
         n_rendered_to_prepare = findings.predictor.n_traced
         counts["search"] += n_rendered_to_prepare
     return counts
+
+
+def _count_rendered_by_purpose(kind: str, images: SearchImages) -> dict[str, int]:
+    """Return the numbers of rendered images of a search, by the names of their counts.
+
+    Args:
+        kind: kind of the search's queries.
+        images: numbers of its images.
+    """
+    if kind == UNPRINTED:
+        return {"unprinted": images.rendered + images.of_gradients}
+    if kind == "search":
+        return {"search": images.rendered, "gradient": images.of_gradients}
+    return {kind: images.rendered}  # the random search has no gradients
 
 
 def _list_searches(findings: RunState) -> dict[str, SearchResult]:
@@ -1006,13 +1026,19 @@ def _make_remarks(findings: RunState, problem: Problem, journal: Journal) -> lis
     if samples is not None and samples.table and not samples.converged:
         has_conditions = problem.conditions is not None
         remarks.append(_make_samples_remark(samples.spp, has_conditions=has_conditions))
-    n_non_finite = _count_non_finite(findings, problem)
-    if n_non_finite:
-        remarks.append(
-            f"{n_non_finite} values of pictures or gradients were not finite "
-            "and were set to 0."
-        )
+    remarks += _list_non_finite_remarks(findings, problem)
     return [*remarks, *make_lost_remarks(journal.n_lost), *journal.remarks]
+
+
+def _list_non_finite_remarks(findings: RunState, problem: Problem) -> list[str]:
+    """Return a remark on values of images and gradients that were not finite, if any."""
+    n_non_finite = _count_non_finite(findings, problem)
+    if not n_non_finite:
+        return []
+    return [
+        f"{n_non_finite} values of pictures or gradients were not finite "
+        "and were set to 0."
+    ]
 
 
 def _count_non_finite(findings: RunState, problem: Problem) -> int:
@@ -1066,12 +1092,10 @@ def describe_failures(problem: Problem, findings: RunState) -> DifferentFailures
     failing_fraction = None
     if known.failure_rate is not None:
         failing_fraction = FailingShare.from_values(known.failure_rate)
-    # A policy may divide the space of some parameters into cells, and count in cells.
-    cell_parameters = [
-        problem.domain.element_names[column] for column in known.cell_parameter_indices
-    ]
+    names = problem.domain.element_names
     return DifferentFailures(
-        over=cell_parameters,
+        # A policy may divide the space of some parameters into cells, and count in cells.
+        over=[names[column] for column in known.cell_parameter_indices],
         found=known.n_failures,
         examined=known.n_visited,
         cells=known.n_cells,

@@ -134,7 +134,7 @@ def attack(
     # The caller's own objects are used. The others are made from the settings.
     searched, random_controls = make_attack_controls(config, controls, over)
     if not isinstance(policy, Policy):
-        policy = make_policy(config.policy_name, **config.policy_options)
+        policy = _make_configured_policy(config)
     loaded_task, objective = request.choose_task_and_objective(config)
     # `directory` is None if nothing is stored, or if another run is overwritten.
     with _open_run(run, resume, config) as directory:
@@ -289,20 +289,22 @@ class AttackRequest:
             config: the settings.
             scene: the loaded scene.
         """
-        parts = [
-            PythonOnly("model", get_model_name(network))
-            for network in to_model_list(self.model)
-            if naming.is_session_only(network)
-        ]
+        parts = self._find_session_models()
         if scene.is_session_only:
             parts.append(PythonOnly("scene"))
         parts += self._find_undescribable_parts()
         parts += [PythonOnly("control", name) for name in self.session_controls]
-        parts += [
-            PythonOnly("metric", name)
-            for name in judging.list_session_only_metrics(config.metrics)
-        ]
+        metrics = judging.list_session_only_metrics(config.metrics)
+        parts += [PythonOnly("metric", name) for name in metrics]
         return parts
+
+    def _find_session_models(self) -> list[PythonOnly]:
+        """Return the models that exist in this session only."""
+        return [
+            PythonOnly("model", get_model_name(network))
+            for network in to_model_list(self.model)
+            if naming.is_session_only(network)
+        ]
 
     def _find_undescribable_parts(self) -> list[PythonOnly]:
         """Return the task, the objective and the policy that no setting describes."""
@@ -407,7 +409,11 @@ def _name_objective(objective: Callable[..., Tensor]) -> str:
 def _make_policy(setting: Any) -> Policy[Any]:
     """Make the policy that a setting names."""
     # The setting `object` is required, but only the policy is used.
-    config = AttackConfig(object="mug", policy=setting)
+    return _make_configured_policy(AttackConfig(object="mug", policy=setting))
+
+
+def _make_configured_policy(config: AttackConfig) -> Policy[Any]:
+    """Make the policy that settings name, with its options."""
     return make_policy(config.policy_name, **config.policy_options)
 
 
@@ -421,6 +427,13 @@ def _check_single_attack(config: AttackConfig) -> None:
     """
     if config.workers is not None or config.cluster is not None:
         judging.check_metrics_importable(config.metrics)
+    _check_not_study(config)
+    if config.aov is not None and config.run is None:
+        raise InputError("aov: needs `run`, the directory that the layers are saved in")
+
+
+def _check_not_study(config: AttackConfig) -> None:
+    """Raise an error if the settings describe attacks on several models or epsilons."""
     if config.is_matrix and config.ensemble is None:
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them "
@@ -432,5 +445,3 @@ def _check_single_attack(config: AttackConfig) -> None:
             f"epsilon: expected one, got {epsilons}; attack with each, or have "
             "`advsearch attack` draw the curve"
         )
-    if config.aov is not None and config.run is None:
-        raise InputError("aov: needs `run`, the directory that the layers are saved in")

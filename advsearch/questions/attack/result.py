@@ -223,14 +223,10 @@ class AttackResult:
             InputError: the adversarial configuration itself sets one of `settings`, or
                 has not as many numbers as the controls take in the other scene.
         """
-        if self.parts is None:
-            raise InputError(
-                "render: expected a result of this session, got one from another "
-                "process; load_run(FOLDER) loads one that can be rendered"
-            )
+        load_parts = self._get_parts_loader()
         _check_render_keywords(options)
-        # `self.parts` is a function: parts of a stored run are loaded only when needed
-        parts = self.parts()
+        # parts of a stored run are loaded only when needed
+        parts = load_parts()
         camera_name, settings = _split_camera(to_python(camera), to_python(settings))
         self._check_no_clashes(settings)
         task = parts.task
@@ -238,8 +234,9 @@ class AttackResult:
             # the attack's own model, which may be an ensemble
             model, _ = parts.model_and_warnings
             task = make_ensemble_task(task, model)
+        viewed_scene = _resolve_scene(scene, parts.scene)
         return render(
-            _change_view(_resolve_scene(scene, parts.scene), camera_name, settings),
+            _change_view(viewed_scene, camera_name, settings),
             model,
             task=task,
             label=parts.config.label,
@@ -247,6 +244,19 @@ class AttackResult:
             at=self.u,
             **{**parts.config.image_settings, **options},
         )
+
+    def _get_parts_loader(self) -> Callable[[], AttackParts]:
+        """Return the function that returns the parts of the attack.
+
+        Raises:
+            InputError: the result came from another process, and has no such function.
+        """
+        if self.parts is None:
+            raise InputError(
+                "render: expected a result of this session, got one from another "
+                "process; load_run(FOLDER) loads one that can be rendered"
+            )
+        return self.parts
 
     def _check_no_clashes(self, settings: SettingValues | None) -> None:
         """Raise an error if the configuration itself sets one of the settings."""
@@ -355,12 +365,11 @@ class StoredImage:
         if trial is None:
             seed = seeds.derive_seed(problem.seed, "pictures")
             configuration = problem.make_full_configuration(u, None)
-            spp = UNTRIED_SPP
         else:
             # as in the trial, which has the same seed
             seed = seeds.derive_seed(problem.seed, "verification", trial)
             configuration = problem.make_full_configuration(u, seed)
-            spp = findings.spp
+        spp = UNTRIED_SPP if trial is None else findings.spp
         radiance, image = _render_stored(problem, configuration, seed, spp)
         return cls(
             full_configuration=configuration,
@@ -425,11 +434,10 @@ def _list_trial_criteria(verification: Verification) -> list[tuple[bool, bool, b
     frequent_label = mode(_list_labels(typical_trials))
     frequent_clean_label = mode(clean_labels)
     criteria = list[tuple[bool, bool, bool]]()
+    labels = _list_labels(verification.adversarial_trials)
+    # `strict=False`: trials of one scene may have ended earlier.
     for label, is_success, clean_label in zip(
-        _list_labels(verification.adversarial_trials),
-        verification.trial_successes,
-        clean_labels,
-        strict=False,  # trials of one scene may have ended earlier
+        labels, verification.trial_successes, clean_labels, strict=False
     ):
         has_label = label == frequent_label
         is_typical = has_label and is_success is has_successes
@@ -586,10 +594,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
     # the inputs of both scenes
     adversarial = _assemble(problem, u)
     clean = _assemble(problem, problem.domain.start)
-    # An input of the scene is named as "mug.bsdf.reflectance": the mesh comes first.
-    changed_names = {OBJECT, *(name.partition(".")[0] for name in adversarial)}
-    meshes = [mesh for name, mesh in scene.meshes.items() if name in changed_names]
-    objects = _SimplifiedObjects.from_meshes(meshes)
+    objects = _SimplifiedObjects.from_meshes(_select_changed(scene, adversarial))
     to_world = _find_camera_pose(adversarial, scene)
     glb = encode_web_glb(
         objects.make_shapes(adversarial),
@@ -598,6 +603,18 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
         objects.describe_simplified(),
     )
     write_bytes(run.path / OBJECT_FILE, glb)
+
+
+def _select_changed(scene: Any, inputs: Mapping[str, Tensor]) -> list[MeshPart]:
+    """Return the meshes of a scene that controls move or paint, and the object.
+
+    Args:
+        scene: the scene.
+        inputs: inputs of the scene that controls set, by name.
+    """
+    # An input of the scene is named as "mug.bsdf.reflectance": the mesh comes first.
+    changed_names = {OBJECT, *(name.partition(".")[0] for name in inputs)}
+    return [mesh for name, mesh in scene.meshes.items() if name in changed_names]
 
 
 @dataclass(frozen=True, eq=False)
@@ -714,9 +731,10 @@ def evaluate_drive(
     n_paths = max(1, len(path_names))  # a single path has no name
     right_counts: dict[str, int] = {}
     # the configuration of each scene, by the name of its files
-    for name, configuration in (("drive-clean", problem.domain.start), ("drive", u)):
-        if configuration is None:  # nothing was searched
-            continue
+    configurations = {"drive-clean": problem.domain.start}
+    if u is not None:  # None if nothing was searched
+        configurations["drive"] = u
+    for name, configuration in configurations.items():
         # The searched coordinates come first, then those that conditions vary.
         frames[:, : len(configuration)] = configuration
         images, right_counts[name] = _render_frames(problem, frames, spp)
@@ -844,7 +862,8 @@ def _render_frames(
     for number, configuration in enumerate(frames):
         seed = seeds.derive_seed(problem.seed, "drive", number)
         with torch.no_grad():
-            image = round_to_8_bit(problem.renderer(configuration, seed=seed, spp=spp))
+            display = problem.renderer(configuration, seed=seed, spp=spp)
+            image = round_to_8_bit(display)
         is_right, marks = problem.predict_with_marks(image, configuration)
         if is_right:
             n_right += 1

@@ -120,9 +120,7 @@ def run_attack(
         # The directory of a new run is made only now, as the parts fit together.
         if run is None and parts.is_stored:
             run = stack.enter_context(RunDirectory.open(config))
-        if run is not None:
-            model, _ = parts.model_and_warnings
-            check_digests(run, [model], find_user_functions(parts))
+        _check_same_parts(run, parts)
         with open_executor(config, WORKER, progress) as executor:
             # replays stored rows, renders and stores the others
             journal = Journal(run, ParallelEvaluator(problem, executor))
@@ -132,6 +130,19 @@ def run_attack(
         # without the matrix of light transport, which may be large
         stored_parts = replace(parts, clean_matrix=CleanMatrix())
         return replace(result, parts=lambda: stored_parts)
+
+
+def _check_same_parts(run: RunDirectory | None, parts: AttackParts) -> None:
+    """Raise an error if a run was made with another model or other functions.
+
+    Args:
+        run: the run directory, with the digests of what made it, which a new run gets
+            here; None if nothing is stored.
+        parts: parts of the attack.
+    """
+    if run is not None:
+        model, _ = parts.model_and_warnings
+        check_digests(run, [model], find_user_functions(parts))
 
 
 def _make_attack_result(
@@ -320,33 +331,35 @@ def search_and_verify(
         search_with_baselines, searches, policy, seconds=seconds, baseline=baseline
     )
     if smallest:
-        # The result is not used: the call raises an error if there is no budget, before
-        # anything is rendered.
-        scale_domain(problem.domain, 1.0)
+        _check_has_budget(problem)
         run_searches = partial(find_smallest, searches, policy, verifier)
+    choose_render_plan = partial(
+        plan_renders,
+        policy,
+        journal,
+        stages,
+        specialise=specialise,
+        measure=measure,
+        deterministic=deterministic,
+        chooses_spp=chooses_spp,
+    )
+    prepare_predictor = partial(
+        choose_predictor,
+        policy,
+        journal,
+        stages,
+        findings,
+        specialise=specialise,
+        clean=clean or CleanMatrix(),
+    )
     try:
         with reraise_lost_interrupt():
-            plan_renders(
-                policy,
-                journal,
-                stages,
-                specialise=specialise,
-                measure=measure,
-                deterministic=deterministic,
-                chooses_spp=chooses_spp,
-            )
+            choose_render_plan()
             findings.first_look_trials = evaluate_clean_scene(
                 journal, stages, first_spp
             )
             if not is_already_wrong(verifier, in_any_case=smallest):
-                findings.predictor = choose_predictor(
-                    policy,
-                    journal,
-                    stages,
-                    findings,
-                    specialise=specialise,
-                    clean=clean or CleanMatrix(),
-                )
+                findings.predictor = prepare_predictor()
                 run_searches()
                 verify_searches(verifier, is_smallest=smallest)
             if average:
@@ -355,6 +368,12 @@ def search_and_verify(
         findings.interrupted = True
     stages.end()
     return findings
+
+
+def _check_has_budget(problem: Problem) -> None:
+    """Raise an error if nothing that is searched has a budget, which could shrink."""
+    # The result is not used: the call raises the error.
+    scale_domain(problem.domain, 1.0)
 
 
 def _choose_look_sizes(problem: Problem, trials: int | None) -> tuple[int, ...]:
@@ -390,15 +409,18 @@ def search_with_baselines(
     steps = searches.problem.steps
     search_result = _search_with_policy(searches, policy, seconds)
     if seconds is not None:
-        # The other searches get as many steps as the first one rendered images within
-        # the time, without its ranking, which `history` lacks.
-        history = search_result.history
-        n_renders = history[-1].renders if history else 0
-        steps = max(1, n_renders)
+        # The other searches are as long as the first one was within the time.
+        steps = max(1, _count_history_renders(search_result))
     if searches.printable:
         _search_without_print_terms(searches, policy, steps)
     if baseline and policy.name != "random":
         _search_at_random(searches, steps)
+
+
+def _count_history_renders(result: SearchResult) -> int:
+    """Count the images that a search rendered, without those of its ranking."""
+    history = result.history  # lacks the ranking
+    return history[-1].renders if history else 0
 
 
 def _search_with_policy(
@@ -485,12 +507,17 @@ def choose_policy(
         has_only_budgets = "box" not in _list_norms(problem)
         if has_only_budgets:
             policy = make_policy("nes")
+    _check_takes_derivatives(policy, gradient_setting)
+    return policy
+
+
+def _check_takes_derivatives(policy: Policy[Any], gradient_setting: str | None) -> None:
+    """Raise an error if a setting about derivatives is set and a policy takes none."""
     if gradient_setting and not policy.uses_gradient:
         raise InputError(
             f"{gradient_setting}: policy {policy.name} takes no "
             "derivatives; leave one of the two out"
         )
-    return policy
 
 
 def _choose_remote_policy(policy: Policy[Any], problem: Problem) -> Policy[Any]:

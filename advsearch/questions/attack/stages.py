@@ -110,17 +110,22 @@ def plan_renders(
     is_full = measure == "full"
     if specialise and _pays_to_measure_bounces(problem, policy, is_full=is_full):
         _choose_bounces(problem, stages)
-    if policy.uses_gradient and measure != "no":
-        matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
-        can_matrices_predict = matrix_refusal is None
-        if is_full or not can_matrices_predict:
-            _measure_gradients(
-                problem,
-                stages,
-                full=is_full,
-                deterministic=deterministic,
-                chooses_spp=chooses_spp,
-            )
+    if policy.uses_gradient and _pays_to_measure_gradients(
+        problem, measure, specialise=specialise
+    ):
+        _measure_gradients(
+            problem,
+            stages,
+            full=is_full,
+            deterministic=deterministic,
+            chooses_spp=chooses_spp,
+        )
+    _store_choice(journal)
+
+
+def _store_choice(journal: Journal) -> None:
+    """Store the plan, the samples and the light bounces of a problem in its run."""
+    problem = journal.problem
     choice = {
         "plan": problem.gradient_plan.to_dict(),
         "spp": problem.search_spp,
@@ -155,6 +160,26 @@ def _pays_to_measure_bounces(
     )
     can_surface_light_predict = refusal is None
     return not can_surface_light_predict
+
+
+def _pays_to_measure_gradients(
+    problem: Problem, measure: Measure, *, specialise: bool
+) -> bool:
+    """Return whether to measure which gradient estimators are best for a search.
+
+    A quick measurement is left out if matrices of light transport predict the images:
+    then no gradient is rendered.
+
+    Args:
+        problem: problem of the attack.
+        measure: which gradient estimators are to be measured.
+        specialise: whether images may be predicted.
+    """
+    if measure == "no":
+        return False
+    matrix_refusal = find_matrix_refusal(problem, problem.steps, specialise)
+    can_matrices_predict = matrix_refusal is None
+    return measure == "full" or not can_matrices_predict
 
 
 def _choose_bounces(problem: Problem, stages: Stages) -> None:
@@ -197,14 +222,7 @@ def _measure_gradients(
     # A quick measurement is too short to measure times: it counts renders.
     counts_renders = not full or deterministic
     bench = _make_loss_bench(problem, stages)
-    n_gradients = planning.count_plan_gradients(problem.renderer.plan, with_all=full)
-    if n_gradients:
-        samples = format_count(problem.search_spp, "sample")
-        hint = (
-            f"{n_gradients} gradients of {samples} a pixel; `measure=no` leaves it out"
-        )
-        title = "measuring which gradients are best here"
-        stages.begin("setup", title, n_gradients, hint=hint)
+    _begin_measuring_gradients(problem, stages, with_all=full)
     problem.gradient_plan = planning.choose_estimators(
         bench, with_all=full, count_renders=counts_renders
     )
@@ -212,6 +230,28 @@ def _measure_gradients(
         spp = _choose_gradient_steps(problem, bench, stages)
         if chooses_spp and spp is not None:
             problem.search_spp = spp
+
+
+def _begin_measuring_gradients(
+    problem: Problem, stages: Stages, *, with_all: bool
+) -> None:
+    """Begin the stage in which gradient estimators are measured, if any are.
+
+    Args:
+        problem: problem of the attack.
+        stages: stages of the run.
+        with_all: whether all estimators are measured, and not only contested ones.
+    """
+    n_gradients = planning.count_plan_gradients(
+        problem.renderer.plan, with_all=with_all
+    )
+    if n_gradients:
+        samples = format_count(problem.search_spp, "sample")
+        hint = (
+            f"{n_gradients} gradients of {samples} a pixel; `measure=no` leaves it out"
+        )
+        title = "measuring which gradients are best here"
+        stages.begin("setup", title, n_gradients, hint=hint)
 
 
 def _make_loss_bench(problem: Problem, stages: Stages) -> Bench:
@@ -296,14 +336,18 @@ def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
     was_right_once = any(trial.right for trial in findings.first_look_trials)
     if was_right_once and not in_any_case:
         return False
-    verifier.choose_spp({"clean": problem.domain.start})
+    _try_clean_scene(verifier)
+    counts = count_right(findings.clean_trials, findings.spp)
+    return problem.verification_rule.is_already_wrong(counts)
+
+
+def _try_clean_scene(verifier: Verifier) -> None:
+    """Choose the samples per pixel for the clean scene, and make its trials."""
+    verifier.choose_spp({"clean": verifier.problem.domain.start})
     # trials after which a verdict is first possible
     min_trials = verifier.look_sizes[0]
     verifier.begin_stage("checking the clean scene with fresh renders", min_trials)
     verifier.run_clean_trials()
-    return problem.verification_rule.is_already_wrong(
-        count_right(findings.clean_trials, findings.spp)
-    )
 
 
 def choose_predictor(
@@ -342,11 +386,12 @@ def choose_predictor(
         problem, problem.steps, policy, specialise
     )
     can_use_matrices = matrix_refusal is None
+    can_use_surface_light = surface_refusal is None
     candidates = _list_candidates(
         journal,
         clean,
         can_use_matrices=can_use_matrices,
-        can_use_surface_light=surface_refusal is None,
+        can_use_surface_light=can_use_surface_light,
     )
     for make_predictor in candidates:
         predictor = make_predictor()
@@ -363,11 +408,10 @@ def choose_predictor(
     # If matrices could be used, the loop has returned. Light on surfaces was refused
     # before the loop or in it.
     assert matrix_refusal is not None and surface_refusal is not None
-    refusal = surface_refusal
-    if _is_matrix_refusal_more_helpful(
+    is_matrix_refusal_reported = _is_matrix_refusal_more_helpful(
         problem, surface_refusal, findings, specialise=specialise
-    ):
-        refusal = matrix_refusal
+    )
+    refusal = matrix_refusal if is_matrix_refusal_reported else surface_refusal
     return _render_search(problem, refusal, stages, findings, specialise=specialise)
 
 
@@ -544,16 +588,21 @@ class Searches:
         )
         samples = format_count(self.problem.search_spp, "sample")
         hint = f"{n_renders} pictures of {samples} a pixel; {shorter}"
-        predictor = self.run_state.predictor
-        # The hint assumes that every search is predicted if the main one is ("search").
-        is_predicted = predictor is not None and bool(
-            predictor.count_predicted("search", steps)
-        )
-        if is_predicted:
+        if self._is_predicted(steps):
             # A search ends with a ranking of the best configurations, always rendered.
             n_rendered = n_renders - steps
             hint = f"{steps} pictures predicted and {n_rendered} traced; {shorter}"
         self.stages.begin(name, title, n_renders, hint=hint, at_most=True)
+
+    def _is_predicted(self, steps: int) -> bool:
+        """Return whether images of a search of some steps are predicted.
+
+        It is assumed that every search is predicted if the main one, "search", is.
+        """
+        predictor = self.run_state.predictor
+        return predictor is not None and bool(
+            predictor.count_predicted("search", steps)
+        )
 
     def _mark_domain(self, domain: Domain, policy: Policy[Any]) -> Domain:
         """Return the domain, marked with what its evaluations are like.
@@ -690,9 +739,8 @@ class Searches:
         Args:
             queries: queries of a single phase, "search" or "ranking".
         """
-        for query, evaluation in zip(
-            queries, self._evaluate_objectives(queries), strict=True
-        ):
+        evaluations = self._evaluate_objectives(queries)
+        for query, evaluation in zip(queries, evaluations, strict=True):
             # `UNPRINTED` is the kind of the search that measures what the terms cost
             has_print_terms = self.printable and query.kind != UNPRINTED
             if has_print_terms:
@@ -778,11 +826,7 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     _begin_verification(verifier, len(results))
     verifier.run_clean_trials()
     findings.verification = verifier.verify("verification", candidate)
-    if findings.verification.ending is Ending.ALREADY_WRONG:
-        # The model is wrong about the clean scene at this sample count, which is not
-        # that of the search. So no change is needed, and bounds of the smallest change
-        # mean nothing.
-        findings.smallest_change_bracket = None
+    _drop_meaningless_bracket(findings)
     _verify_unprinted(verifier)
     if baseline is not None:
         _verify_baseline(verifier, candidate, baseline)
@@ -792,6 +836,18 @@ def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
     verification = findings.verification
     if verification.ending is Ending.FOUND:
         find_ambient(verifier, verification.u)
+
+
+def _drop_meaningless_bracket(findings: RunState) -> None:
+    """Drop the bounds of the smallest change if the clean scene is wrong already.
+
+    The verification has another sample count than the search. If the model is wrong
+    about the clean scene at this count, no change is needed, and the bounds mean
+    nothing.
+    """
+    verification = findings.verification
+    if verification and verification.ending is Ending.ALREADY_WRONG:
+        findings.smallest_change_bracket = None
 
 
 def _list_results(findings: RunState) -> list[SearchResult]:
@@ -1145,14 +1201,8 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
         verifier: verifier of the attack.
         result: result of the search.
     """
-    rule = verifier.problem.verification_rule
     known = result.failures
-    if known is None or not known.examples or rule.has_varying_conditions:
-        return
-    # If the model is wrong about the clean scene, a failure proves nothing. Only the
-    # counts matter here, and not the `spp` that is stored with them.
-    clean_counts = count_right(verifier.run_state.clean_trials, spp=1)
-    if rule.is_already_wrong(clean_counts):
+    if known is None or not known.examples or not _can_verify_failures(verifier):
         return
     failures = known.examples[:MAX_TRIED_FAILURES]
     title = "checking different failures with fresh renders"
@@ -1163,3 +1213,17 @@ def verify_failures(verifier: Verifier, result: SearchResult) -> None:
         )
         for number, failure in enumerate(failures)
     )
+
+
+def _can_verify_failures(verifier: Verifier) -> bool:
+    """Return whether trials of single failures can prove anything at a bearable cost.
+
+    They cannot if conditions vary by chance, or if the model is wrong about the clean
+    scene.
+    """
+    rule = verifier.problem.verification_rule
+    if rule.has_varying_conditions:
+        return False
+    # Only the counts matter here, and not the `spp` that is stored with them.
+    clean_counts = count_right(verifier.run_state.clean_trials, spp=1)
+    return not rule.is_already_wrong(clean_counts)

@@ -187,9 +187,8 @@ def _run_chain(
     with tempfile.TemporaryDirectory(prefix="advsearch-part-") as directory:
         for study_attack in chains[chain_index]:
             path = Path(directory) / study_attack.name
-            config = study_attack.config.model_copy(
-                update={"run": str(path), "overwrite": True}
-            )
+            changes = {"run": str(path), "overwrite": True}
+            config = study_attack.config.model_copy(update=changes)
             ending = attack_once(config, clean=clean).summary.ending
             finished.append((study_attack.name, str(path), _read_files(path)))
             if ending in SETTLED:
@@ -223,11 +222,7 @@ def distribute_attacks(
     Raises:
         ClusterError: every worker that tried an attack died, or no worker is left.
     """
-    missing_chains = [
-        index
-        for index, chain in enumerate(chains)
-        if not any(is_run(run / PARTS / attack.name) for attack in chain)
-    ]
+    missing_chains = _find_missing_chains(chains, run)
     with open_workers(
         _make_study_task(config),
         # without work no workers are started
@@ -245,6 +240,15 @@ def distribute_attacks(
             for name, worker_path, files in result.value:
                 _write_part(run, name, worker_path, files)
             _report_chain(executor, progress)
+
+
+def _find_missing_chains(chains: Sequence[Chain], run: Path) -> list[int]:
+    """Return the indices of the chains of which no attack has begun in a run directory."""
+    return [
+        index
+        for index, chain in enumerate(chains)
+        if not any(is_run(run / PARTS / attack.name) for attack in chain)
+    ]
 
 
 def _report_chain(executor: Workers, progress: Progress) -> None:
