@@ -117,13 +117,14 @@ def _verify_in_light(
     """
     problem = verifier.problem
     verifier_in_light = _move_into_light(verifier, lux, factor)
+    seed = seeds.derive_seed(problem.seed, "ambient")  # the same in every light
     return verify(
         verifier_in_light.evaluate_all,
         problem.domain,
         u,
         claim=Ending.FOUND,
         spp=verifier.run_state.spp,
-        seed=seeds.derive_seed(problem.seed, "ambient"),
+        seed=seed,
         trials=verifier.look_sizes,
         rule=problem.verification_rule,
         kind=f"ambient {lux:.6g} lux",

@@ -369,9 +369,10 @@ def _curve_chart(result: CurveResult, points: Sequence[CurvePoint]) -> ResultPar
         result: result of the curve.
         points: the points that have an epsilon and a robust accuracy.
     """
-    points_text = "; ".join(
+    rates = [
         f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points
-    )
+    ]
+    points_text = "; ".join(rates)
     return ResultPart(
         CURVE_TITLE,
         [f"Over epsilon with 95 % intervals: {points_text}."],
@@ -445,13 +446,18 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
     if not known or not result.table:
         return "No object was attacked to the end."
     if len(result.objects) > 1:
-        first_and_last = [known[0]] if len(known) == 1 else [known[0], known[-1]]
-        rates = [
-            f"{point.robust} of {point.objects}{_at_epsilon_text(point.epsilon)}"
-            for point in first_and_last
-        ]
-        return f"Still recognised: {' and '.join(rates)}."
+        return _several_objects_text(known)
     return _single_object_text(result.table[0])
+
+
+def _several_objects_text(known: Sequence[CurvePoint]) -> str:
+    """Return the robust accuracy at the first and the last epsilon in a sentence."""
+    first_and_last = [known[0]] if len(known) == 1 else [known[0], known[-1]]
+    rates = [
+        f"{point.robust} of {point.objects}{_at_epsilon_text(point.epsilon)}"
+        for point in first_and_last
+    ]
+    return f"Still recognised: {' and '.join(rates)}."
 
 
 def _at_epsilon_text(epsilon: float | None) -> str:
@@ -593,10 +599,6 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
 
     The stronger a cell's color, the more successes.
     """
-    heads = ["attacked on", "ending"]
-    heads += [
-        f"tested on {words.shorten_name(tested.model)}" for tested in result.tested
-    ]
     clean_rows: list[list[str]] = []
     if result.tested:
         clean_rows = [["clean scene", "", *_clean_rate_cells(result)]]
@@ -604,12 +606,18 @@ def _matrix_part(result: MatrixResult) -> ResultPart:
     clean_runs: list[str | None] = [None] * len(clean_rows)
     return ResultPart(
         "Attacked on, tested on",
-        column_heads=heads,
+        column_heads=_list_matrix_heads(result),
         rows=rows,
         note=_matrix_note(result),
         parts=[*clean_runs, *(row.run for row in result.table)],
         cell_fractions=_find_cell_rates(result, first_row=len(clean_rows)),
     )
+
+
+def _list_matrix_heads(result: MatrixResult) -> list[str]:
+    """Return the heads of the table of a matrix: scene, ending, and tested models."""
+    tested_names = [words.shorten_name(tested.model) for tested in result.tested]
+    return ["attacked on", "ending", *(f"tested on {name}" for name in tested_names)]
 
 
 def _find_cell_rates(
@@ -684,6 +692,11 @@ def _list_endings(result: MatrixResult, *, on_same_model: bool) -> list[str]:
     ]
 
 
+MAX_LEVEL_CHARACTERS = 12  # names under a matrix with more characters are slanted
+SLANT_DEGREES = 20
+DARK_RATE = 0.6  # cells with a larger rate are so dark that their text is white
+
+
 def _draw_matrix(result: MatrixResult, axes: Any) -> None:
     """Draw the rates of a matrix on matplotlib axes.
 
@@ -693,8 +706,8 @@ def _draw_matrix(result: MatrixResult, axes: Any) -> None:
     rows = [row for row in result.table if row.tested]
     _draw_matrix_cells(rows, axes)
     tested_names = [words.shorten_name(tested.model) for tested in result.tested]
-    has_long_names = max(map(len, tested_names)) > 12
-    rotation = 20 if has_long_names else 0
+    has_long_names = max(map(len, tested_names)) > MAX_LEVEL_CHARACTERS
+    rotation = SLANT_DEGREES if has_long_names else 0
     axes.set_xticks(range(len(tested_names)), tested_names, rotation=rotation)
     attacked_names = [words.shorten_name(row.attacked) for row in rows]
     axes.set_yticks(range(len(rows)), attacked_names)
@@ -711,6 +724,5 @@ def _draw_matrix_cells(rows: Sequence[MatrixRow], axes: Any) -> None:
     for y, row in enumerate(rows):
         for x, cell in enumerate(row.tested):
             text = f"{cell.verified.successes}/{cell.verified.trials}"
-            # readable on the dark end of the color scale
-            color = "white" if rates[y][x] > 0.6 else "black"
+            color = "white" if rates[y][x] > DARK_RATE else "black"
             axes.text(x, y, text, ha="center", va="center", color=color)

@@ -76,16 +76,14 @@ def make_page(run: Path, result: Result) -> str | None:
         *_result_parts(run, result, rates_table),
         *_search_parts(result, objectives),
     ]
-    view = replace(
-        view,
-        sections=sections,
-        facts={**view.facts, **_make_page_facts(result)},
-        about=_list_subjects(result),
-    )
+    facts = {**view.facts, **_make_page_facts(result)}
+    about = _list_subjects(result)
+    view = replace(view, sections=sections, facts=facts, about=about)
     # script elements with data, which the scripts of the page read
     data = make_object_data(object_file)
     if frames:
-        data = [_frames_data(frames, objectives.get("search", [])), *data]
+        search_objectives = objectives.get("search", [])
+        data = [_frames_data(frames, search_objectives), *data]
     object_scripts = ["object.js"] if object_file else []
     scripts = ["make.js", "attack.js", *object_scripts]
     return make_view_page(run, result, view, data=data, scripts=scripts)
@@ -248,10 +246,8 @@ def _drive_part(summary: AttackSummary) -> ResultPart:
 def _clean_and_adversarial(summary: AttackSummary, suffix: str) -> list[Picture]:
     """Return the images of both scenes; `suffix` is the end of their file names."""
     pictures = []
-    for name, prediction in (
-        ("clean", summary.clean),
-        ("adversarial", summary.adversarial),
-    ):
+    predictions = {"clean": summary.clean, "adversarial": summary.adversarial}
+    for name, prediction in predictions.items():
         caption = "no prediction recorded"
         if prediction is not None:
             caption = words.format_prediction(summary.task, prediction)
@@ -297,10 +293,7 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
     rows = [_make_change_row(name, changed) for name, changed in changes]
     bars = [_range_bar(changed) for _, changed in changes]
     heads = ("parameter", "clean", "adversarial", "in its range")
-    # indices of the columns with any text
-    columns = [
-        column for column in range(len(heads)) if any(row[column] for row in rows)
-    ]
+    columns = _find_filled_columns(rows, len(heads))
     has_all_columns = len(columns) == len(heads)
     return ResultPart(
         "What was changed" if rows else "",
@@ -308,6 +301,11 @@ def _changes_part(summary: AttackSummary) -> ResultPart:
         rows=[[row[column] for column in columns] for row in rows],
         bars=bars if has_all_columns else (),  # type: ignore[arg-type]
     )
+
+
+def _find_filled_columns(rows: Sequence[Sequence[str]], n_columns: int) -> list[int]:
+    """Return the indices of the columns of a table that have any text."""
+    return [column for column in range(n_columns) if any(row[column] for row in rows)]
 
 
 def _make_change_row(name: str, changed: FoundValue) -> list[str]:
@@ -417,16 +415,20 @@ def _rates_part(summary: AttackSummary, table: ResultPart) -> ResultPart:
     has_rates = any(bars)
     if not has_rates:
         return ResultPart()
-    spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
-    note = f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
     return replace(
         table,
         title="Verified rates",
         column_heads=_put_rate_first(table.column_heads),
         rows=[_put_rate_first(row) for row in table.rows],
         bars=bars,
-        note=note,
+        note=_rates_note(summary),
     )
+
+
+def _rates_note(summary: AttackSummary) -> str:
+    """Return how the images of the verification were rendered, and the intervals made."""
+    spp = f", {summary.verified.spp} samples per pixel" if summary.verified else ""
+    return f"Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals{spp}."
 
 
 def _list_rate_bars(

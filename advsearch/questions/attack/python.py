@@ -289,7 +289,7 @@ class AttackRequest:
             config: the settings.
             scene: the loaded scene.
         """
-        parts = self._find_session_models()
+        parts = self._find_session_only_models()
         if scene.is_session_only:
             parts.append(PythonOnly("scene"))
         parts += self._find_undescribable_parts()
@@ -298,7 +298,7 @@ class AttackRequest:
         parts += [PythonOnly("metric", name) for name in metrics]
         return parts
 
-    def _find_session_models(self) -> list[PythonOnly]:
+    def _find_session_only_models(self) -> list[PythonOnly]:
         """Return the models that exist in this session only."""
         return [
             PythonOnly("model", get_model_name(network))

@@ -12,6 +12,7 @@ from advsearch.report import wording as words
 from advsearch.report.wording import format_count, format_number
 from advsearch.runs.results import (
     ControlGroup,
+    LinearTransport,
     MovedValue,
     PredictionError,
     PrintTerms,
@@ -192,9 +193,10 @@ def _clean_remark(summary: AttackSummary) -> str:
     n_failures = control.trials - control.correct
     if not n_failures:
         return ""
+    failures = _clean_failures_text(control, summary)
     return (
         f"The clean scene itself fails {n_failures} of its {control.trials} "
-        f"trials{_clean_failures_text(control, summary)}"
+        f"trials{failures}"
     )
 
 
@@ -221,6 +223,16 @@ def _baseline_remark(summary: AttackSummary) -> str:
         return _outdone_remark(policy_rate, summary.task)
     if verified is None or random_rate is None:
         return ""
+    return _compare_with_random(verified, random_rate)
+
+
+def _compare_with_random(verified: VerifiedRate, random_rate: VerifiedRate) -> str:
+    """Return that the random search did better or as well; empty if it did not.
+
+    Args:
+        verified: rate of the policy's result.
+        random_rate: rate of the result of the random search.
+    """
     if random_rate.rate <= 0 or random_rate.rate < verified.rate:
         return ""  # without any success, the random search did not do well
     successes = f"{random_rate.successes} of {random_rate.trials}"
@@ -410,7 +422,8 @@ def _error_clause(
     if summary.minimises:
         return _begin_upper(claim)
     if summary.task == words.COMMAND:
-        return _begin_upper(claim + _deviation_text(summary, only_label))
+        direction = _deviation_text(summary, only_label)
+        return _begin_upper(f"{claim}{direction}")
     if only_label is not None:
         outcome = words.get_only_outcome(verified.outcomes)
         predicts = words.format_mistake(summary.task, thing, only_label, outcome)
@@ -674,18 +687,23 @@ def transport_text(summary: AttackSummary) -> str:
     if not transport.used:
         text = "every picture was rendered"
         return f"{text}: {transport.reason}" if transport.reason else text
-    parts = [_prediction_method_text(summary, transport.method)]
+    method = _prediction_method_text(summary, transport.method)
+    return "; ".join([method, *_list_prediction_details(transport)])
+
+
+def _list_prediction_details(transport: LinearTransport) -> list[str]:
+    """Return what is known of predicted images: error, renewals, seconds, a reason."""
+    details = []
     if transport.error is not None:
-        parts.append(_prediction_error_text(transport.error))
+        details.append(_prediction_error_text(transport.error))
     if transport.renewed:
-        parts.append(f"made again {format_count(transport.renewed, 'time')}")
+        details.append(f"made again {format_count(transport.renewed, 'time')}")
     if transport.seconds is not None:
-        parts.append(
-            f"it and the comparisons took {words.format_seconds(transport.seconds)}"
-        )
+        seconds = words.format_seconds(transport.seconds)
+        details.append(f"it and the comparisons took {seconds}")
     if transport.reason:
-        parts.append(transport.reason)
-    return "; ".join(parts)
+        details.append(transport.reason)
+    return details
 
 
 def _prediction_method_text(summary: AttackSummary, method: str | None) -> str:

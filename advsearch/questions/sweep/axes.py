@@ -108,13 +108,24 @@ def parse_axes(
     axes: dict[str, Axis] = {}
     for name, values in grid.items():
         axis = _parse_axis(name, values, instances)
-        if axis.name in axes:
-            raise InputError(
-                f"`grid` {name}: {axis.name} is given twice; leave one of the two out"
-            )
+        _check_not_repeated(name, axis, axes)
         _check_not_sampled(name, axis, instances)
         axes[axis.name] = axis
     return tuple(axes.values())
+
+
+def _check_not_repeated(name: str, axis: Axis, axes: Mapping[str, Axis]) -> None:
+    """Raise an error if an earlier axis varies the same parameter.
+
+    Args:
+        name: name of the axis, as the user wrote it.
+        axis: the axis.
+        axes: the earlier axes by their stored name.
+    """
+    if axis.name in axes:
+        raise InputError(
+            f"`grid` {name}: {axis.name} is given twice; leave one of the two out"
+        )
 
 
 def _check_not_sampled(name: str, axis: Axis, instances: Mapping[str, Control]) -> None:
@@ -147,11 +158,7 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         InputError, UnknownNameError: the name or the values cannot be used.
     """
     where = f"`grid` {name}"
-    # Names such as "model" are settings and no controls.
-    if name in _LISTED_SETTINGS:
-        raise InputError(
-            f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
-        )
+    _check_no_listed_setting(where, name)
     kind, parameter_name, colon_instance = _split_axis_name(name)
     instance = name.partition(".")[0]  # if the name is INSTANCE.PARAMETER
     if instance not in instances:
@@ -172,6 +179,21 @@ def _parse_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axi
         parameter=parameter,
         values=parse_axis_values(where, parameter, values),
     )
+
+
+def _check_no_listed_setting(where: str, name: str) -> None:
+    """Raise an error if an axis has the name of a setting that takes several values.
+
+    Such a setting, "model" say, is no control.
+
+    Args:
+        where: the axis, as messages name it.
+        name: name of the axis.
+    """
+    if name in _LISTED_SETTINGS:
+        raise InputError(
+            f"{where}: several of them are given as a list: {_LISTED_SETTINGS[name]}"
+        )
 
 
 def _select_parameter(
@@ -339,11 +361,7 @@ def parse_axis_values(
     """
     is_angle = parameter.periodic and parameter.unit == "degrees"
     values = _list_raw_values(where, parameter, raw_values, is_angle)
-    if not values:
-        raise InputError(
-            f"{where}: expected at least one value, got none; write "
-            "FIRST:LAST:COUNT or a list"
-        )
+    _check_any_values(where, values)
     _check_count(where, len(values))
     # NumPy's scalars (they have `item`) become Python's.
     choices = [value.item() if hasattr(value, "item") else value for value in values]
@@ -352,6 +370,15 @@ def parse_axis_values(
     _check_distinct(where, spec.values, is_angle)
     _check_number_precision(where, parameter, spec.values)
     return spec.values
+
+
+def _check_any_values(where: str, values: Sequence[Any]) -> None:
+    """Raise an error if an axis, `where` in the message, has no values."""
+    if not values:
+        raise InputError(
+            f"{where}: expected at least one value, got none; write "
+            "FIRST:LAST:COUNT or a list"
+        )
 
 
 def _list_raw_values(
@@ -864,8 +891,9 @@ class SceneConfigurations:
         self._grid_coordinates: list[_GridCoordinate] = []
         self._small_blocks: list[_SampledBlock] = []
         self._large_blocks: list[_SampledBlock] = []
+        block_slices = domain.list_block_slices()
         for group, (block, coordinates) in zip(
-            self.space.groups, domain.list_block_slices(), strict=True
+            self.space.groups, block_slices, strict=True
         ):
             if group.name in self._axes:
                 axis_index, _ = self._axes[group.name]
@@ -875,11 +903,10 @@ class SceneConfigurations:
             is_small = block.size <= MAX_SOBOL_SIZE
             blocks = self._small_blocks if is_small else self._large_blocks
             columns = _find_free_columns(blocks, block)
-            blocks.append(
-                _SampledBlock(
-                    group.control, group.parameter, block, coordinates, columns
-                )
+            sampled = _SampledBlock(
+                group.control, group.parameter, block, coordinates, columns
             )
+            blocks.append(sampled)
 
     def _list_sampled_numbers(self) -> Iterator[SampledNumber]:
         """Yield the sampled numbers that tables count by.
@@ -922,9 +949,8 @@ class SceneConfigurations:
             yield _make_sampled_choice(full_name, unit, spec, first_column)
             return
         is_vector = bool(parameter.shape)
-        for component, coordinate in enumerate(
-            range(coordinates.start, coordinates.stop)
-        ):
+        coordinate_indices = range(coordinates.start, coordinates.stop)
+        for component, coordinate in enumerate(coordinate_indices):
             suffix = f".{component}" if is_vector else ""
             yield SampledNumber(
                 name=full_name + suffix,
@@ -1035,7 +1061,8 @@ class SceneConfigurations:
         first_in_sweep = before + first
         self._fill_sampled(u, self._small_draws, self._small_blocks, first_in_sweep)
         self._fill_sampled(u, self._large_draws, self._large_blocks, first_in_sweep)
-        return torch.from_numpy(np.clip(u.astype(np.float32), self._lower, self._upper))
+        bounded = np.clip(u.astype(np.float32), self._lower, self._upper)
+        return torch.from_numpy(bounded)
 
     def _fill_sampled(
         self,
@@ -1056,16 +1083,14 @@ class SceneConfigurations:
             return
         samples = self._sample(draws, first, len(u))
         for sampled in blocks:
-            u[:, sampled.coordinates] = self._transform(
-                sampled, samples[:, sampled.columns]
-            )
+            uniform = samples[:, sampled.columns]
+            u[:, sampled.coordinates] = self._transform(sampled, uniform)
 
     def _transform(self, sampled: _SampledBlock, uniform: Float64Array) -> Float64Array:
         """Return coordinates inside the budget of a block from uniform numbers.
 
-        The coordinates are uniform in the box, or in the ball around the start. A
-        choice of n options cuts [0, 1] into n equal parts; the coordinate of an option
-        is the center of its part.
+        The coordinates are uniform in the box, or in the ball around the start, or among
+        the options of a choice.
 
         Args:
             sampled: the block, of k coordinates.
@@ -1077,11 +1102,7 @@ class SceneConfigurations:
         """
         block = sampled.block
         if block.n_options:
-            # a uniform number of exactly 1 belongs to the last option
-            option = np.minimum(
-                np.floor(uniform * block.n_options), block.n_options - 1
-            )
-            return np.asarray((option + 0.5) / block.n_options)
+            return _map_to_options(uniform, block.n_options)
         # Only a ball has an epsilon; the type checker needs the second condition.
         if block.norm == "l2" and block.epsilon is not None:
             center = self._start[sampled.coordinates]
@@ -1120,9 +1141,9 @@ class SceneConfigurations:
                 _add_columns(rows, columns)
                 continue
             for image, row in enumerate(rows):
-                axis_points = self._find_axis_points(control, indices, image)
+                points = self._find_axis_points(control, indices, image)
                 row |= self._describe_control(
-                    control, u[image], control_u[image], axis_points
+                    control, u[image], control_u[image], points
                 )
         return rows
 
@@ -1168,13 +1189,22 @@ class SceneConfigurations:
         description = self._describe_alone(control, u, control_u)
         for axis, index in axis_points:
             description[axis.name] = {"value": axis.values[index], "unit": axis.unit}
-        # A control has a group for each of its parameters.
-        are_all_on_axes = len(axis_points) == len(control.groups)
-        follows_from_axes = are_all_on_axes and not control.refines
-        has_room = len(self._description_cache) < MAX_CACHED_DESCRIPTIONS
-        if follows_from_axes and has_room:
+        if self._can_cache(control, n_axes=len(axis_points)):
             self._description_cache[key] = description
         return description
+
+    def _can_cache(self, control: Control, *, n_axes: int) -> bool:
+        """Return whether the values of a control follow from axes, and the cache has room.
+
+        Args:
+            control: the control.
+            n_axes: number of its parameters that are axes of the grid.
+        """
+        # A control has a group for each of its parameters.
+        are_all_on_axes = n_axes == len(control.groups)
+        follows_from_axes = are_all_on_axes and not control.refines
+        has_room = len(self._description_cache) < MAX_CACHED_DESCRIPTIONS
+        return follows_from_axes and has_room
 
     def _describe_alone(
         self, control: Control, u: Tensor, control_u: Tensor
@@ -1275,6 +1305,21 @@ def _make_sampled_choice(
     )
 
 
+def _map_to_options(uniform: Float64Array, n_options: int) -> Float64Array:
+    """Return the coordinates (n, 1) of options from uniform numbers (n, 1).
+
+    A choice of n options cuts [0, 1] into n equal parts; the coordinate of an option is
+    the center of its part.
+    """
+    # a uniform number of exactly 1 belongs to the last option
+    option = np.minimum(np.floor(uniform * n_options), n_options - 1)
+    return np.asarray((option + 0.5) / n_options)
+
+
+MIN_UNIFORM = 1e-12  # uniform numbers are kept this far from 0 and 1
+MIN_NORM = 1e-30  # smallest divisor of a direction
+
+
 def _map_to_ball(
     center: Float64Array, radius: float, uniform: Float64Array
 ) -> Float64Array:
@@ -1288,11 +1333,11 @@ def _map_to_ball(
         uniform: (n, k + 1) in [0, 1], with that of the length last.
     """
     # Normal numbers, by the inverse distribution; 0 and 1 would give infinities.
-    direction = ndtri(np.clip(uniform[:, :-1], 1e-12, 1.0 - 1e-12))
+    direction = ndtri(np.clip(uniform[:, :-1], MIN_UNIFORM, 1.0 - MIN_UNIFORM))
     # The volume within a length r grows as r^k: r is the root of a uniform number.
     length = radius * uniform[:, -1:] ** (1.0 / len(center))
     # no division by 0, where all numbers are 0.5
-    norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
+    norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), MIN_NORM)
     return np.asarray(center + direction * (length / norm))
 
 

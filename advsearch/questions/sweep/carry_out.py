@@ -251,15 +251,13 @@ class SweepRequest:
             config: the settings.
         """
         metric_names = judging.list_session_only_metrics(config.metrics)
+        control_names = loading.list_session_only_controls(self.controls)
         return [
             *self._find_session_models(),
             *self._find_session_scene_and_task(),
             *(PythonOnly("metric", name) for name in metric_names),
             *([] if self.tracker is None else [PythonOnly("tracker")]),
-            *(
-                PythonOnly("control", name)
-                for name in loading.list_session_only_controls(self.controls)
-            ),
+            *(PythonOnly("control", name) for name in control_names),
         ]
 
     def _find_session_models(self) -> list[PythonOnly]:
@@ -381,19 +379,19 @@ def _name_loaded_scenes(scenes: Sequence[Any]) -> tuple[NamedScene, ...]:
     Raises:
         InputError: some are loaded, and others are names.
     """
-    loaded = tuple(
-        NamedScene(
-            scene.description.object_name, scene.description.environment_name, scene
-        )
-        for scene in scenes
-        if isinstance(scene, Scene)
-    )
+    loaded = tuple(_name_scene(scene) for scene in scenes if isinstance(scene, Scene))
     if 0 < len(loaded) < len(scenes):
         raise InputError(
             "scene: expected scenes from load_scene or names of objects, "
             "got some of each"
         )
     return loaded
+
+
+def _name_scene(scene: Scene) -> NamedScene:
+    """Return a scene with the names of its object and its environment."""
+    description = scene.description
+    return NamedScene(description.object_name, description.environment_name, scene)
 
 
 def _describe_scenes(
@@ -465,21 +463,28 @@ def _run_config(
         request: what the caller passed.
         progress: reports the progress.
     """
-    resumed = _find_resumable(config)
-    # The directory of a new run is created before the work starts. A sweep without
-    # `run` has no directory: `directory` is None below.
-    context: Any = nullcontext(resumed)  # of the directory, as `with` returns it
-    if config.run is not None and resumed is None:
-        check_free(config.run, overwrite=config.overwrite)
-        context = create_before_work(config)
+    run_context = _open_run_before_work(config)
     if config.twins is not None:
         read_twins(config.twins)  # a check before the work: raises if it is corrupt
-    with context as directory:
+    with run_context as directory:
         job = _make_requested_job(config, request)
         if config.run is not None:
             return _run_in_directory(config, job, progress, directory)
         with open_executor(config, WORKER, progress) as executor:
             return Sweep(job, None, progress, executor).execute()
+
+
+def _open_run_before_work(config: SweepConfig) -> Any:
+    """Return a context with the run directory of a sweep, created if it is new.
+
+    The context has the directory of a stopped sweep that is continued, or a new one. It
+    has None if the sweep is not stored.
+    """
+    resumed = _find_resumable(config)
+    if config.run is None or resumed is not None:
+        return nullcontext(resumed)
+    check_free(config.run, overwrite=config.overwrite)
+    return create_before_work(config)
 
 
 def _make_requested_job(config: SweepConfig, request: SweepRequest) -> Job:
@@ -570,17 +575,16 @@ def _add_adversarial_arm(
     attack_config = _load_attack_config(directory)
     fixed_controls = make_configured_controls(attack_config, attack_config.controls)
     _check_not_varied(fixed_controls, sampled, axes, directory)
+    # The attack's controls are fixed in both arms. Without an adversarial configuration
+    # they have their values in the clean scene.
     u = torch.from_numpy(read_configuration(directory))
-    # The attack's controls are fixed in both arms. Without `u` they have their values
-    # in the clean scene.
-    clean = [
-        replace(named_scene, fixed_controls=fixed_controls, arm=CLEAN)
-        for named_scene in named_scenes
-    ]
     arm = _name_adversarial_arm(directory)
+    clean = [
+        replace(scene, fixed_controls=fixed_controls, arm=CLEAN)
+        for scene in named_scenes
+    ]
     adversarial = [
-        replace(named_scene, adversarial_configuration=u, arm=arm)
-        for named_scene in clean
+        replace(scene, adversarial_configuration=u, arm=arm) for scene in clean
     ]
     return (*clean, *adversarial)
 
@@ -774,17 +778,24 @@ def _check_something_varies(
     Raises:
         InputError: `samples` is set but nothing is sampled, or nothing varies at all.
     """
-    if config.samples is not None and not sampled:
-        raise InputError(
-            "samples: expected `controls` beside it, which says what is drawn by "
-            "chance; add `controls=pose`, say, or "
-            "leave `samples` out"
-        )
+    _check_samples_have_controls(config, sampled)
     if not axes and not sampled and n_combinations == 1:
         raise InputError(
             "grid: expected something that varies, got nothing; add an axis such as "
             "`grid` pose.yaw=0:360:24, or "
             "`controls=pose` `samples=100`"
+        )
+
+
+def _check_samples_have_controls(
+    config: SweepConfig, sampled: Sequence[Control]
+) -> None:
+    """Raise an error if `samples` is set but no control is sampled."""
+    if config.samples is not None and not sampled:
+        raise InputError(
+            "samples: expected `controls` beside it, which says what is drawn by "
+            "chance; add `controls=pose`, say, or "
+            "leave `samples` out"
         )
 
 
@@ -841,12 +852,18 @@ def _load_models_and_tasks(
         warnings += network_task.output_remarks
     if config.judge == ALL_THINGS:
         tasks = tuple(map(make_each_thing_task, tasks))
-    labels = {
+    warnings += judging.find_label_warnings(
+        networks, config.label, _find_object_labels(named_scenes)
+    )
+    return networks, tasks, warnings
+
+
+def _find_object_labels(named_scenes: Sequence[NamedScene]) -> dict[str, str | None]:
+    """Return the label of each object by its name."""
+    return {
         named_scene.object_name: named_scene.scene.description.object.label
         for named_scene in named_scenes
     }
-    warnings += judging.find_label_warnings(networks, config.label, labels)
-    return networks, tasks, warnings
 
 
 def _calibrate_for_model(

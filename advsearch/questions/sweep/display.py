@@ -22,6 +22,7 @@ from advsearch.errors import InputError
 from advsearch.options import Outcome
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.sweep.summary import (
+    ArmComparison,
     AxisRow,
     DriveRates,
     OverDrives,
@@ -71,6 +72,7 @@ MAX_TICKS = 16  # number of values of an axis that have a label
 USUAL_LABEL_LENGTH = 8
 # total number of characters of the labels of an axis that fit side by side
 MAX_LABELS_LENGTH = 50
+SLANT_OF_LABELS = 45  # degrees by which long labels of an x axis are rotated
 # Sizes of figures in inches. A map has the size of its frame plus that of each cell;
 # labels longer than usual add the width or the height of each further character.
 ACCURACY_FIGURE_SIZE = (5.6, 3.6)
@@ -91,19 +93,33 @@ def figure_size(summary: SweepSummary) -> tuple[float, float] | None:
     if not summary.cells:
         return ACCURACY_FIGURE_SIZE if _list_single_axis(summary) else None
     x_axis, y_axis = summary.cells.axes
-    rotated_length = 0
-    if _are_long(x_axis.values):
-        rotated_length = _find_longest_label(x_axis.values)
-    left_length = _find_longest_label(y_axis.values)
-    # Labels of the x axis end below their tick: rotated ones begin to the left of it,
-    # so that the first of them needs room at the left of the axes.
-    extra_left = max(max(left_length, rotated_length) - USUAL_LABEL_LENGTH, 0)
-    extra_below = max(rotated_length - USUAL_LABEL_LENGTH, 0)
+    extra_left, extra_below = _count_extra_characters(x_axis.values, y_axis.values)
     cells_width = CELL_WIDTH * min(len(x_axis.values), MAX_TICKS)
     cells_height = CELL_HEIGHT * min(len(y_axis.values), MAX_TICKS)
     width = MAP_FRAME_WIDTH + cells_width + CHARACTER_WIDTH * extra_left
     height = MAP_FRAME_HEIGHT + cells_height + ROTATED_CHARACTER_HEIGHT * extra_below
     return width, height
+
+
+def _count_extra_characters(
+    x_values: Sequence[Any], y_values: Sequence[Any]
+) -> tuple[int, int]:
+    """Return how many characters the labels of a map are longer than usual.
+
+    Args:
+        x_values: values of the x axis.
+        y_values: values of the y axis.
+
+    Returns:
+        The characters for which room is needed at the left of the axes, and below them.
+    """
+    rotated_length = _find_longest_label(x_values) if _are_long(x_values) else 0
+    left_length = _find_longest_label(y_values)
+    # Labels of the x axis end below their tick: rotated ones begin to the left of it,
+    # so that the first of them needs room at the left of the axes.
+    extra_left = max(max(left_length, rotated_length) - USUAL_LABEL_LENGTH, 0)
+    extra_below = max(rotated_length - USUAL_LABEL_LENGTH, 0)
+    return extra_left, extra_below
 
 
 def _find_longest_label(values: Sequence[Any]) -> int:
@@ -159,18 +175,25 @@ def _draw_map(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
     # The accuracy of a single prediction is only 0 or 1: its margin says more.
     counts = np.array(cells.configurations, dtype=float)
     has_accuracy = bool(counts.max() > 1)
+    cell_values = _compute_accuracies(cells) if has_accuracy else _list_margins(cells)
     draw_heat_map(
         axes,
-        _compute_accuracies(cells) if has_accuracy else _list_margins(cells),
+        cell_values,
         extent,
         ACCURACY if has_accuracy else MARGIN,
         format_axis_title(x_axis.axis, x_axis.unit),
         format_axis_title(y_axis.axis, y_axis.unit),
     )
-    rotation = 45 if _are_long(x_axis.values) else 0
-    axes.set_xticks(*_select_ticks(x_axis.values), rotation=rotation)
+    _label_x_values(axes, x_axis.values)
     axes.set_yticks(*_select_ticks(y_axis.values))
     axes.set_title(_make_map_title(summary, n_more_axes=len(cells.over)))
+
+
+def _label_x_values(axes: Any, values: Sequence[Any]) -> None:
+    """Label the values of an x axis, slanted if their labels are long."""
+    indices, labels = _select_ticks(values)
+    rotation = SLANT_OF_LABELS if _are_long(values) else 0
+    axes.set_xticks(indices, labels, rotation=rotation)
 
 
 def _compute_accuracies(cells: SweepMap) -> list[list[float]]:
@@ -208,7 +231,7 @@ def _draw_accuracy(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) ->
     _draw_intervals(axes, rows)
     accuracy = [row.accuracy for row in rows]
     axes.plot(range(len(rows)), accuracy, "o", color=BLUE, label="accuracy")
-    axes.set_xticks(*_select_ticks(values), rotation=45 if _are_long(values) else 0)
+    _label_x_values(axes, values)
     axes.set(
         xlabel=format_axis_title(rows[0].axis, rows[0].unit),
         ylabel="accuracy",
@@ -312,9 +335,8 @@ SURFACE_COLUMNS: dict[str, Column] = {
 def make_sweep_view(summary: SweepSummary) -> ShownResult:
     """Return the view of a sweep: what a text, a page and a notebook show of it."""
     axes = _group_axes(summary)
-    page_parts = (
-        replace(part, only_medium="page") for part in _make_page_parts(summary, axes)
-    )
+    parts_for_page = _make_page_parts(summary, axes)
+    page_parts = (replace(part, only_medium="page") for part in parts_for_page)
     sections = [
         *_make_text_sections(summary, axes),
         *_make_figure_parts(summary),
@@ -385,17 +407,22 @@ def _make_text_sections(
     if distance:
         yield ResultPart(text=[describe_detection_distance(distance)])
     for rates in summary.drives or ():
-        yield ResultPart(
-            drive_title(rates), column_heads=DRIVE_HEADS, rows=make_drive_rows(rates)
-        )
-    yield ResultPart.make_table(
-        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
-    )
+        title = drive_title(rates)
+        rows = make_drive_rows(rates)
+        yield ResultPart(title, column_heads=DRIVE_HEADS, rows=rows)
+    yield _make_changes_table(summary)
     yield from _make_axis_sections(summary, axes)
     if summary.surface is not None:
         sentences = "\n".join(surface_sentences(summary.surface))
         title = "What is seen of the surface when the model is wrong:"
         yield ResultPart(title, [sentences])
+
+
+def _make_changes_table(summary: SweepSummary) -> ResultPart:
+    """Return the table of predictions about changed images; empty without any."""
+    return ResultPart.make_table(
+        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
+    )
 
 
 def _make_axis_sections(
@@ -484,9 +511,7 @@ def _make_page_parts(
         yield _make_distance_part(distance)
     for index, rates in enumerate(summary.drives or ()):
         yield _make_drive_part(rates, is_first=index == 0)
-    yield ResultPart.make_table(
-        summary.changes or [], CHANGE_COLUMNS, title=CHANGES_TITLE
-    )
+    yield _make_changes_table(summary)
     if summary.surface is not None:
         yield from _make_surface_parts(summary.surface)
     for name, rows in axes.items():
@@ -560,16 +585,18 @@ def _verdict(summary: SweepSummary) -> str:
             f"configurations: right in {summary.correct} ({rate}){outcomes}."
         )
     if summary.arms and summary.arms.pairs:
-        adversarial_run = summary.arms.adversarial_run
-        rates = [
-            format_paired_rates(adversarial_run, pair) for pair in summary.arms.pairs
-        ]
-        return " ".join(rates)
+        return _verdict_of_arms(summary.arms)
     configurations = format_count(summary.configurations, "configuration")
     return (
         f"The model is right in {summary.correct} of {configurations} "
         f"({rate}){format_grid_caution(summary)}{outcomes}."
     )
+
+
+def _verdict_of_arms(arms: ArmComparison) -> str:
+    """Return how the adversarial scene compares with the clean one, for each model."""
+    rates = [format_paired_rates(arms.adversarial_run, pair) for pair in arms.pairs]
+    return " ".join(rates)
 
 
 def describe_wrong_outcomes(summary: SweepSummary) -> str:
@@ -603,9 +630,7 @@ def _make_axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPar
         rows: its values.
         task: name of the task.
     """
-    title = name
-    if rows[0].unit not in (*wording.PLAIN_UNITS, "name"):  # "name": a discrete choice
-        title += f", {rows[0].unit}"
+    title = _make_axis_title(name, rows[0].unit)
     listed = list(rows)
     if len(rows) > MAX_TEXT_ROWS:
         listed = _select_worst(rows, MAX_TEXT_ROWS // 2)
@@ -619,6 +644,13 @@ def _make_axis_table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPar
         for cells, row in zip(lines, listed, strict=True):
             cells.append(wording.format_outcomes(row.outcomes, task))
     return ResultPart(title, rows=lines)
+
+
+def _make_axis_title(name: str, unit: str) -> str:
+    """Return the name of an axis with its unit, if values are written without it."""
+    # "name" is the unit of a discrete choice.
+    has_unit = unit not in (*wording.PLAIN_UNITS, "name")
+    return f"{name}, {unit}" if has_unit else name
 
 
 def _make_value_row(row: AxisRow) -> list[str]:
@@ -700,13 +732,7 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
     if not is_sampled:
         return _describe_imported_population(result)
     if result.drives:
-        # The frames are the grid; what else differs between drives is sampled.
-        population = (
-            f"{_name_frames(result.drives)}; what else differs between drives is drawn "
-            f"at random ({result.sampler})"
-        )
-        note = " The interval is over drives, as if these were independent."
-        return population, "" if result.sampler == "random" else note
+        return _describe_sampled_drives(result.drives, result.sampler)
     has_independent_draws = result.sampler == "random" and not result.grid
     if has_independent_draws:
         return "configurations drawn at random from the stated ranges", ""
@@ -715,6 +741,21 @@ def _describe_population(result: SweepSummary) -> tuple[str, str]:
         population += " at each point of a grid"
     note = " The interval is that of independent draws, which these are not."
     return population, note
+
+
+def _describe_sampled_drives(
+    drives: Sequence[DriveRates], sampler: str | None
+) -> tuple[str, str]:
+    """Return what the rates of sampled drives are over, and a caution.
+
+    The frames are the grid; what else differs between drives is sampled.
+    """
+    population = (
+        f"{_name_frames(drives)}; what else differs between drives is drawn "
+        f"at random ({sampler})"
+    )
+    note = " The interval is over drives, as if these were independent."
+    return population, "" if sampler == "random" else note
 
 
 def _describe_imported_population(result: SweepSummary) -> tuple[str, str]:
@@ -780,10 +821,9 @@ def _make_accuracy_claims(
         note: a caution about the interval.
     """
     population += _describe_unsampled(result)
+    contents = "configurations in which the model is right"
     for model, counts in _count_by_model(result).items():
-        extent = _make_accuracy_extent(
-            "configurations in which the model is right", counts
-        )
+        extent = _make_accuracy_extent(contents, counts)
         outcomes = wording.format_outcomes(counts.outcomes, result.task)
         others = f" Of the others: {outcomes}." if outcomes else ""
         text = (
@@ -981,6 +1021,9 @@ def format_error_rate(counts: CountedPredictions) -> str:
 
 DISTANCE = "camera.distance"  # name of the axis
 HALF = 0.5
+# significance of a one-sided binomial test, divided by the number of tests; both bounds
+# together have 95 % confidence
+BOUND_SIGNIFICANCE = 0.025
 
 
 @dataclass(frozen=True)
@@ -1034,6 +1077,14 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     independent images are needed.
     """
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
+    has_distances = len(rows) > 1
+    if not has_distances or not _can_measure_distance(summary):
+        return None
+    return compute_detection_distance(rows)
+
+
+def _can_measure_distance(summary: SweepSummary) -> bool:
+    """Return whether a sweep detects one object with one model in independent images."""
     # A task may have options, as in "detection=..."
     task_name = summary.task.partition("=")[0]
     is_detection = task_name == "detection"
@@ -1043,9 +1094,7 @@ def find_detection_distance(summary: SweepSummary) -> DetectionDistance | None:
     # Frames of a drive are not independent. Neither are images that share a draw; then
     # `units` is the number of draws.
     are_independent = summary.drives is None and summary.units is None
-    if is_comparison or not (is_detection and is_single and are_independent):
-        return None
-    return compute_detection_distance(rows) if len(rows) > 1 else None
+    return is_detection and is_single and are_independent and not is_comparison
 
 
 def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
@@ -1062,18 +1111,13 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
     Raises:
         InputError: there are fewer than two distances.
     """
-    if len(rows) < 2:
-        raise InputError(
-            "detection distance: expected at least two distances, got "
-            f"{len(rows)}; sweep over more"
-        )
+    _check_distance_count(len(rows))
     rows = sorted(rows, key=_center_distance)
     distances = tuple(_center_distance(row) for row in rows)
     k = np.array([row.correct for row in rows])  # right images at each distance
     n = np.array([row.configurations for row in rows])  # images
-    # significance of a one-sided binomial test at one of the distances: 2.5 %, divided
-    # by the number of tests (Bonferroni)
-    significance = 0.025 / len(rows)
+    # significance of the test at one of the distances (Bonferroni)
+    significance = BOUND_SIGNIFICANCE / len(rows)
     low, high = _bound_distance(np.array(distances), k, n, significance)
     dips = find_dips(distances, k, n)
     beyond_dips = slice(_find_first_beyond_dips(distances, dips), None)
@@ -1093,6 +1137,15 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         # The last one is the smallest.
         is_above_half=bool(fitted_fractions[-1] >= HALF),
     )
+
+
+def _check_distance_count(n_distances: int) -> None:
+    """Raise an error if there are fewer than two distances."""
+    if n_distances < 2:
+        raise InputError(
+            "detection distance: expected at least two distances, got "
+            f"{n_distances}; sweep over more"
+        )
 
 
 def _find_missing_images(n: NDArray[np.int64], significance: float) -> int | None:
@@ -1340,14 +1393,12 @@ def _loose_sentence(estimate: DetectionDistance, unit: str) -> str:
     """
     if not sum(estimate.loose_counts):
         return ""
+    counts = zip(
+        estimate.distances, estimate.loose_counts, estimate.image_counts, strict=True
+    )
     clauses = [
         f"{n_loose} of {n_images} at {distance:.3g} {unit}"
-        for distance, n_loose, n_images in zip(
-            estimate.distances,
-            estimate.loose_counts,
-            estimate.image_counts,
-            strict=True,
-        )
+        for distance, n_loose, n_images in counts
         if n_loose
     ]
     return (
@@ -1361,15 +1412,13 @@ def _add_loose_fractions(estimate: DetectionDistance) -> list[float]:
 
     That is the fraction of right images plus that of images with only a loose box.
     """
-    return [
-        fraction + n_loose / n_images
-        for fraction, n_loose, n_images in zip(
-            estimate.right_fractions,
-            estimate.loose_counts,
-            estimate.image_counts,
-            strict=True,
-        )
-    ]
+    counts = zip(
+        estimate.right_fractions,
+        estimate.loose_counts,
+        estimate.image_counts,
+        strict=True,
+    )
+    return [fraction + n_loose / n_images for fraction, n_loose, n_images in counts]
 
 
 def draw_detection_distance(estimate: DetectionDistance, axes: Any) -> None:

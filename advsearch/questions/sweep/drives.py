@@ -82,15 +82,26 @@ def add_frame_axis(
     time_name = f"{travelling.name}.time"
     if time_name not in grid:
         grid = {**grid, time_name: _make_frame_range(travelling.seconds, config.fps)}
+    return sampled, {**_make_path_axis(config, travelling), **grid}
+
+
+def _make_path_axis(config: SweepConfig, travelling: Any) -> dict[str, object]:
+    """Return the axis of the paths among which a control can choose, by its name.
+
+    There is none if the path is in the grid, set or sampled, or if there is one path.
+
+    Args:
+        config: the settings.
+        travelling: the control that travels.
+    """
     path_name = f"{travelling.name}.{Control.PATH_PARAMETER}"
-    is_path_in_grid = path_name in grid
+    is_path_in_grid = path_name in config.grid
     is_path_set = Control.PATH_PARAMETER in travelling.specs
     is_sampled = config.samples is not None
-    if not (is_path_in_grid or is_path_set or is_sampled):
-        paths = _list_paths(travelling)
-        if paths:
-            grid = {path_name: paths, **grid}
-    return sampled, grid
+    if is_path_in_grid or is_path_set or is_sampled:
+        return {}
+    paths = _list_paths(travelling)
+    return {path_name: paths} if paths else {}
 
 
 def _make_frame_range(seconds: float, fps: float) -> str:
@@ -205,9 +216,7 @@ class Drives:
         assert time_index is not None
         self._job = job
         time_axis = job.axes[time_index]
-        # The units are the same in all scenes and for all sizes of images.
-        points_of_first_scene = job.load_configurations_by_size(0)
-        self._units = next(iter(points_of_first_scene.values())).independent_units
+        self._units = _find_independent_units(job)
         self._distance_bounds = compute_distance_bounds(job, time_axis)
         shape = _find_shape_of_rows(job)
         flags: Flags = np.full(shape, UNKNOWN, np.int8)
@@ -222,7 +231,7 @@ class Drives:
         times = np.array([float(value) for value in time_axis.values])
         order = np.argsort(times)
         self.times = times[order]
-        self.seconds = float(self.times[-1] - self.times[0])
+        self.seconds = float(self.times[-1] - self.times[0])  # of one drive
         row_numbers = np.arange(flags.size).reshape(shape)
         self._outcomes = _move_frames_last(flags, time_index, order)
         self._row_numbers = _move_frames_last(row_numbers, time_index, order)
@@ -346,10 +355,6 @@ class Drives:
         draw_of_drive = self._find_draw_of_drives(drives)
         n_drives = len(np.unique(draw_of_drive))
         n_right_drives = len(np.unique(draw_of_drive[has_right]))
-        # The largest values that are possible: every frame is wrong, and the prediction
-        # changes from each frame to the next.
-        max_gap = n_frames * self._frame_interval
-        max_flicker = (n_frames - 1) / self.seconds
         summarize = partial(summarize_drives, drive_of_value=draw_of_drive)
         return DriveRates(
             model=self._job.models[model].name,
@@ -362,7 +367,7 @@ class Drives:
             # the longest gap, the smallest distance of the first detection.
             right=summarize(_right_fraction(outcomes), min),
             longest_gap=summarize(
-                self._longest_gaps(outcomes), max, bounds=(0.0, max_gap)
+                self._longest_gaps(outcomes), max, bounds=(0.0, self._max_gap)
             ),
             first_right=self._first_detection(
                 first_distance[has_right], draw_of_drive[has_right]
@@ -370,7 +375,7 @@ class Drives:
             unit=self._distance_unit,
             never_right=n_drives - n_right_drives,
             flicker=summarize(
-                self._changes_per_second(outcomes), max, bounds=(0.0, max_flicker)
+                self._changes_per_second(outcomes), max, bounds=(0.0, self._max_flicker)
             ),
             tracks=self._compute_track_rates(model, drives.row_numbers, draw_of_drive),
             per_drive=self._describe_drives(drives, first_distance),
@@ -399,7 +404,8 @@ class Drives:
         longest_gap = self._longest_gaps(drives.outcomes)
         flicker = self._changes_per_second(drives.outcomes)
         # A drive is identified by the row of its first frame.
-        first_steps = drives.row_numbers[:MAX_LISTED_DRIVES, 0].tolist()
+        first_frames = drives.row_numbers[:, 0]
+        first_steps = first_frames[:MAX_LISTED_DRIVES].tolist()
         return [
             DriveRecord(
                 row=step,
@@ -416,6 +422,16 @@ class Drives:
     def _frame_interval(self) -> float:
         """Seconds from one frame to the next."""
         return self.seconds / (len(self.times) - 1)
+
+    @property
+    def _max_gap(self) -> float:
+        """The longest possible gap in seconds: every frame is wrong."""
+        return len(self.times) * self._frame_interval
+
+    @property
+    def _max_flicker(self) -> float:
+        """The most changes a second that are possible: from each frame to the next."""
+        return (len(self.times) - 1) / self.seconds
 
     def _longest_gaps(self, flags: Flags) -> npt.NDArray[np.float64]:
         """Return the seconds (n,) of the longest run of wrong frames of each drive."""
@@ -485,8 +501,8 @@ class Drives:
         switches = np.array(
             [tracked.switches for tracked in tracked_drives], dtype=float
         )
+        max_switches = len(self.times) - 1.0  # one between any two frames
         gaps = np.array([tracked.gap for tracked in tracked_drives], dtype=float)
-        n_frames = len(self.times)
         summarize = partial(summarize_drives, drive_of_value=drive)
         # In the worst drive each of these rates is largest: therefore `max`.
         return TrackRates(
@@ -494,12 +510,9 @@ class Drives:
             lost=summarize(lost, max),
             # frames that are lost, but not if a small overlap is enough
             loose=summarize(lost - lost_loosely, max),
-            # at most one switch between two frames
-            switches=summarize(switches, max, bounds=(0.0, n_frames - 1.0)),
+            switches=summarize(switches, max, bounds=(0.0, max_switches)),
             longest_gap=summarize(
-                gaps * self._frame_interval,
-                max,
-                bounds=(0.0, n_frames * self._frame_interval),
+                gaps * self._frame_interval, max, bounds=(0.0, self._max_gap)
             ),
         )
 
@@ -539,6 +552,15 @@ class Drives:
             for number in image_numbers[selected].tolist()
         ]
         save_drive(run, "drive", animated_frames, self.seconds)
+
+
+def _find_independent_units(job: Job) -> Units:
+    """Return the independent units of the images of a sweep.
+
+    They are the same in all scenes and for all sizes of images.
+    """
+    configurations_by_size = job.load_configurations_by_size(0)
+    return next(iter(configurations_by_size.values())).independent_units
 
 
 def _find_shape_of_rows(job: Job) -> tuple[int, ...]:

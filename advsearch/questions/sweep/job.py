@@ -208,10 +208,9 @@ class Job:
             descriptions = configurations.describe_images(all_u, first_in_scene)
             models = self.list_models_of_size(size)
             for number, u, values in zip(numbers, all_u, descriptions, strict=True):
-                queries += [
-                    self._make_query(number, model, configurations, u, values)
-                    for model in models
-                ]
+                for model in models:
+                    query = self._make_query(number, model, configurations, u, values)
+                    queries.append(query)
         # The loop above is by size; rows are by image, then by model.
         queries.sort(key=lambda query: query.row_index)
         return [(str(scene), None, query) for query in queries]
@@ -332,11 +331,11 @@ class Job:
         In a comparison without and with an adversarial configuration, the second half
         of the scenes are those with it. They repeat the draws of the first half.
         """
-        repeat_after_scenes = 0  # never
         # In a comparison every scene has the name of an arm, clean ones, too.
         is_comparison = bool(self.scenes[0].arm)
-        if is_comparison:
-            repeat_after_scenes = len(self.scenes) // 2
+        repeat_after_scenes = len(self.scenes) // 2 if is_comparison else 0  # 0: never
+        # one name without a folder of photographs: all are empty then
+        photograph_names = {scene.photograph_name for scene in self.scenes}
         return SceneConfigurations(
             space,
             make_domain(space.controls),
@@ -346,8 +345,7 @@ class Job:
             seed=self.config.seed,
             repeat_after_scenes=repeat_after_scenes,
             n_scenes=len(self.scenes),
-            # 1 without a folder of photographs: all names are empty then
-            n_photographs=len({scene.photograph_name for scene in self.scenes}),
+            n_photographs=len(photograph_names),
         )
 
     def make_ground_truth_facts(
@@ -436,9 +434,8 @@ def check_scenes(
         *_list_environment_axes(named_scenes, controls, axes),
         *_list_environment_controls(controls),
     ]
-    environments = list(
-        dict.fromkeys(named_scene.environment_name for named_scene in named_scenes)
-    )
+    all_environments = [scene.environment_name for scene in named_scenes]
+    environments = list(dict.fromkeys(all_environments))
     if len(environments) > 1 and environment_choices:
         raise InputError(
             f"`environment={','.join(environments)}` and {environment_choices[0]} both "
@@ -521,14 +518,7 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
     Raises:
         InputError: controls sample other numbers in one scene than in another.
     """
-    # a pair for each scene and each size of images
-    pairs = list[tuple[NamedScene, SceneConfigurations]]()
-    for scene, named_scene in enumerate(job.scenes):
-        pairs += [
-            (named_scene, configurations)
-            for configurations in job.load_configurations_by_size(scene).values()
-        ]
-        _check_truths(job, named_scene)
+    pairs = _bind_all_scenes(job)
     _, first_configurations = pairs[0]
     _check_same_layout(pairs)
     # A number may have another range in another scene or size: it has a version in
@@ -539,6 +529,23 @@ def check_job(job: Job) -> tuple[SceneConfigurations, tuple[SampledNumber, ...]]
         for versions in zip(*numbers_of_pair, strict=True)
     ]
     return first_configurations, tuple(sampled)
+
+
+def _bind_all_scenes(job: Job) -> list[tuple[NamedScene, SceneConfigurations]]:
+    """Return a pair for each scene and each size of images, and check the right labels.
+
+    Raises:
+        InputError: controls cannot be bound to a scene, or no prediction about it would
+            be right.
+    """
+    pairs = list[tuple[NamedScene, SceneConfigurations]]()
+    for scene, named_scene in enumerate(job.scenes):
+        pairs += [
+            (named_scene, configurations)
+            for configurations in job.load_configurations_by_size(scene).values()
+        ]
+        _check_truths(job, named_scene)
+    return pairs
 
 
 def _check_truths(job: Job, named_scene: NamedScene) -> None:
@@ -686,10 +693,9 @@ class SweptScene:
         # difference could be negative.
         n_new_non_finite = max(0, self.n_non_finite - not_finite_before)
         predictors = self.predictor_of_size.values()
+        summaries = [predictor.summarize() for predictor in predictors]
         evaluations[-1] = replace(
-            evaluations[-1],
-            collected_light=[predictor.summarize() for predictor in predictors],
-            n_non_finite=n_new_non_finite,
+            evaluations[-1], collected_light=summaries, n_non_finite=n_new_non_finite
         )
         return evaluations
 
@@ -779,11 +785,10 @@ class SweptScene:
             model_queries = [
                 query for query in queries if query.row_index % n_models == model
             ]
-            if not model_queries:
-                continue
-            judgements = self._judge_model(model, model_queries, images)
-            for query, judgement in zip(model_queries, judgements, strict=True):
-                judgement_of_query[query.row_index] = judgement
+            if model_queries:
+                row_numbers = [query.row_index for query in model_queries]
+                judgements = self._judge_model(model, model_queries, images)
+                judgement_of_query |= zip(row_numbers, judgements, strict=True)
         return judgement_of_query
 
     def _judge_model(
@@ -802,9 +807,8 @@ class SweptScene:
         size = self.job.image_sizes[model]
         problem = self.problems[model]
         n_models = len(self.job.models)
-        batch = torch.stack(
-            [images[size][query.row_index // n_models].image for query in queries]
-        )
+        image_numbers = [query.row_index // n_models for query in queries]
+        batch = torch.stack([images[size][number].image for number in image_numbers])
         judgements = problem.judge_images(
             batch, [query.u for query in queries], [query.values for query in queries]
         )
@@ -1069,6 +1073,22 @@ def verify_worst(
     verifier.choose_spp({"worst": u})  # sets `spp` and `sample_count` of its state
     title = "checking the worst configuration with fresh renders"
     verifier.begin_stage(title, config.trials)
+    verified_rate = _try_worst(verifier, config, u)
+    return WorstVerified(
+        **vars(verified_rate),
+        converged=_has_converged(verifier),
+        renders=verifier.run_state.verification_renders,
+    )
+
+
+def _try_worst(verifier: Verifier, config: SweepConfig, u: Tensor) -> VerifiedRate:
+    """Make the trials of a configuration, and return its rate of wrong predictions.
+
+    Args:
+        verifier: verifier that has chosen the samples per pixel.
+        config: settings of the sweep, with the number and the seed of the trials.
+        u: (d,) the configuration.
+    """
     spp = verifier.run_state.spp
     trials = run_trials(
         verifier.evaluate_all, u, spp=spp, seed=config.seed, trials=config.trials
@@ -1076,12 +1096,7 @@ def verify_worst(
     # For an attack, a wrong prediction is a success.
     wrong_trials = [trial for trial in trials if trial.success]
     counts = TrialCounts(len(wrong_trials), len(trials), spp)
-    verified_rate = make_rate(counts, trials, wrong_trials)
-    return WorstVerified(
-        **vars(verified_rate),
-        converged=_has_converged(verifier),
-        renders=verifier.run_state.verification_renders,
-    )
+    return make_rate(counts, trials, wrong_trials)
 
 
 def _has_converged(verifier: Verifier) -> bool:

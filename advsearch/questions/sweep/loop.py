@@ -139,11 +139,7 @@ class Sweep:
         if run is not None:
             self._write_notes(run)
         self._scenes = SceneLoader(job)
-        self._executor: Workers = (
-            InProcess(make_worker_call(self._scenes.load_by_name))
-            if executor is None
-            else executor
-        )
+        self._executor = self._make_in_process() if executor is None else executor
         # Problems are loaded by the name of the scene in each work item.
         self.journal = Journal(run, ParallelEvaluator(None, executor))
         self._reset_counts()
@@ -151,11 +147,13 @@ class Sweep:
         # Summaries of the predictors of images, by worker and scene. There is one for
         # each size of images; None if nothing that they predict moves.
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
-        self._has_non_finite = (
-            run is not None and run.store.read_note(NOT_FINITE) is not None
-        )
+        self._has_non_finite = _has_stored_non_finite(run)
         self._surface: SurfaceMap | None = None
         self._drives: list[DriveRates] | None = None
+
+    def _make_in_process(self) -> Workers:
+        """Return what evaluates batches in this process."""
+        return InProcess(make_worker_call(self._scenes.load_by_name))
 
     def _reset_progress(self) -> None:
         """Set what is counted for the progress since this sweep was resumed to 0."""
@@ -253,7 +251,8 @@ class Sweep:
         self.stages.begin("sweep", title, self.n_rows, hint=self._make_progress_hint())
         self.stages.progress.advance(self.n_rows - sum(map(len, missing)))
         self._sweep_begin = time.monotonic()
-        for batch in self._executor.compute(self._make_batches(missing)):
+        batches = self._make_batches(missing)
+        for batch in self._executor.compute(batches):
             evaluated = _pair_evaluations(batch)
             self._store_batch(evaluated, batch.worker)
             for query, evaluation in evaluated:
@@ -364,11 +363,10 @@ class Sweep:
         while image < images_end:
             scene_begin = image // self.images_per_scene * self.images_per_scene
             scene_end = scene_begin + self.images_per_scene
+            end = min(images_end, scene_end)
             # Batches begin at multiples of their size, counted from the scene's begin.
             batches = split_into_batches(
-                image - scene_begin,
-                min(images_end, scene_end) - scene_begin,
-                self.job.config.batch,
+                image - scene_begin, end - scene_begin, self.job.config.batch
             )
             for batch in batches:
                 yield range(scene_begin + batch.start, scene_begin + batch.stop)
@@ -507,9 +505,8 @@ class Sweep:
             return []
         # The samples of a grid point are consecutive images.
         grid_point = image // self.job.samples_per_grid_point
-        indices = np.unravel_index(
-            grid_point, self.first_scene_configurations.grid.sizes
-        )
+        grid = self.first_scene_configurations.grid
+        indices = np.unravel_index(grid_point, grid.sizes)
         return [
             TableAxis(
                 name=axis.name,
@@ -531,16 +528,13 @@ class Sweep:
             images: (n,) their numbers in the sweep, ascending, at least one.
         """
         last_image = int(images[-1])
+        configurations = self.first_scene_configurations
         parts = list[npt.NDArray[np.int64]]()
         for scene_begin in range(0, last_image + 1, self.images_per_scene):
             scene_end = scene_begin + self.images_per_scene
             for batch in split_into_batches(scene_begin, scene_end, SAMPLING_BATCH):
                 if batch.start <= last_image:
-                    parts.append(
-                        self.first_scene_configurations.find_parts(
-                            batch.start, len(batch)
-                        )
-                    )
+                    parts.append(configurations.find_parts(batch.start, len(batch)))
         return np.asarray(np.concatenate(parts)[images])
 
     def _find_worst(
@@ -591,9 +585,9 @@ class Sweep:
             truth = problem.find_truth(query.u, query.values)
         else:
             # The facts of the scene are enough, so that it need not be loaded.
-            truth = task.truth(
-                self.job.make_ground_truth_facts(self.job.scenes[scene], query.values)
-            )
+            named_scene = self.job.scenes[scene]
+            facts = self.job.make_ground_truth_facts(named_scene, query.values)
+            truth = task.truth(facts)
         return list(task.truth_names(truth))
 
     def _verify_worst(
@@ -697,16 +691,14 @@ class Sweep:
         job = self.job
         config = job.config
         is_sampled = self.first_scene_configurations.is_sampled
+        ranges = {number.name: number.varied_value for number in self._sampled_numbers}
         return {
             "object": config.object,
             "model": ",".join(_get_names(job.models)),
             "task": config.task_name,
             "environment": self._environment,
             "controls": _get_names(job.controls),
-            # the sampled numbers, with their ranges
-            "drawn": {
-                number.name: number.varied_value for number in self._sampled_numbers
-            },
+            "drawn": ranges,
             "planned": self.n_rows,
             "grid": {axis.name: len(axis.values) for axis in job.axes},
             "samples": job.samples_per_grid_point,
@@ -905,11 +897,7 @@ class Sweep:
         if self._has_non_finite:
             yield "Some values of pictures were not finite and were set to 0."
         if verified and not verified.converged:
-            yield (
-                "It is not shown that the worst margin keeps its side beyond "
-                f"{verified.spp} samples a pixel, the most "
-                "that a check takes: noise may take part in it."
-            )
+            yield _make_noise_remark(verified.spp)
         for rates in changes:
             if _is_blind(rates):
                 yield _make_blind_remark(rates)
@@ -956,6 +944,15 @@ class Sweep:
             )
 
 
+def _make_noise_remark(spp: int) -> str:
+    """Return that noise may decide the worst margin, with the samples that were tried."""
+    return (
+        "It is not shown that the worst margin keeps its side beyond "
+        f"{spp} samples a pixel, the most "
+        "that a check takes: noise may take part in it."
+    )
+
+
 def _make_hidden_remark(predictions: Predictions) -> str:
     """Return a remark on images without the object, which are not counted."""
     n_hidden = int(predictions.is_out_of_view.sum())
@@ -1000,6 +997,11 @@ def _format_megabytes(megabytes: float) -> str:
     if megabytes >= 1e3:
         return f"{megabytes / 1e3:.1f} GB"
     return f"{max(megabytes, 0.1):.1f} MB"
+
+
+def _has_stored_non_finite(run: RunDirectory | None) -> bool:
+    """Return whether a run has the note that some values of images were not finite."""
+    return run is not None and run.store.read_note(NOT_FINITE) is not None
 
 
 def _get_names(items: Iterable[Any]) -> list[str]:

@@ -148,8 +148,9 @@ def make_sweep_page(
     explorer = make_element("div", id="explorer", hidden="hidden")
     if not explored:
         explorer = _too_many_rows_html(runs)
+    title = ", ".join(path.name for path, _ in runs)
     return make_document(
-        ", ".join(path.name for path, _ in runs),
+        title,
         _header_html(runs),
         make_element("main", explorer, *image_notes, *_list_contents(runs)),
         data=[make_data_script(descriptions, "runs"), *embedded_rows],
@@ -295,10 +296,11 @@ def _describe_for_explorer(run: Path, summary: SweepSummary | None) -> JsonObjec
     has_single_model = "," not in summary.model
     if formation is not None and has_single_model:
         size = list[JsonValue](formation.resolution)
+    axis_names = dict.fromkeys(row.axis for row in summary.axes)
     return {
         "task": summary.task,
         "size": size,
-        "grid": list[JsonValue](dict.fromkeys(row.axis for row in summary.axes)),
+        "grid": list[JsonValue](axis_names),
         "drives": bool(summary.drives),
     }
 
@@ -351,9 +353,8 @@ def _too_many_rows_html(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Htm
     """Return a note in place of the explorer, for a page with too many rows."""
     names = [directory.format_run_name(path) for path, _ in runs]
     command = shlex.join(["advsearch", "dashboard", *names])
-    counts = ", ".join(
-        f"{summary.configurations:,}" for _, summary in runs if summary is not None
-    )
+    summaries = [summary for _, summary in runs if summary is not None]
+    counts = ", ".join(f"{summary.configurations:,}" for summary in summaries)
     return make_element(
         "p",
         f"This file leaves out the {counts} rows, and what pictures they have: it "
@@ -403,15 +404,15 @@ def _still_html(path: Path, summary: SweepSummary) -> Html:
     caption = f"{_find_measure(summary)} over {axes}."
     figure = _figure_html(path / "images" / "sweep.png", caption)
     worst = _figure_html(path / "images" / "worst.png", _worst_caption(summary))
-    return join_html(
+    parts = list[Html | None]()
+    if figure:
         # The page's script hides this element once the explorer replaces it. The worst
         # image stays.
-        make_element("div", figure, class_="pictures", data_still="true")
-        if figure
-        else None,
-        make_element("h2", "The worst configuration") if worst else None,
-        make_element("div", worst, class_="pictures pair") if worst else None,
-    )
+        parts.append(make_element("div", figure, class_="pictures", data_still="true"))
+    if worst:
+        parts.append(make_element("h2", "The worst configuration"))
+        parts.append(make_element("div", worst, class_="pictures pair"))
+    return join_html(*parts)
 
 
 def _find_measure(summary: SweepSummary) -> str:

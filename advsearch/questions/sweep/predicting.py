@@ -110,13 +110,12 @@ class Groups:
         # Samples are like one more axis, the last and fastest.
         self._all_axes = ProductIndex((*grid.sizes, samples))
         # Two images along any axis but that of the frames have different draws.
-        self._is_within = (
-            *(
-                may_differ and (may_draws_differ or axis == frame_axis)
-                for axis, may_differ in enumerate(within)
-            ),
-            may_draws_differ,  # the axis of the samples
-        )
+        is_within = [
+            may_differ and (may_draws_differ or axis == frame_axis)
+            for axis, may_differ in enumerate(within)
+        ]
+        # The samples, whose axis is the last, have different draws, too.
+        self._is_within = (*is_within, may_draws_differ)
         within_sizes = self._select(self._all_axes.sizes, is_within=True)
         between_sizes = self._select(self._all_axes.sizes, is_within=False)
         self._within = ProductIndex(tuple(within_sizes))
@@ -371,10 +370,8 @@ class LightOnSurfaces:
         light_groups = make_groups(self.parameters)
         # The images of one of these groups have the same arrangement: neither object
         # nor surroundings move, and the object has one color.
-        same_arrangement_inputs = FREE_INPUTS - {COLOR_INPUT}
-        arrangement_groups = make_groups(
-            self._find_parameters_changing_only(same_arrangement_inputs)
-        )
+        parameters = self._find_parameters_changing_only(FREE_INPUTS - {COLOR_INPUT})
+        arrangement_groups = make_groups(parameters)
         self._max_arrangements = arrangement_groups.n_groups_to_cache
         # below 1 if several lights share an arrangement
         arrangements_per_light = arrangement_groups.n_groups / light_groups.n_groups
@@ -424,9 +421,8 @@ class LightOnSurfaces:
             seed: not used; all arrangements have the same rays.
         """
         with torch.no_grad():
-            inputs = self._renderer.scene.input_assembler(
-                self._renderer.space.inputs(u)
-            )
+            space_inputs = self._renderer.space.inputs(u)
+            inputs = self._renderer.scene.input_assembler(space_inputs)
             for arrangement in self._arrangements:
                 if arrangement.is_applicable(inputs):
                     return arrangement.with_fixed_light(inputs)
@@ -562,10 +558,7 @@ class SweepPredictor:
         images: dict[int, SweptImage] = {}
         numbers_by_predictor: dict[Predictor, list[int]] = {}
         for number, query in query_of_image.items():
-            predictor = None  # the image is rendered
-            if self.refusal is None:
-                group = self._groups.find_group_of_image(number)
-                predictor = self._load_predictor(group, number)
+            predictor = self._find_predictor_of_image(number)
             if predictor is None:
                 images[number] = self._render_swept_image(number, query)
             else:
@@ -574,6 +567,13 @@ class SweepPredictor:
             queries = [query_of_image[number] for number in numbers]
             images |= self._predict_swept_images(predictor, numbers, queries)
         return images
+
+    def _find_predictor_of_image(self, number: int) -> Predictor | None:
+        """Return the predictor of an image of the scene; None if it is rendered."""
+        if self.refusal is not None:
+            return None
+        group = self._groups.find_group_of_image(number)
+        return self._load_predictor(group, number)
 
     def _predict_swept_images(
         self, predictor: Predictor, numbers: Sequence[int], queries: Sequence[Query]
@@ -650,11 +650,9 @@ class SweepPredictor:
         # the same index.
         group_index = self.images_before + group
         seed = seeds.derive_seed(self.seed, "light", group_index)
-        # The configuration is that of the first image of the group, whichever image
-        # comes first.
-        predictor = self.method.make_predictor(
-            self._make_configuration(number, 0), seed
-        )
+        # that of the first image of the group, whichever image comes first
+        configuration = self._make_configuration(number, index=0)
+        predictor = self.method.make_predictor(configuration, seed)
         deviation = self._compare(predictor, number, seed)
         self.deviations.append(deviation)
         self._n_traced_of_group[group] = predictor.n_traced_images + deviation.n_traced
@@ -736,27 +734,33 @@ class SweepPredictor:
             return None
         if self.refusal is not None:
             return LinearTransport(used=False, reason=str(self.refusal))
-        error = None
-        if self.deviations:
-            worst = max(self.deviations, key=lambda deviation: deviation.levels)
-            error = PredictionError.from_values(worst)
-        reason = None
-        if self.rendered_groups:
-            reason = (
-                f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were "
-                "rendered: predicted pictures were too far off"
-            )
         # `entries` and `renewed` are about the matrix of an attack. Sweeps have none.
         return LinearTransport(
             used=True,
             method=self.method.name,
-            reason=reason,
+            reason=self._explain_rendered_groups(),
             entries=0,
             bytes=self.method.bytes + self._count_predictor_bytes(),
             seconds=self.seconds,
             renewed=0,
-            error=error,
+            error=self._find_worst_error(),
         )
+
+    def _explain_rendered_groups(self) -> str | None:
+        """Return why some groups were rendered; None if none was."""
+        if not self.rendered_groups:
+            return None
+        return (
+            f"{len(self.rendered_groups)} of {self._groups.n_groups} groups were "
+            "rendered: predicted pictures were too far off"
+        )
+
+    def _find_worst_error(self) -> PredictionError | None:
+        """Return the largest deviation from traced images; None if none was compared."""
+        if not self.deviations:
+            return None
+        worst = max(self.deviations, key=lambda deviation: deviation.levels)
+        return PredictionError.from_values(worst)
 
     def _count_predictor_bytes(self) -> int:
         """Count the memory of the cached predictors."""

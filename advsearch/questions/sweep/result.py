@@ -316,9 +316,8 @@ class TableAxis:
         predictions = pd.DataFrame({"right": right, "unit": units, "outcome": outcome})
         axis_rows = list[AxisRow]()
         for index, group in predictions.groupby(self.value_index):
-            counts = count_predictions(
-                group.right, group.unit, group.outcome.to_numpy()
-            )
+            outcomes = group.outcome.to_numpy()
+            counts = count_predictions(group.right, group.unit, outcomes)
             value = self.values[index]
             axis_rows.append(
                 AxisRow(axis=self.name, unit=self.unit, value=value, **vars(counts))
@@ -485,6 +484,7 @@ class SweepResult:
 
 MAX_PIXELS = 1 << 22  # maximum size of an imported image
 MAX_LISTED_VALUES = 96  # maximum number of values of a parameter with a table
+MAX_LISTED_NAMES = 20  # maximum number of names of objects or models in a summary
 STORED_BATCH = 1000  # number of rows that are stored together
 
 
@@ -505,15 +505,20 @@ def import_threedb(
     with RunDirectory.create(run, overwrite=overwrite, default=default) as directory:
         _store_threedb_rows(folder, directory)
         rows = read_sweep(directory.path)
-        if rows.empty:
-            raise FileFormatError(
-                f"{folder}: expected the log of 3DB with at least "
-                "one line, got an empty one"
-            )
+        _check_log_not_empty(rows, folder)
         summary = _summarize_threedb(rows, directory.path, folder)
         write_sweep_page(directory.path, summary)
         directory.write_summary(summary)
         return directory.path
+
+
+def _check_log_not_empty(rows: pd.DataFrame, folder: Path) -> None:
+    """Raise an error if a folder of 3DB has no rows."""
+    if rows.empty:
+        raise FileFormatError(
+            f"{folder}: expected the log of 3DB with at least "
+            "one line, got an empty one"
+        )
 
 
 def _store_threedb_rows(folder: Path, directory: RunDirectory) -> None:
@@ -595,12 +600,13 @@ def _count_by_parameter(
 
 
 def _join_names(rows: pd.DataFrame, column: str) -> str:
-    """Return the names in a column, the first 20; "unknown" if there is none."""
+    """Return the first `MAX_LISTED_NAMES` names in a column; "unknown" without any."""
     names = rows[column].unique().tolist() if column in rows else []
     if not names:
         return "unknown"
-    more = f" and {len(names) - 20} more" if len(names) > 20 else ""
-    return ",".join(map(str, names[:20])) + more
+    n_unlisted = len(names) - MAX_LISTED_NAMES
+    more = f" and {n_unlisted} more" if n_unlisted > 0 else ""
+    return ",".join(map(str, names[:MAX_LISTED_NAMES])) + more
 
 
 def read_image(path: Path) -> object:

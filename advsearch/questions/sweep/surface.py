@@ -216,6 +216,9 @@ def _compute_comparison(counts: PartCounts, parts: Int64Array) -> pd.DataFrame:
     return pd.DataFrame(columns, index=parts, columns=list(COMPARISON_COLUMNS))
 
 
+STATISTIC_TOLERANCE = 1e-9  # statistics that differ by less, by rounding, are equal
+
+
 def _compute_permutation_p_value(
     counts: PartCounts, k: Int64Array, n: Int64Array, parts: Int64Array
 ) -> Float64Array:
@@ -241,10 +244,9 @@ def _compute_permutation_p_value(
     )
     statistic = _compute_statistic(counts, k, n)
     n_permutations = len(max_statistics)
-    # number of permutations whose largest statistic is at least that of the part; the
-    # tolerance is for rounding
-    tolerance = 1e-9
-    n_above = n_permutations - np.searchsorted(max_statistics, statistic - tolerance)
+    n_below = np.searchsorted(max_statistics, statistic - STATISTIC_TOLERANCE)
+    # permutations whose largest statistic is at least that of the part
+    n_above = n_permutations - n_below
     return np.asarray((1 + n_above) / (1 + n_permutations))
 
 
@@ -542,11 +544,10 @@ def _make_counts(
         wrong: (scenes, images, models) 1, 0 or UNKNOWN, from `_read_wrong`.
     """
     draws = _find_draws(scenes, wrong, scenes.job)
+    name_of_scene = np.array([scene.object_name for scene in scenes.job.scenes])
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
-        has_object = np.array(
-            [named_scene.object_name == name for named_scene in scenes.job.scenes]
-        )
+        has_object = name_of_scene == name
         model_seeds = _make_model_seeds(scenes.job, object_index)
         parts = SurfaceParts(asset.mesh)
         part_counts = _make_all_part_counts(
@@ -715,16 +716,29 @@ def permute_draws(
         return None
     is_known = wrong != UNKNOWN
     is_wrong = wrong == 1
-    n_draws = len(draw_sizes)
     # (draws, images of a draw): row k has the indices of the images of draw k
-    images_of_draw = np.argsort(draws, kind="stable").reshape(n_draws, -1)
+    images_of_draw = np.argsort(draws, kind="stable").reshape(len(draw_sizes), -1)
+    permuted_is_wrong = _permute_rows(is_wrong, images_of_draw, seed)
+    return np.packbits(permuted_is_wrong[:, is_known], axis=0)
+
+
+def _permute_rows(
+    is_wrong: npt.NDArray[np.bool_], images_of_draw: npt.NDArray[np.intp], seed: int
+) -> npt.NDArray[np.bool_]:
+    """Return predictions (N_PERMUTATIONS, n) that are permuted among the draws.
+
+    Args:
+        is_wrong: (n,) whether each prediction is wrong.
+        images_of_draw: (draws, images of a draw) indices of the images of each draw.
+        seed: seed of the permutations.
+    """
     generator = np.random.default_rng(seed)
-    permuted_is_wrong = np.zeros((N_PERMUTATIONS, len(wrong)), bool)
+    permuted_is_wrong = np.zeros((N_PERMUTATIONS, len(is_wrong)), bool)
     for permutation in permuted_is_wrong:  # a view of one row, which is filled
         # The images of each draw get the predictions of another draw.
-        source_images = images_of_draw[generator.permutation(n_draws)]
+        source_images = images_of_draw[generator.permutation(len(images_of_draw))]
         permutation[images_of_draw] = is_wrong[source_images]
-    return np.packbits(permuted_is_wrong[:, is_known], axis=0)
+    return permuted_is_wrong
 
 
 def _write_map(
@@ -977,11 +991,18 @@ def _render_views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         )
         to_world = camera_to_world(viewed, aspect=1.0).astype(np.float32)
         surfaces = scene.find_surfaces({"camera.to_world": torch.from_numpy(to_world)})
+        title = f"{azimuth:g}°, {elevation:g}° up"
         cells = _find_cell_of_pixels(surfaces, parts)
-        cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
-        # never so dark that colors are hard to distinguish
-        shade = MIN_SHADE + LIT_SHADE * cosine
-        yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
+        yield MapView(title, cells, _compute_shade(surfaces))
+
+
+def _compute_shade(surfaces: Surfaces) -> Float64Array:
+    """Return the brightness of each pixel (H, W) in [0, 1], by its surface's normal.
+
+    It is never so dark that colors are hard to distinguish.
+    """
+    cosine = np.clip(surfaces.normal.numpy() @ np.array(LIGHT_DIRECTION), 0.0, 1.0)
+    return np.asarray(MIN_SHADE + LIT_SHADE * cosine)
 
 
 def _find_cell_of_pixels(surfaces: Surfaces, parts: SurfaceParts) -> Int64Array:
@@ -1011,9 +1032,8 @@ def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
     import matplotlib as mpl  # takes long to import
 
     limit = _find_scale_limit(panels)
-    scale = mpl.cm.ScalarMappable(
-        mpl.colors.Normalize(-limit, limit), mpl.colormaps[COLORMAP]
-    )
+    normalize = mpl.colors.Normalize(-limit, limit)
+    scale = mpl.cm.ScalarMappable(normalize, mpl.colormaps[COLORMAP])
     axes = figure.subplots(
         len(panels), 2, squeeze=False, width_ratios=(1.0, VIEWS_WIDTH)
     )
@@ -1022,17 +1042,28 @@ def _draw_panels(panels: Sequence[Panel], figure: Any) -> None:
         _draw_cells(map_axes, panel.title, cell_colors)
         _draw_views(view_axes, panel.views, cell_colors)
 
-    # One color bar for all rows stands at their right; it need not be as high.
-    shrink = 0.8 if len(panels) == 1 else 0.4
-    bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
-    bar.set_label(
-        "share of wrong predictions where it is seen,\nless that where it is not"
-    )
+    _add_color_bar(figure, axes, scale)
     patches = [
         mpl.patches.Patch(facecolor=color, label=label)
         for color, label in GREY_LABELS.items()
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=2)
+
+
+def _add_color_bar(figure: Any, axes: npt.NDArray[Any], scale: Any) -> None:
+    """Add one color bar for all rows of a figure, at their right.
+
+    Args:
+        figure: figure of matplotlib.
+        axes: (rows, 2) axes of its rows.
+        scale: matplotlib's map from differences to colors.
+    """
+    # its height as a fraction of that of all rows
+    shrink = 0.8 if len(axes) == 1 else 0.4
+    bar = figure.colorbar(scale, ax=axes, shrink=shrink, format=_format_percent)
+    bar.set_label(
+        "share of wrong predictions where it is seen,\nless that where it is not"
+    )
 
 
 def _draw_cells(axes: Any, title: str, cell_colors: Float64Array) -> None:
