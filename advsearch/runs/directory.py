@@ -276,9 +276,8 @@ class RunDirectory:
             self.store.write_note(
                 PYTHON_ONLY_NOTE, json.dumps(config.python_only_parts)
             )
-        self.check_unchanged(
-            summary.VERSIONS_NOTE, summary.collect_versions(_known_settings(config))
-        )
+        versions = summary.collect_versions(_known_settings(config))
+        self.check_unchanged(summary.VERSIONS_NOTE, versions)
         # This note is the last one: if it exists, the others were stored, too.
         self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
 
@@ -293,17 +292,9 @@ class RunDirectory:
             self._begin_killed_run(config)
             return
         self.check_unchanged(SETTINGS_NOTE, config.get_deciding_settings())
-        # Only files that a resumed run reads again are compared. One that the run has
-        # copied into its store, such as a recipe, may have changed or be missing.
-        settings_of_files = {
-            name: value
-            for name, value in _known_settings(config).items()
-            if name not in summary.NOT_READ_AGAIN
-        }
-        # versions of packages, and digests of the files that these settings name
-        self.check_unchanged(
-            summary.VERSIONS_NOTE, summary.collect_versions(settings_of_files)
-        )
+        # versions of packages, and digests of files that a resumed run reads again
+        versions = summary.collect_versions(_select_read_settings(config))
+        self.check_unchanged(summary.VERSIONS_NOTE, versions)
 
     def _begin_killed_run(self, config: Config) -> None:
         """Begin a run that was killed before `_note_start` ended.
@@ -335,13 +326,12 @@ class RunDirectory:
                 can't go on.
         """
         before = self._read_facts(note)
-        if changed := summary.find_changed_facts(before, facts):
-            changes = ", ".join(
-                _format_change(name, before.get(name)) for name in changed
-            )
+        changed = summary.find_changed_facts(before, facts)
+        if changed:
+            changes = [_format_change(name, before.get(name)) for name in changed]
             raise InputError(
                 f"{self.path}: cannot resume with something else than the run began "
-                f"with: {changes}; restore it, or {self.restart_advice}"
+                f"with: {', '.join(changes)}; restore it, or {self.restart_advice}"
             )
         has_new_facts = not facts.keys() <= before.keys()
         if has_new_facts:  # the stored values of known facts stay
@@ -515,17 +505,29 @@ class RunDirectory:
 
         Without an error it is checked first that it was not moved in the meantime.
         """
-        # A new directory is removed only if the block raised before it stored anything.
         if error is None:
             try:
                 check_not_moved(self.path)
             finally:
                 self.close()
-            return
-        if self._is_new and self.is_empty:
+        elif self._is_new and self.is_empty:
+            # the block raised before it stored anything
             self.discard()
         else:
             self.close()
+
+
+def _select_read_settings(config: Config) -> dict[str, Any]:
+    """Return the settings of a run, without those of files that it does not read again.
+
+    A run has copied such a file, a recipe say, into its store. Then the file may have
+    changed or be missing.
+    """
+    return {
+        name: value
+        for name, value in _known_settings(config).items()
+        if name not in summary.NOT_READ_AGAIN
+    }
 
 
 @contextmanager
@@ -550,10 +552,7 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
         yield None
         return
     home = HOME if location is None else locate_run(location).parent
-    # parent folders that do not exist yet, the innermost first
-    new_folders = [
-        parent for parent in (home, *home.parents) if not os.path.exists(parent)
-    ]
+    new_folders = _list_missing_folders(home)
     with RunDirectory.create_for(config) as run:
         path = run.path
     try:
@@ -561,6 +560,13 @@ def create_before_work(config: Config) -> Iterator[Path | None]:
     except BaseException:
         _discard_if_empty(path, new_folders)
         raise
+
+
+def _list_missing_folders(folder: Path) -> list[Path]:
+    """Return those of a folder and its parents that do not exist, the innermost first."""
+    return [
+        parent for parent in (folder, *folder.parents) if not os.path.exists(parent)
+    ]
 
 
 def _discard_if_empty(path: Path, new_folders: Sequence[Path]) -> None:

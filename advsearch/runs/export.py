@@ -346,11 +346,16 @@ def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:
             line = file.readline(MAX_LINE_BYTES + 1)
             if not line:  # the end of the file; an empty line has its line break
                 return
-            if len(line) > MAX_LINE_BYTES:
-                reason = f"more than {MAX_LINE_BYTES} bytes"
-                raise _make_line_error(folder, number, reason)
+            _check_line_length(folder, number, line)
             if line.strip():
                 yield _parse_line(folder, number, line, class_names)
+
+
+def _check_line_length(folder: Path, number: int, line: bytes) -> None:
+    """Raise an error if a line of 3DB's log is too long; see `_parse_line`."""
+    if len(line) > MAX_LINE_BYTES:
+        reason = f"more than {MAX_LINE_BYTES} bytes"
+        raise _make_line_error(folder, number, reason)
 
 
 def _open_log(folder: Path) -> IO[bytes]:

@@ -85,6 +85,7 @@ def can_resume(path: Path) -> bool:
         return results.has_cached
 
 
+# by path and `counts`, the state of the files when they were read, and the entry
 _LISTED: dict[tuple[str, bool], tuple[object, ListedRun]] = {}
 
 
@@ -100,19 +101,27 @@ def read_listed_run(path: Path, *, counts: bool = True) -> ListedRun:
         counts: whether to count its rows, which takes a second for a million.
     """
     running = is_held(path)
-    read_paths = [
-        path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
-    ]
-    # The cache has, by key, the state of the files (their times and sizes) when they
-    # were read, and the entry. The state has the path as it was passed, too, since the
-    # entry contains it.
     key = (os.path.abspath(path), counts)
-    state = (str(path), running, *map(_state, read_paths))
+    state = _find_state_of_files(path, running)
     is_cached = key in _LISTED and _LISTED[key][0] == state
     count_may_change = running and counts
     if not is_cached or count_may_change:
         _LISTED[key] = state, _read_checked_run(path, counts, running)
     return _LISTED[key][1]
+
+
+def _find_state_of_files(path: Path, running: bool) -> tuple[object, ...]:
+    """Return a value that changes when the entry of a run in the list may change.
+
+    It has the times and sizes of the files that are read. It has the path as it was
+    passed, too, since the entry contains it.
+
+    Args:
+        path: path of the run.
+        running: whether a process works on the run.
+    """
+    names = (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")
+    return (str(path), running, *(_state(path / name) for name in names))
 
 
 def _read_checked_run(path: Path, counts: bool, running: bool) -> ListedRun:

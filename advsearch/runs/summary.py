@@ -79,9 +79,8 @@ def read_stored_result(folder: Path) -> Result:
     values = _read_summary_values(path)
     result_type = find_result_type(values)  # the class of the experiment's result
     if result_type is None:
-        raise make_summary_error(
-            path, f"one of the command {str(values.get('command'))[:40]!r}"
-        )
+        command = str(values.get("command"))[:MAX_TEXT_IN_ERROR]
+        raise make_summary_error(path, f"one of the command {command!r}")
     try:
         return result_type.from_values(values)
     except ValidationError as error:
@@ -100,9 +99,8 @@ def _read_summary_values(path: Path) -> JsonObject:
         FileFormatError: there is no such file, or it has something else.
     """
     try:
-        values = parse_json(
-            read_text(path, "the summary of a run", MAX_SUMMARY_BYTES), finite=True
-        )
+        text = read_text(path, "the summary of a run", MAX_SUMMARY_BYTES)
+        values = parse_json(text, finite=True)
     except FileNotFoundError:
         # the summary is the last file of a run
         raise make_summary_error(path, "no such file; did the run end?") from None
@@ -110,13 +108,22 @@ def _read_summary_values(path: Path) -> JsonObject:
         raise make_summary_error(path, str(error)) from None
     if not isinstance(values, dict):
         raise make_summary_error(path, type(values).__name__)
+    _check_schema(path, values)
+    return values
+
+
+MAX_TEXT_IN_ERROR = 40  # characters of a text of a summary in an error
+
+
+def _check_schema(path: Path, values: JsonObject) -> None:
+    """Raise an error if a summary, the file `path`, has the schema of another version."""
     if values.get("schema", SCHEMA) != SCHEMA:
+        schema = str(values["schema"])[:MAX_TEXT_IN_ERROR]
         raise make_summary_error(
             path,
-            f"schema {str(values['schema'])[:40]} of another version (this one writes "
+            f"schema {schema} of another version (this one writes "
             f"{SCHEMA}); run it again",
         )
-    return values
 
 
 def _describe_first_error(error: ValidationError) -> str:
@@ -422,11 +429,19 @@ def _iterate_digests(setting: str, path: str) -> Iterator[tuple[str, str]]:
 
     for opened_file in opened_files:
         if opened_file != absolute_path and Path(opened_file).is_file():
-            # Its name in the result is relative to the current directory if `path` is,
-            # and absolute otherwise.
-            relative = os.path.relpath(opened_file, os.path.dirname(absolute_path))
-            file_name = os.path.join(os.path.dirname(path), relative)
+            file_name = _name_as_path(opened_file, path)
             yield file_name, _digest_file(Path(opened_file))
+
+
+def _name_as_path(file: str, path: str) -> str:
+    """Return the path of a file, relative to the current directory if another path is.
+
+    Args:
+        file: absolute path of the file.
+        path: the other path, relative or absolute.
+    """
+    folder = os.path.dirname(os.path.abspath(path))
+    return os.path.join(os.path.dirname(path), os.path.relpath(file, folder))
 
 
 def _find_folder(path: str) -> str:

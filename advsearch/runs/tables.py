@@ -133,19 +133,27 @@ class Units:
         draw = image_index // self.noise  # `noise` consecutive images have one draw
         if self.frames is None:
             return draw
-        # Draws are numbered by point of the grid, then by sample. A point has an index
-        # along each axis, the last one fastest, so it is
-        # (index_before * n_frames + frame) * n_after + index_after.
-        # Leaving out the frame gives all frames of a drive the same number.
+        # Draws are numbered by point of the grid, then by sample.
         point = draw // self.samples
         sample = draw % self.samples
-        n_frames = self.sizes[self.frames]
-        n_after = prod(self.sizes[self.frames + 1 :])  # points along the axes after
+        return self._leave_out_frame(point, self.frames) * self.samples + sample
+
+    def _leave_out_frame(self, point: Number, frame_axis: int) -> Number:
+        """Return a number of a point of the grid that all frames of its drive share.
+
+        A point has an index along each axis, the last one fastest, so its number is
+        (index_before * n_frames + frame) * n_after + index_after.
+
+        Args:
+            point: number of the point in the sweep, or an array of numbers.
+            frame_axis: index of the axis of the frames.
+        """
+        n_frames = self.sizes[frame_axis]
+        n_after = prod(self.sizes[frame_axis + 1 :])  # points along the axes after
         # The index along the axes before also counts scenes, as an axis before all.
         index_before = point // (n_frames * n_after)
         index_after = point % n_after
-        point_without_frame = index_before * n_after + index_after
-        return point_without_frame * self.samples + sample
+        return index_before * n_after + index_after
 
 
 def read_units(store: Store, *, is_sampled: bool = True) -> Units | None:
@@ -258,9 +266,8 @@ def read_sweep(
         FileFormatError: the results cannot be read.
     """
     with Store(run / NAME, read_only=True) as store:
-        frame = make_sweep_frame(
-            islice(store.rows(KIND, after=after), max_rows), extra_columns
-        )
+        rows = islice(store.rows(KIND, after=after), max_rows)
+        frame = make_sweep_frame(rows, extra_columns)
         noted = store.read_json_note(EDGES_NOTE)
         units = read_units(store, is_sampled=is_sampled)
     frame.attrs["unit name"] = PICTURE

@@ -28,6 +28,7 @@ MAX_CLOSE_SECONDS = 10.0
 # Maximum number of messages that wait to be sent. Further ones are dropped.
 MAX_QUEUED = 10_000
 MAX_TEXT_LENGTH = 250
+MAX_REASON_LENGTH = 300  # characters of an error in the log
 _LOG = logging.getLogger("advsearch")
 
 
@@ -150,11 +151,8 @@ class Tracker:
                 message = self._queue.get()
             close()
         except Exception as error:  # whatever a tracker does, the run goes on
-            _LOG.warning(
-                "nothing more is sent to %s: %s",
-                self._name,
-                str(error)[:300] or type(error).__name__,
-            )
+            reason = str(error)[:MAX_REASON_LENGTH] or type(error).__name__
+            _LOG.warning("nothing more is sent to %s: %s", self._name, reason)
 
 
 def _open_tracker(

@@ -39,6 +39,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified
 from advsearch.questions.sweep.tracks import ConstantVelocity, Tracker
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results import VerifiedRate
 from advsearch.scene.color import round_to_8_bit
 from advsearch.scene.description import ENVIRONMENT, OBJECT
 from advsearch.scene.formation import round_sample_count

@@ -544,10 +544,10 @@ def _make_counts(
         wrong: (scenes, images, models) 1, 0 or UNKNOWN, from `_read_wrong`.
     """
     draws = _find_draws(scenes, wrong, scenes.job)
-    name_of_scene = np.array([scene.object_name for scene in scenes.job.scenes])
+    name_of_scene = [scene.object_name for scene in scenes.job.scenes]
     counts = dict[str, SurfaceCounts]()
     for object_index, (name, asset) in enumerate(assets.items()):
-        has_object = name_of_scene == name
+        has_object = np.array([scene_name == name for scene_name in name_of_scene])
         model_seeds = _make_model_seeds(scenes.job, object_index)
         parts = SurfaceParts(asset.mesh)
         part_counts = _make_all_part_counts(
