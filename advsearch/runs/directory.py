@@ -703,10 +703,8 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
     path = locate_run(run)
     _check_possible_folder(path)
     with storage_errors(path):
-        is_free = not path.exists() or all(
-            _is_leftover(entry) for entry in path.iterdir()
-        )
-    if is_free:  # nothing is there, or leftovers of a run that was killed at its start
+        is_free = not path.exists() or _has_only_leftovers(path)
+    if is_free:
         return
     if not is_run(path):
         raise RunExistsError(
@@ -718,6 +716,11 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
             f"{path}: the run exists already; add `overwrite=True` or "
             "choose another name with `run`"
         )
+
+
+def _has_only_leftovers(folder: Path) -> bool:
+    """Return whether a folder has nothing but what a run killed at its start leaves."""
+    return all(_is_leftover(entry) for entry in folder.iterdir())
 
 
 def _check_possible_folder(path: Path) -> None:

@@ -188,13 +188,8 @@ def _make_listed_run(
         running: whether a process works on the run.
         faults: list of sentences, to which those about this run are added.
     """
-    config: dict[str, object] = {}
-    result: Result | None = None
-    # an error in one of these blocks is added to the faults, and not raised
-    with _collect_faults(faults, path / CONFIG):
-        config = read_yaml(path / CONFIG)
-    with _collect_faults(faults, path / summary.NAME):
-        result = summary.read_result(path)
+    config = _read_listed_config(path, faults)
+    result = _read_listed_result(path, faults)
     kinds = _count_stored_rows(path, faults) if counts else {}
     command = config.get("command") or (result.command if result else "?")
     return ListedRun(
@@ -210,6 +205,34 @@ def _make_listed_run(
         started=bool(config),
         when=_find_start_time(path),
     )
+
+
+def _read_listed_config(path: Path, faults: list[str]) -> dict[str, object]:
+    """Return the settings of a run; empty if they cannot be read.
+
+    Args:
+        path: path of the run.
+        faults: list of sentences, to which one about the file may be added.
+    """
+    config: dict[str, object] = {}
+    # an error is added to the faults, and not raised
+    with _collect_faults(faults, path / CONFIG):
+        config = read_yaml(path / CONFIG)
+    return config
+
+
+def _read_listed_result(path: Path, faults: list[str]) -> Result | None:
+    """Return the result of a run; None if it cannot be read.
+
+    Args:
+        path: path of the run.
+        faults: list of sentences, to which one about the file may be added.
+    """
+    result: Result | None = None
+    # an error is added to the faults, and not raised
+    with _collect_faults(faults, path / summary.NAME):
+        result = summary.read_result(path)
+    return result
 
 
 def _count_stored_rows(path: Path, faults: list[str]) -> dict[str, int]:

@@ -203,13 +203,25 @@ class Store:
         with storage_errors(self.path):
             self._db.execute(f"PRAGMA synchronous = {mode}")
             with self._db:  # one transaction
-                self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
-                if cached is not None:
-                    row = rows[-1]
-                    values = (*_encode_cached(cached), row.kind, row.step)
-                    self._db.execute(_INSERT_CACHED, values)
+                self._insert(rows, cached, timestamp)
         if must_sync:
             self._schedule_sync(start_time)
+
+    def _insert(
+        self, rows: Sequence[Row], cached: CachedEvaluation | None, timestamp: float
+    ) -> None:
+        """Insert rows, and what belongs to the last one, into the tables.
+
+        Args:
+            rows: rows of evaluations.
+            cached: data that a search needs and the last row lacks; None without any.
+            timestamp: the time of writing, seconds since 1970.
+        """
+        self._db.executemany(_INSERT, (_encode(row, timestamp) for row in rows))
+        if cached is not None:
+            row = rows[-1]
+            values = (*_encode_cached(cached), row.kind, row.step)
+            self._db.execute(_INSERT_CACHED, values)
 
     def _schedule_sync(self, start_time: float) -> None:
         """Set when the next write waits for the disk, after one that did.

@@ -75,11 +75,7 @@ class Tracker:
         self._n_correct = Counter[str]()
         self._n_judged = Counter[str]()
         self._queue: Queue[tuple[MetricValues, int] | None] = Queue(MAX_QUEUED)
-        setting_texts = {
-            key: str(value)[:MAX_TEXT_LENGTH]
-            for key, value in settings.items()
-            if value is not None
-        }
+        setting_texts = _shorten_settings(settings)
         self._thread = threading.Thread(
             target=self._work, args=(folder, setting_texts), name=name, daemon=True
         )
@@ -153,6 +149,15 @@ class Tracker:
         except Exception as error:  # whatever a tracker does, the run goes on
             reason = str(error)[:MAX_REASON_LENGTH] or type(error).__name__
             _LOG.warning("nothing more is sent to %s: %s", self._name, reason)
+
+
+def _shorten_settings(settings: JsonObject) -> dict[str, str]:
+    """Return settings as texts of at most `MAX_TEXT_LENGTH` characters, without None."""
+    return {
+        key: str(value)[:MAX_TEXT_LENGTH]
+        for key, value in settings.items()
+        if value is not None
+    }
 
 
 def _open_tracker(

@@ -9,7 +9,13 @@ from typing import Any, NamedTuple, TypeVar
 
 from torch import Tensor
 
-from advsearch.attacks import Ending, SearchResult, Verification, count_right
+from advsearch.attacks import (
+    Ending,
+    SearchResult,
+    StepRecord,
+    Verification,
+    count_right,
+)
 from advsearch.attacks.candidates import FoundFailure
 from advsearch.attacks.trials import MAX_MOVED_FRACTION, MAX_SAMPLE_RATIO, OVER_LADDER
 from advsearch.engine.journal import Journal
@@ -371,12 +377,12 @@ def _summarize_controls(problem: Problem) -> dict[str, Any]:
     # The space has the searched controls first, then those that conditions vary.
     random_controls = problem.space.controls[len(controls) :]
     budgets = {control.name: control.largest_group_budget for control in controls}
+    epsilons = {name: budget.epsilon for name, budget in budgets.items()}
+    norms = {name: budget.norm for name, budget in budgets.items()}
     return {
         "controls": [control.name for control in controls],
-        "epsilon": _unwrap_single(
-            {name: budget.epsilon for name, budget in budgets.items()}
-        ),
-        "norm": _unwrap_single({name: budget.norm for name, budget in budgets.items()}),
+        "epsilon": _unwrap_single(epsilons),
+        "norm": _unwrap_single(norms),
         "over": [control.name for control in random_controls],
         "conditions": _describe_conditions(problem),
     }
@@ -531,13 +537,11 @@ def _summarize_ambient(findings: RunState) -> AmbientLight | None:
         for lux, verification in sorted(findings.verification_by_lux.items())
     ]
     n_holding = _count_holding(points)
-    limit_lux = None  # it holds in all lights
-    if n_holding < len(points):
-        limit_lux = points[n_holding].lux
+    holds_in_all = n_holding == len(points)
     return AmbientLight(
         lux=points[0].lux,
         holds_to=points[n_holding - 1].lux,
-        limit_lux=limit_lux,
+        limit_lux=None if holds_in_all else points[n_holding].lux,
         points=points,
     )
 
@@ -636,22 +640,25 @@ def _make_search_claim(search: SearchResult) -> SearchClaim:
 
 def _summarize_gradients(search: SearchResult) -> SearchGradients:
     """Return the statistics of the gradients of a search."""
-    norms = [
-        record.gradient_norm
-        for record in search.history
-        if not math.isnan(record.objective)
-    ]
     # the cosine of each gradient with the previous one
     cosines = search.agreement
     median_cosine = statistics.median(cosines) if cosines else None
     return SearchGradients(
         count=search.gradients,
         cosine_with_the_one_before=median_cosine,
-        zero=sum(norm == 0.0 for norm in norms),
+        zero=_count_zero_gradients(search.history),
         cut=search.counts.cut,  # gradients in which single elements were clipped
         shortened=search.counts.shortened,  # gradients whose norm was scaled down
         rejected=search.counts.rejected,  # steps that were undone
     )
+
+
+def _count_zero_gradients(history: Sequence[StepRecord]) -> int:
+    """Count the steps whose gradient is zero, though their objective is a number."""
+    norms = [
+        record.gradient_norm for record in history if not math.isnan(record.objective)
+    ]
+    return sum(norm == 0.0 for norm in norms)
 
 
 def _summarize_distribution(

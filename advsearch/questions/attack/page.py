@@ -199,16 +199,21 @@ def _image_parts(
         yield _marks_part(summary)
     trial_images = _find_trial_images(images)
     if trial_images:
-        yield ResultPart(
-            "Pictures of the verification",
-            pictures=[trial_images],
-            layout="small",
-            folded=True,
-        )
+        yield _trials_part(trial_images)
     if animated:
         yield ResultPart("The search, step by step", live="search")
     if summary.drive is not None:
         yield _drive_part(summary)
+
+
+def _trials_part(trial_images: list[Picture]) -> ResultPart:
+    """Return the section with the images of trials, which is folded."""
+    return ResultPart(
+        "Pictures of the verification",
+        pictures=[trial_images],
+        layout="small",
+        folded=True,
+    )
 
 
 def _model_input_part(summary: AttackSummary) -> ResultPart:

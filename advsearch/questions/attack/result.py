@@ -730,11 +730,7 @@ def evaluate_drive(
     # The animation has the paths one after another.
     n_paths = max(1, len(path_names))  # a single path has no name
     right_counts: dict[str, int] = {}
-    # the configuration of each scene, by the name of its files
-    configurations = {"drive-clean": problem.domain.start}
-    if u is not None:  # None if nothing was searched
-        configurations["drive"] = u
-    for name, configuration in configurations.items():
+    for name, configuration in _name_drive_configurations(problem, u).items():
         # The searched coordinates come first, then those that conditions vary.
         frames[:, : len(configuration)] = configuration
         images, right_counts[name] = _render_frames(problem, frames, spp)
@@ -748,6 +744,19 @@ def evaluate_drive(
         adversarial=right_counts.get("drive"),
         spp=spp,
     )
+
+
+def _name_drive_configurations(problem: Problem, u: Tensor | None) -> dict[str, Tensor]:
+    """Return the configurations (d,) of both scenes by the names of their files.
+
+    Args:
+        problem: problem of the attack.
+        u: (d,) the adversarial configuration; None leaves it out.
+    """
+    configurations = {"drive-clean": problem.domain.start}
+    if u is not None:
+        configurations["drive"] = u
+    return configurations
 
 
 def _measure_path_seconds(problem: Problem, path: Any, frames: Tensor) -> float:

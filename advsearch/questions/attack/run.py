@@ -433,7 +433,7 @@ def _search_with_policy(
         "search",
         f"searching with {policy.name}",
         problem.steps,
-        "`steps` or `seconds` shorten it",
+        shorter="`steps` or `seconds` shorten it",
     )
     findings.search_result = searches.run_search(
         "search",
@@ -455,7 +455,7 @@ def _search_without_print_terms(
         "without print terms",
         title,
         steps,
-        "`printable=false` leaves out this search and the print terms",
+        shorter="`printable=false` leaves out this search and the print terms",
     )
     searches.run_state.result_without_print_terms = searches.run_search(
         UNPRINTED, policy, steps, searches.problem.seed
@@ -468,7 +468,7 @@ def _search_at_random(searches: Searches, steps: int) -> None:
         "baseline",
         "searching at random, to compare",
         steps,
-        "`baseline=false` leaves it out",
+        shorter="`baseline=false` leaves it out",
     )
     seed = seeds.derive_seed(searches.problem.seed, "baseline")
     searches.run_state.random_search_result = searches.run_search(

@@ -394,14 +394,8 @@ class StudyRun:
     ) -> AttackSummary:
         """Make an attack, or read its result if it is done; see `run_attack`."""
         path = self.run.path / PARTS / attack.name
-
-        def attack_with_matrix(
-            part_config: AttackConfig, **options: Any
-        ) -> AttackSummary:
-            """Make the attack with the shared matrix, and return its result."""
-            return attack_once(part_config, clean=clean, **options).summary
-
-        summary = run_part(path, attack.config, self.progress, attack_with_matrix)
+        make_attack = partial(_attack_with_matrix, clean)
+        summary = run_part(path, attack.config, self.progress, make_attack)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(
                 f"{path}: expected the run of an attack, got one of {summary.command}"
@@ -418,6 +412,20 @@ class StudyRun:
         return self.context.result(
             kind, parts=self.names, warnings=self.warnings, **fields
         )
+
+
+def _attack_with_matrix(
+    clean: CleanMatrix | None, config: AttackConfig, **options: Any
+) -> AttackSummary:
+    """Make an attack, and return its result.
+
+    Args:
+        clean: the matrix of light transport of the clean scene, shared with other
+            attacks; None to share none.
+        config: settings of the attack.
+        **options: keywords of `attack_once`.
+    """
+    return attack_once(config, clean=clean, **options).summary
 
 
 def _find_label_warnings(config: AttackConfig) -> list[str]:
@@ -596,7 +604,6 @@ def matrix(context: RunContext[AttackConfig]) -> MatrixResult:
     context.progress.stage(LOADING)
     for name in names:
         check_from_config(_with_model(config, name))  # raises before any attack
-
     study = StudyRun(context)
     attacked = _attack_models(study)
     # `_try_on_models` fills these: an interrupt leaves what was done before it

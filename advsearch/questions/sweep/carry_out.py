@@ -730,9 +730,12 @@ def _make_job(
         axes=axes,
         aovs=parse_aovs(config.aov),
     )
-    warnings += _find_control_notes(job)
-    unique_warnings = tuple(dict.fromkeys(warnings))  # scenes may have the same notes
-    return replace(job, warnings=unique_warnings)
+    return _add_warnings(job, [*warnings, *_find_control_notes(job)])
+
+
+def _add_warnings(job: Job, warnings: Iterable[str]) -> Job:
+    """Return a job with warnings, each once: several scenes may have the same."""
+    return replace(job, warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _check_run_settings(config: SweepConfig) -> None:
@@ -837,10 +840,7 @@ def _load_models_and_tasks(
         The models, the tasks, and remarks on both.
     """
     shared_task = make_task(task)
-    _check_distinct_names([get_model_name(model) for model in models])
-    networks, warnings = load_models(models, shared_task, config)
-    # Several files or functions may return models of the same name.
-    _check_distinct_names([network.name for network in networks])
+    networks, warnings = _load_distinct_models(models, shared_task, config)
     scenes = [named_scene.scene for named_scene in named_scenes]
     tasks = tuple(
         _calibrate_for_model(config, shared_task, network, scenes)
@@ -864,6 +864,26 @@ def _find_object_labels(named_scenes: Sequence[NamedScene]) -> dict[str, str | N
         named_scene.object_name: named_scene.scene.description.object.label
         for named_scene in named_scenes
     }
+
+
+def _load_distinct_models(
+    models: Sequence[AnyModel], task: Task, config: SweepConfig
+) -> tuple[tuple[Model, ...], list[str]]:
+    """Load models, and check that their names differ.
+
+    Args:
+        models: names, files or modules.
+        task: task of all models.
+        config: the settings.
+
+    Returns:
+        The models, and warnings of loading.
+    """
+    _check_distinct_names([get_model_name(model) for model in models])
+    networks, warnings = load_models(models, task, config)
+    # Several files or functions may return models of the same name.
+    _check_distinct_names([network.name for network in networks])
+    return networks, warnings
 
 
 def _calibrate_for_model(
@@ -951,10 +971,23 @@ def _load_named_scenes(config: SweepConfig) -> list[NamedScene]:
             NamedScene(name, scene.description.environment_name, scene)
             for name, scene in scenes.items()
         ]
-    environment_by_name = _load_environments(scenes[objects[0]], environments)
+    return _combine_with_environments(scenes, environments)
+
+
+def _combine_with_environments(
+    scenes: Mapping[str, Scene], environments: Sequence[str]
+) -> list[NamedScene]:
+    """Return every object in every environment, sorted by object.
+
+    Args:
+        scenes: the scene of each object in the first environment, by the object's name.
+        environments: names of the environments.
+    """
+    first_scene = next(iter(scenes.values()))
+    environment_by_name = _load_environments(first_scene, environments)
     return [
         NamedScene(name, environment_name, scenes[name].with_environment(environment))
-        for name in objects
+        for name in scenes
         for environment_name, environment in environment_by_name.items()
     ]
 

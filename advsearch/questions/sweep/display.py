@@ -573,23 +573,29 @@ def _make_surface_parts(surface: SurfaceMap) -> Iterator[ResultPart]:
 
 def _verdict(summary: SweepSummary) -> str:
     """Return the result of a sweep in one or two sentences."""
+    if not summary.configurations and summary.out_of_view:
+        return "The object is in no picture."
     if not summary.configurations:
-        if summary.out_of_view:
-            return "The object is in no picture."
         return "Interrupted before the first configuration."
-    rate = format_accuracy(summary)
-    outcomes = describe_wrong_outcomes(summary)
     if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
-        return (
-            f"Interrupted after {summary.looked_at} of {summary.planned} "
-            f"configurations: right in {summary.correct} ({rate}){outcomes}."
-        )
+        return _interrupted_verdict(summary)
     if summary.arms and summary.arms.pairs:
         return _verdict_of_arms(summary.arms)
     configurations = format_count(summary.configurations, "configuration")
+    rate = f"({format_accuracy(summary)}){format_grid_caution(summary)}"
+    outcomes = describe_wrong_outcomes(summary)
     return (
-        f"The model is right in {summary.correct} of {configurations} "
-        f"({rate}){format_grid_caution(summary)}{outcomes}."
+        f"The model is right in {summary.correct} of {configurations} {rate}{outcomes}."
+    )
+
+
+def _interrupted_verdict(summary: SweepSummary) -> str:
+    """Return the result so far of a sweep that was interrupted."""
+    rate = format_accuracy(summary)
+    outcomes = describe_wrong_outcomes(summary)
+    return (
+        f"Interrupted after {summary.looked_at} of {summary.planned} "
+        f"configurations: right in {summary.correct} ({rate}){outcomes}."
     )
 
 

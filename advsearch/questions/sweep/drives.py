@@ -679,11 +679,23 @@ def summarize_drives(
     """
     means = values
     if drive_of_value is not None:
-        n_values = sum_per_unit(np.ones(len(values)), drive_of_value)
-        means = sum_per_unit(values, drive_of_value) / n_values
+        means = _average_per_drive(values, drive_of_value)
     interval = None
     if bounds is not None and len(means) > 1:
         interval = mean_interval(means, *bounds)
     # The worst value is that of a single evaluation, with the noise that it had.
     worst_value = worst(values.tolist())
     return OverDrives(mean=float(means.mean()), interval=interval, worst=worst_value)
+
+
+def _average_per_drive(
+    values: npt.NDArray[np.float64], drive_of_value: npt.NDArray[np.int64]
+) -> npt.NDArray[np.float64]:
+    """Return the mean of the values (n,) of each drive.
+
+    Args:
+        values: (n,) the values.
+        drive_of_value: (n,) the drive of each value.
+    """
+    n_values = sum_per_unit(np.ones(len(values)), drive_of_value)
+    return np.asarray(sum_per_unit(values, drive_of_value) / n_values)

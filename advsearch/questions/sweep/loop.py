@@ -275,9 +275,9 @@ class Sweep:
         stored_rows = self.journal.store(evaluated, id_is_number=True)
         self._add_costs(stored_rows)
         # Models of one size share an image, which counts for the first of them.
+        model_indices = [query.row_index % self.n_models for query, _ in evaluated]
         self._n_rendered += sum(
-            self.job.is_first_of_size[query.row_index % self.n_models]
-            for query, _ in evaluated
+            self.job.is_first_of_size[model] for model in model_indices
         )
         first_query, _ = evaluated[0]
         scene = self._find_scene(first_query.row_index)
@@ -552,10 +552,9 @@ class Sweep:
         row_number = predictions.worst_row
         if row_number is None:
             return None
-        image, model = divmod(row_number, self.n_models)
+        model = row_number % self.n_models
         claim = _make_claim(read_judgement(self._read_row(row_number)))
-        item_of_model = self.job.make_queries(range(image, image + 1))
-        _, _, query = item_of_model[model]  # an item ends with its query
+        query = self._make_query_of_row(row_number)
         scene = self._find_scene(row_number)
         worst = WorstConfiguration(
             configuration=row_number,
@@ -569,6 +568,13 @@ class Sweep:
             return worst
         problem = self._scenes.load_scene(scene).problems[model]
         return self._verify_worst(worst, problem, query.u)
+
+    def _make_query_of_row(self, number: int) -> Query:
+        """Return the query that a row, by its number, stores the result of."""
+        image, model = divmod(number, self.n_models)
+        item_of_model = self.job.make_queries(range(image, image + 1))
+        _, _, query = item_of_model[model]  # an item ends with its query
+        return query
 
     def _read_row(self, number: int) -> Row:
         """Return a row that was evaluated, from the run directory if there is one."""

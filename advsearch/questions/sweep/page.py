@@ -29,6 +29,7 @@ from advsearch.report.views import Html, join_html, make_element
 from advsearch.report.views import get_view as make_view
 from advsearch.report.wording import format_paired_rates, format_prediction
 from advsearch.runs import directory
+from advsearch.runs.results import VerifiedRate
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.trust.writing import (
@@ -435,14 +436,19 @@ def _worst_caption(summary: SweepSummary) -> str:
     )
     # the prediction about the saved image, or else the one of the sweep
     claim = worst.pictured or worst.claimed
-    text = f"{values}: the model predicts {format_prediction(summary.task, claim)}"
-    rate = worst.verified
-    if rate is not None:
-        wrong = wording.format_tally(
-            "wrong", rate.successes, rate.trials, rate.not_a_number
-        )
-        text += f"; {wrong} fresh renders"
-    return f"{text}."
+    prediction = format_prediction(summary.task, claim)
+    verified = _verified_clause(worst.verified)
+    return f"{values}: the model predicts {prediction}{verified}."
+
+
+def _verified_clause(rate: VerifiedRate | None) -> str:
+    """Return in how many fresh renders the model is wrong; empty without any."""
+    if rate is None:
+        return ""
+    wrong = wording.format_tally(
+        "wrong", rate.successes, rate.trials, rate.not_a_number
+    )
+    return f"; {wrong} fresh renders"
 
 
 def _figure_html(file: Path, caption: str) -> Html | None:

@@ -72,6 +72,9 @@ prediction, including the comparisons.
 """
 
 
+BASIS_PIXEL_BYTES = 8  # approximate memory of a pixel of a basis image
+
+
 class Groups:
     """Divides the images of a scene into groups, each of which one predictor serves.
 
@@ -237,14 +240,15 @@ class BasisPictures:
     def _count_lights(self) -> int:
         """Count the lights, whose number is the same in all configurations."""
         renderer = self._renderer
-        inputs = renderer.scene.input_assembler(renderer.space.inputs(renderer.start))
+        start_inputs = renderer.space.inputs(renderer.start)
+        inputs = renderer.scene.input_assembler(start_inputs)
         return len(LightBasis(renderer, self._lighting, inputs).inputs_of_light)
 
     def _find_memory_refusal(self, groups: Groups, n_lights: int) -> Refusal | None:
         """Return a refusal if the basis images take too much memory; else None."""
         height, width = self._renderer.formation.resolution
-        # about 8 bytes for each pixel of a basis image
-        n_bytes = groups.n_groups_to_cache * n_lights * 8 * height * width
+        bytes_per_basis_image = BASIS_PIXEL_BYTES * height * width
+        n_bytes = groups.n_groups_to_cache * n_lights * bytes_per_basis_image
         if n_bytes > scale_limit(MAX_BYTES):
             return Refusal(
                 f"basis pictures of {groups.n_groups} groups take too much memory; "
