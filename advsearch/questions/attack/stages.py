@@ -846,7 +846,7 @@ def _drop_meaningless_bracket(findings: RunState) -> None:
     nothing.
     """
     verification = findings.verification
-    if verification and verification.ending is Ending.ALREADY_WRONG:
+    if verification is not None and verification.ending is Ending.ALREADY_WRONG:
         findings.smallest_change_bracket = None
 
 
