@@ -227,12 +227,24 @@ class Drives:
         self._distance_unit = "object sizes"
         # fills `flags` and `distance`, and the attributes above
         self._read_rows(rows, time_axis.control_name, flags, distance)
+        self._set_frames_in_order(flags, distance, time_index)
 
-        times = np.array([float(value) for value in time_axis.values])
+    def _set_frames_in_order(
+        self, flags: Flags, distance: npt.NDArray[np.float64], time_index: int
+    ) -> None:
+        """Set the times, and the arrays with the frames in the order of their times.
+
+        Args:
+            flags: (scenes, axes of the grid ..., samples, models) flags of the rows.
+            distance: the same shape without models, distances of the images.
+            time_index: index of the time among the axes of the grid.
+        """
+        time_values = self._job.axes[time_index].values
+        times = np.array([float(value) for value in time_values])
         order = np.argsort(times)
         self.times = times[order]
         self.seconds = float(self.times[-1] - self.times[0])  # of one drive
-        row_numbers = np.arange(flags.size).reshape(shape)
+        row_numbers = np.arange(flags.size).reshape(flags.shape)
         self._outcomes = _move_frames_last(flags, time_index, order)
         self._row_numbers = _move_frames_last(row_numbers, time_index, order)
         self._distance = _move_frames_last(distance, time_index, order)
@@ -267,12 +279,21 @@ class Drives:
             if distance_name in row.values:
                 distance.flat[image] = float(str(row.values[distance_name]["value"]))
                 self._distance_unit = row.values[distance_name]["unit"]
-            names = right_names.get((image // job.images_per_scene, model))
-            # Only detectors have names, and an old row may lack its boxes.
-            if names is not None and isinstance(row.payload, dict):
-                self._frame_of_step[row.step] = read_frame(row.payload, names)
+            scene = image // job.images_per_scene
+            self._store_boxes(row, right_names.get((scene, model)))
             if path_name in row.values:
                 self._path_of_step[row.step] = str(row.values[path_name]["value"])
+
+    def _store_boxes(self, row: Row, names: Collection[str] | None) -> None:
+        """Store the detected boxes of a row, if it has any.
+
+        Args:
+            row: the row.
+            names: names of the right classes; None if the model is no detector.
+        """
+        # A row of an older version may lack its boxes.
+        if names is not None and isinstance(row.payload, dict):
+            self._frame_of_step[row.step] = read_frame(row.payload, names)
 
     def _find_right_names(self) -> dict[tuple[int, int], Collection[str]]:
         """Return the names of the right classes by scene and model, of detectors."""
@@ -281,9 +302,8 @@ class Drives:
         for scene, named_scene in enumerate(job.scenes):
             for model, task in enumerate(job.tasks):
                 if isinstance(task, Detection):
-                    classes = task.find_right_classes(
-                        job.make_ground_truth_facts(named_scene, {})
-                    )
+                    facts = job.make_ground_truth_facts(named_scene, {})
+                    classes = task.find_right_classes(facts)
                     right_names[scene, model] = task.get_class_names(classes)
         return right_names
 

@@ -599,11 +599,8 @@ def _find_draws(
     all sizes of images, so those of the first size are used.
     """
     n_scenes, images_per_scene, _ = wrong.shape
-    units = (
-        scenes.load_scene(0)
-        .configurations_by_size[job.image_sizes[0]]
-        .independent_units
-    )
+    configurations = scenes.load_scene(0).configurations_by_size[job.image_sizes[0]]
+    units = configurations.independent_units
     image_numbers = np.arange(n_scenes * images_per_scene)
     draws = np.asarray(units.find_cluster(image_numbers))
     return draws.reshape(n_scenes, images_per_scene)
@@ -649,16 +646,35 @@ def _count_scene(
     n_images, n_models = wrong.shape
     for batch in split_into_batches(0, n_images, BATCH_SIZE):
         for size in dict.fromkeys(scenes.job.image_sizes):
-            # The scenes before this one have the same number of images each.
-            configurations = swept_scene.configurations_by_size[size]
-            batch_u = configurations.make_configurations(
-                batch.start, len(batch), before=scene * n_images
-            )
-            images_surfaces = _find_batch_surfaces(swept_scene, size, batch_u)
-            models = scenes.job.list_models_of_size(size)
-            for number, surfaces in zip(batch, images_surfaces, strict=True):
-                counts.add_image(surfaces, _select_known(wrong[number], models))
+            _count_batch(swept_scene, size, batch, wrong, counts)
         progress.advance(len(batch) * n_models)
+
+
+def _count_batch(
+    scene: SweptScene,
+    size: tuple[int, int],
+    batch: range,
+    wrong: npt.NDArray[np.int8],
+    counts: SurfaceCounts,
+) -> None:
+    """Count the visible parts in consecutive images of one size.
+
+    Args:
+        scene: the scene.
+        size: (height, width) of the images.
+        batch: numbers of the images in the scene.
+        wrong: (images, models) 1, 0 or UNKNOWN, of all images of the scene.
+        counts: counts of the scene's object.
+    """
+    # The scenes before this one have the same number of images each.
+    images_before = scene.number * len(wrong)
+    batch_u = scene.configurations_by_size[size].make_configurations(
+        batch.start, len(batch), before=images_before
+    )
+    images_surfaces = _find_batch_surfaces(scene, size, batch_u)
+    models = scene.job.list_models_of_size(size)
+    for number, surfaces in zip(batch, images_surfaces, strict=True):
+        counts.add_image(surfaces, _select_known(wrong[number], models))
 
 
 def _find_batch_surfaces(
