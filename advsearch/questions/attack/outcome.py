@@ -863,11 +863,9 @@ def _describe_conditions(problem: Problem) -> dict[str, VariedValue]:
     for group, block in zip(problem.space.groups, full_domain.blocks, strict=True):
         # The searched controls come first in the space.
         is_random = group.begin >= len(problem.domain.start)
-        described = list[Value]()
-        if is_random and group.size == 1:
-            described = _describe_along(
-                problem, group.name, group.begin, block.n_options
-            )
+        if group.size != 1 or not is_random:
+            continue
+        described = _describe_along(problem, group.name, group.begin, block.n_options)
         if described:
             ranges[group.name] = _to_range(described, is_choice=bool(block.n_options))
     return ranges

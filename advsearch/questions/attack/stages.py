@@ -408,10 +408,10 @@ def choose_predictor(
     # If matrices could be used, the loop has returned. Light on surfaces was refused
     # before the loop or in it.
     assert matrix_refusal is not None and surface_refusal is not None
-    is_matrix_refusal_reported = _is_matrix_refusal_more_helpful(
+    reports_matrix_refusal = _is_matrix_refusal_more_helpful(
         problem, surface_refusal, findings, specialise=specialise
     )
-    refusal = matrix_refusal if is_matrix_refusal_reported else surface_refusal
+    refusal = matrix_refusal if reports_matrix_refusal else surface_refusal
     return _render_search(problem, refusal, stages, findings, specialise=specialise)
 
 

@@ -575,10 +575,10 @@ def _add_adversarial_arm(
     attack_config = _load_attack_config(directory)
     fixed_controls = make_configured_controls(attack_config, attack_config.controls)
     _check_not_varied(fixed_controls, sampled, axes, directory)
-    # The attack's controls are fixed in both arms. Without an adversarial configuration
-    # they have their values in the clean scene.
     u = torch.from_numpy(read_configuration(directory))
     arm = _name_adversarial_arm(directory)
+    # The attack's controls are fixed in both arms. Without an adversarial configuration
+    # they have their values in the clean scene.
     clean = [
         replace(scene, fixed_controls=fixed_controls, arm=CLEAN)
         for scene in named_scenes
