@@ -74,8 +74,8 @@ def _double_until_failing(
         scene_lux: the ambient light of the scene, in which it holds.
 
     Returns:
-        The brightest light in which it holds, and twice that light. It fails in the
-        latter, which is not tried if it is beyond `MAX_LUX`.
+        The brightest light in which it holds, and twice that light. In the latter it
+        fails, unless that is beyond `MAX_LUX` and was not tried.
     """
     holding_lux = scene_lux
     failing_lux = 2.0 * scene_lux

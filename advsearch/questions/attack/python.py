@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from torch import Tensor
 
 from advsearch import losses
-from advsearch.api.keywords import Names, SceneKeywords, with_settings_signature
+from advsearch.api.keywords import (
+    Names,
+    SceneKeywords,
+    drop_unset,
+    with_settings_signature,
+)
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.config import SceneConfig
@@ -113,7 +118,7 @@ def attack(
         resume: continue the run in that directory, if there is one, from where it was
             stopped. All other arguments have to be the same as before.
     """
-    options = _drop_unset(settings)
+    options = drop_unset(settings)
     if callable(task):  # a function of the caller
         task = make_task(task)
     _check_policy(policy)
@@ -164,11 +169,6 @@ def _check_policy(policy: object) -> None:
             "policy: expected a name, a mapping with a `name` and options, or an "
             f"instance, got {describe_value(policy)}"
         )
-
-
-def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
-    """Return the settings that are not None."""
-    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _list_session_controls(searched: Controls, random: Controls) -> list[str]:

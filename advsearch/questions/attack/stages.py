@@ -761,7 +761,7 @@ class Searches:
 
 
 def _request_frame(query: Query, interval: int) -> Query:
-    """Return a query, with a request for an image if its step is a multiple.
+    """Return a query, with a request for an image if its step has a frame.
 
     Args:
         query: the query.

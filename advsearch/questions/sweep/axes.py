@@ -584,7 +584,7 @@ def add_grid_axes(
         scene: the scene, which decides the default ranges of a control.
     """
     control_by_name = {control.name: control for control in controls}
-    # Axes of one control have the same `instance`, the name of that control.
+    # Axes of one control have the same `control_name`.
     for instance in dict.fromkeys(axis.control_name for axis in axes):
         instance_axes = [axis for axis in axes if axis.control_name == instance]
         sampled = control_by_name.get(instance)
@@ -988,7 +988,7 @@ class SceneConfigurations:
             count: number of consecutive images of one scene.
 
         Returns:
-            (count, k) indices among `parts` of each of `sampled_numbers`.
+            (count, k) indices among `range_parts` of each of `sampled_numbers`.
         """
         draws = self._sample(self._small_draws, first, count)[:, self._columns]
         # [0, 1] is divided into equal bins for each number: find the bin of each draw.
@@ -1037,7 +1037,7 @@ class SceneConfigurations:
 
         Args:
             first: number of the first image in the scene.
-            n_images: count of images.
+            count: number of images.
         """
         if not self._axes:
             return ()

@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from advsearch.api.keywords import SceneKeywords, with_settings_signature
+from advsearch.api.keywords import (
+    SceneKeywords,
+    drop_unset,
+    with_settings_signature,
+)
 from advsearch.cluster import BatchFunction
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, adapt_length_unit
@@ -179,7 +183,7 @@ def sweep(
         "samples": samples,
         "adversarial_of": attack_run,
     }
-    set_options = _drop_unset(settings)
+    set_options = drop_unset(settings)
     run_setting = {"run": None if run is None else str(run)}
     described = {**request.to_settings(set_options), **varied}
     # A later mapping overrides earlier ones: what is passed overrides the attack.
@@ -311,11 +315,6 @@ def _resolve_task(task: AnyTask, defaults: Mapping[str, Any]) -> AnyTask:
     if task == "classification":
         task = defaults.get("task", task)
     return make_task(task) if callable(task) else task
-
-
-def _drop_unset(settings: Mapping[str, object]) -> dict[str, Any]:
-    """Return the settings that are not None."""
-    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _find_attack_run(
@@ -478,7 +477,7 @@ def _open_run_before_work(config: SweepConfig) -> Any:
     """Return a context with the run directory of a sweep, created if it is new.
 
     The context has the directory of a stopped sweep that is continued, or a new one. It
-    has None if the sweep is not stored.
+    has None if the sweep is not stored, or overwrites another run.
     """
     resumed = _find_resumable(config)
     if config.run is None or resumed is not None:

@@ -1027,8 +1027,8 @@ def format_error_rate(counts: CountedPredictions) -> str:
 
 DISTANCE = "camera.distance"  # name of the axis
 HALF = 0.5
-# significance of a one-sided binomial test, divided by the number of tests; both bounds
-# together have 95 % confidence
+# significance of all one-sided binomial tests of a bound together; both bounds together
+# have 95 % confidence
 BOUND_SIGNIFICANCE = 0.025
 
 
@@ -1136,7 +1136,7 @@ def compute_detection_distance(rows: Sequence[AxisRow]) -> DetectionDistance:
         distance=_find_crossing(np.array(distances[beyond_dips]), fitted_fractions),
         lower=low,
         upper=high,
-        min_images=_find_missing_images(n, significance),
+        min_images=_find_required_images(n, significance),
         loose_counts=_count_loose(rows),
         image_counts=tuple(n.tolist()),
         dips=dips,
@@ -1154,7 +1154,7 @@ def _check_distance_count(n_distances: int) -> None:
         )
 
 
-def _find_missing_images(n: NDArray[np.int64], significance: float) -> int | None:
+def _find_required_images(n: NDArray[np.int64], significance: float) -> int | None:
     """Return how many images a bound needs; None if some distance has as many.
 
     Args:
